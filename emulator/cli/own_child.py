@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from types import FrameType
 
 from vnet.runtime import interrupts, running_node
 from vnet.runtime.die_with_parent import signal_at_parent_death
@@ -17,8 +16,10 @@ from vnet.runtime.die_with_parent import signal_at_parent_death
 LONGEST_PATH = 4096
 """Bytes of the path of a run's folder."""
 FORWARDED = (signal.SIGINT, signal.SIGTERM)
+FAULTS = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
+"""Signals of code that fails: a vehicle's death also where none was seen running, as in a thread of its own."""
 FROM_TERMINAL = 0x80
-"""`si_code` of a signal that the kernel sends, as Ctrl-C does to the child, too (SI_KERNEL)."""
+"""`si_code` of a signal that the kernel sends, as Ctrl-C does to all of the terminal's foreground (SI_KERNEL)."""
 
 
 class OwnChild:
@@ -32,38 +33,37 @@ class OwnChild:
         self._folder[:] = os.fsencode(folder.absolute()).ljust(LONGEST_PATH, b"\0")
 
     def fork(self) -> str | None:
-        """Return None in the child, and in the parent the vehicle that has ended it; its folder is removed.
+        """Return None in the child, and in the parent the vehicle that has ended it, "" if unknown.
 
-        Where no vehicle has, the parent ends as the child did.
+        The folder of its run is then removed. Where no vehicle has, the parent ends as the child did.
         """
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        in_foreground = _is_in_foreground()
         handled = (*FORWARDED, signal.SIGCHLD)
-        handler = signal.signal(signal.SIGCHLD, _ignore)  # one that is ignored would not be told
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may ignore it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, handled)
         child = os.fork()
         if child == 0:
+            if not in_foreground:  # what is sent to the parent's group would reach it twice
+                os.setpgid(0, 0)
             signal_at_parent_death(signal.SIGKILL)
-            signal.signal(signal.SIGCHLD, handler)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return None
         forwarded: set[int] = set()
-        while True:
-            waited, status = os.waitpid(child, os.WNOHANG)
-            if waited:
-                break
+        while not (waited := os.waitpid(child, os.WNOHANG))[0]:
             told = signal.sigwaitinfo(handled)
-            if told.si_signo != signal.SIGCHLD:
+            if told.si_signo in FORWARDED:
                 forwarded.add(told.si_signo)
-                if told.si_code != FROM_TERMINAL:
+                if not in_foreground or told.si_code != FROM_TERMINAL:
                     os.kill(child, told.si_signo)
         forwarded |= signal.sigpending() & set(FORWARDED)
-        signal.signal(signal.SIGCHLD, handler)
-        vehicle, ended = running_node.running.read(), os.waitstatus_to_exitcode(status)
-        if vehicle and not forwarded and ended != -signal.SIGKILL:  # which the system sends if memory is short
+        vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
+        ended = os.waitstatus_to_exitcode(waited[1])
+        died = (vehicle and ended != -signal.SIGKILL) or (folder and -ended in FAULTS)  # KILL: memory is short
+        if died and not forwarded:
             running_node.running.show("")
-            if folder := self._folder[:].rstrip(b"\0"):
-                shutil.rmtree(os.fsdecode(folder), ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return vehicle
         if ended < 0:
@@ -74,8 +74,13 @@ class OwnChild:
         return interrupts.exit_now(ended)
 
 
-def _ignore(number: int, frame: FrameType | None) -> None:
-    pass
+def _is_in_foreground() -> bool:
+    """Return whether this process may read from its terminal: Ctrl-C there is for its group."""
+    try:
+        with Path("/dev/tty").open() as terminal:
+            return os.tcgetpgrp(terminal.fileno()) == os.getpgrp()
+    except OSError:
+        return False
 
 
 def may_fork() -> bool:

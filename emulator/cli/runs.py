@@ -149,6 +149,8 @@ def simulate(
         child, apart = OwnChild(), None
         if processes == "1" and asked.debug is None and may_fork():
             apart = child.fork()
+        if apart is not None and not asked.only_the_result:
+            say_first(f"{apart or 'a program'} ended the process of all: again, with a process a vehicle")
         with ended_at_once():
             from emulator.cli.execution import Request, run_simulated
 

@@ -113,7 +113,12 @@ def run_again(
     path = emulation.folder.path
     agreeing: list[str] = []
     finding: Finding = unknown("replay", "was not repeated")
-    for repetition in repetitions(command, emulation):
+    alive = next((check for check in judgement.checks if check.name == "agents_alive"), finding)
+    gone = alive.figures.get("gone", ()) if isinstance(alive, CheckResult) else ()
+    if ended := [each["node"] for each in gone if each["kind"] == "died" and "where" not in each]:
+        why = f"the process of {ended[0]} ended, at an instant that depends on processes and windows"
+        finding = unknown("replay", f"was not repeated: {why}")
+    for repetition in () if ended else repetitions(command, emulation):
         shutil.rmtree(path / AGAIN, ignore_errors=True)
         status = repetition.run(emulation.folder.scenario_path, path / AGAIN, options)
         finding = _compared(path, repetition, status, agreeing)
@@ -121,7 +126,7 @@ def run_again(
             break
         agreeing.append(repetition.name)
     else:
-        if compared == PORTABLE:
+        if compared == PORTABLE and not ended:
             finding = _with_note(finding, _other_hash_seed(emulation, options))
     asked = "" if compared == LAYOUTS else f"={compared}"
     verdict = {**verdict, "reproduce": f"{verdict['reproduce']} --check-determinism{asked}"}

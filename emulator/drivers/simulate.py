@@ -26,6 +26,7 @@ from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.memory import first_over
 from emulator.drivers.process_count import split_evenly
 from emulator.drivers.signals import signals_handled, tell_from_handler
+from vnet.errors import VnetError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_programs
@@ -33,6 +34,9 @@ from vnet.transport import wire
 
 if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
+
+MOST_APART = 100
+"""Processes of the vehicles of a run that is made again because one of them has ended its process."""
 
 
 def simulate(
@@ -52,13 +56,15 @@ def simulate(
     Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one. `on_interrupt` is called, on
     a thread of its own, at the first Ctrl-C. `debug` has a debugger stop in a program. With `processes` above 1 so
     many processes run the programs, and not this one; the vehicles of one that ends before its time have died.
-    `apart` is a vehicle that has ended the process of an earlier attempt: it has a process of its own, the others
-    have another, and what they print has been printed then.
+    `apart` is the vehicle that has ended the process of an earlier attempt, "" if unknown: each vehicle has a
+    process of its own (beyond `MOST_APART` others, these share so many), and what they print has been printed then.
+    If none dies now, that one has, at the end; raises VnetError if it is unknown.
     """
     node_ids = emulation.world.node_ids
     groups = split_evenly(node_ids, processes)
     if apart is not None:
-        groups = [group for group in ([apart], [node for node in node_ids if node != apart]) if group]
+        others = [node for node in node_ids if node != apart]
+        groups = [*([[apart]] if apart else []), *(split_evenly(others, MOST_APART) if others else [])]
     emulation.costs.processes = len(groups)
     stop = stop or threading.Event()
     barrier = _Barrier(emulation, groups, before_horizon, stop)
@@ -82,6 +88,11 @@ def simulate(
         if interrupted:
             emulation.folder.event(simulation.now_ns, "interrupted")
         emulation.finish(simulation.now_ns)
+    if apart is not None and not interrupted and not any(each.kind == "died" for each in emulation.folder.events):
+        if not apart:
+            raise VnetError("a process of programs ended, and none did when each vehicle had one of its own")
+        how = "ended the process of all vehicles, and not one of its own"
+        emulation.folder.event(simulation.now_ns, "died", apart, how=how)
     return time.monotonic() - started, interrupted
 
 

@@ -213,16 +213,16 @@ class Campaign:
     def _shrink(self, outcome: Outcome) -> Outcome:
         """Shrink a failure, and run the smallest once more where it is kept."""
         wanted = {column_of(name) for name in outcome.trial.failed}
-        until_s = time.monotonic() + self._plan.limit_s
+        until_s, apart = time.monotonic() + self._plan.limit_s, outcome.trial.apart
 
         def still_fails(smaller: Scenario) -> bool:
             if self._workshop.closed or time.monotonic() > until_s:
                 return False
-            return bool(wanted & {column_of(name) for name in self._workshop.run_anywhere(smaller).failed})
+            return bool(wanted & {column_of(name) for name in self._workshop.run_anywhere(smaller, apart).failed})
 
         shrunk, steps = self._smallest(outcome, still_fails) if self._plan.shrink_steps else (outcome.scenario, 0)
         folder = self._folder / "failures" / outcome.label
-        again = self._workshop.run(shrunk, folder)
+        again = self._workshop.run(shrunk, folder, apart)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
         (folder / "drawn.toml").write_text(schedule_toml(outcome.scenario.fault) + "\n")

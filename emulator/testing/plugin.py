@@ -10,6 +10,7 @@ import asyncio
 import functools
 import inspect
 import itertools
+import sys
 from collections.abc import Callable, Coroutine, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_unconfigure() -> None:
+    """End the watch that the fixture has begun."""
+    if death_watch := sys.modules.get("emulator.testing.death_watch"):
+        death_watch.end()
+
+
 @pytest.fixture
 def vnet_emulation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..., RunHarness]]:
     """Runs of a scenario, step by step: `async with vnet_emulation(SCENARIO, vehicles=6, …) as emu:`.
@@ -40,9 +47,11 @@ def vnet_emulation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[C
     SCENARIO is a file, a dict or a Scenario. Keywords change it: vehicles, program, options, seed, duration,
     settle, faults, or `**{"section.key": value}`. `live=True` runs real processes. See docs/testing.md.
     """
+    from emulator.testing.death_watch import watch
     from emulator.testing.harness import RunHarness
     from emulator.testing.scenarios import make_scenario
 
+    watch(request.config)
     runs: list[RunHarness] = []
     request.node.stash[_runs] = runs
     folders = [request.config.rootpath, request.path.parent]

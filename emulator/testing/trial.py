@@ -13,7 +13,7 @@ import traceback
 import weakref
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from emulator.checks.replay import compare_tables, first_call
 from emulator.drivers.determinism import calls_recorded, scattered
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session
+from emulator.drivers.simulate import MOST_APART
 from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.records.tape import TapeEntry
 from emulator.scenario.scenario import Scenario
@@ -53,6 +54,8 @@ class Trial:
     wall_s: float = 0.0
     tape: tuple[TapeEntry, ...] = ()
     """Deviations from FIFO of a run that has failed."""
+    apart: bool = False
+    """True if each vehicle needed a process of its own, because one had ended that of all."""
 
     @property
     def failed(self) -> list[str]:
@@ -69,13 +72,14 @@ UNKNOWN = Trial({}, {})
 """Result of a run that was given up."""
 
 
-def run_trial(scenario: Scenario, folder: RunFolder, twice: bool = False) -> Trial:
+def run_trial(scenario: Scenario, folder: RunFolder, twice: bool = False, apart: bool = False) -> Trial:
     """Simulate and judge a run in this process. Raises VnetError if it cannot be run.
 
-    In a folder that is open its files are written, as of any other run. `twice` has it made again in another way.
+    In a folder that is open its files are written, as of any other run. `twice` has it made again in another way;
+    `apart` gives each vehicle a process of its own.
     """
     started = time.monotonic()
-    session = Session(scenario, folder)
+    session = Session(scenario, folder, Local(MOST_APART if apart else 1))
     emulation = session.emulation
     with calls_recorded(folder.path, twice):
         session.run()
@@ -86,7 +90,7 @@ def run_trial(scenario: Scenario, folder: RunFolder, twice: bool = False) -> Tri
     verdicts[GROWTH] = Verdict.INVALID if greatest > GREATEST else Verdict.VALID
     if greatest > GREATEST:
         texts[GROWTH] = f"a report holds {greatest:.3g}"
-    if twice:
+    if twice and not apart:  # the instant at which a process ends depends on processes and windows
         differs = _difference_of_another(emulation)
         verdicts[REPLAY] = Verdict.INVALID if differs else Verdict.VALID
         texts |= {REPLAY: differs} if differs else {}
@@ -146,21 +150,22 @@ class TrialPool:
         self._scratch = Path(tempfile.mkdtemp(prefix="vnet-trials-"))
         self._forget = weakref.finalize(self, shutil.rmtree, self._scratch, ignore_errors=True)
 
-    def run(self, scenario: Scenario, folder: Path) -> Trial:
+    def run(self, scenario: Scenario, folder: Path, apart: bool = False) -> Trial:
         """Return a trial on this machine, whose files stay in `folder`.
 
-        One that hangs, or ends its process, has failed. Nothing is known of one that was begun once closed.
+        One that hangs has failed; one that ends its process is made again with a process a vehicle, so that the
+        vehicle has died; so is any if `apart`. Nothing is known of one that was begun once closed.
         """
-        return self._judged(lambda: self._here(scenario, folder))
+        return self._judged(lambda apart: self._here(scenario, folder, apart), apart)
 
-    def run_anywhere(self, scenario: Scenario) -> Trial:
+    def run_anywhere(self, scenario: Scenario, apart: bool = False) -> Trial:
         """Return a trial that leaves no files, on the executor if there is one; VnetError if that is broken."""
-        return self._judged(lambda: self._away(scenario))
+        return self._judged(lambda apart: self._away(scenario, apart), apart)
 
-    def _judged(self, run: Callable[[], Trial]) -> Trial:
+    def _judged(self, run: Callable[[bool], Trial], apart: bool = False) -> Trial:
         try:
             if not self.closed:
-                return run()
+                return run(apart)
         except WorkerTimeoutError as error:
             return Trial.failure(HUNG, f"{error}; logs/stacks.txt says where it stood")
         except BrokenExecutor:
@@ -169,25 +174,29 @@ class TrialPool:
             if not worker_died(error):
                 raise
             if not self.closed:
-                return Trial.failure(EMULATOR, str(error))
+                return Trial.failure(EMULATOR, str(error)) if apart else self._apart(run, error)
         return UNKNOWN
 
-    def _here(self, scenario: Scenario, folder: Path | None) -> Trial:
-        self._pool.call(self._place, _get_ready)
-        if folder is not None:
-            return self._pool.call(
-                self._place, _run_in_worker, scenario, folder, self.limit_s, self._twice, limit_s=self.limit_s
-            )
-        scratch = self._scratch / str(threading.get_ident())
-        return self._pool.call(
-            self._place, _run_unkept, scenario, scratch, self.limit_s, self._twice, limit_s=self.limit_s
-        )
+    def _apart(self, run: Callable[[bool], Trial], error: Exception) -> Trial:
+        """Return the trial again with a process a vehicle, so that the vehicle has died that ended all before."""
+        trial = self._judged(run, apart=True)
+        if trial.verdicts and not trial.failed:
+            return Trial.failure(EMULATOR, f"{error}; not where each vehicle had a process of its own")
+        return replace(trial, apart=True)
 
-    def _away(self, scenario: Scenario) -> Trial:
+    def _here(self, scenario: Scenario, folder: Path | None, apart: bool) -> Trial:
+        self._pool.call(self._place, _get_ready)
+        function = _run_unkept if folder is None else _run_in_worker
+        place = self._scratch / str(threading.get_ident()) if folder is None else folder
+        how = self.limit_s, self._twice, apart
+        return self._pool.call(self._place, function, scenario, place, *how, limit_s=self.limit_s)
+
+    def _away(self, scenario: Scenario, apart: bool) -> Trial:
         if self._executor is None:
-            return self._here(scenario, None)
+            return self._here(scenario, None, apart)
+        how = self.limit_s, self._twice, apart
         future: Future[Trial] = self._executor.submit(
-            call_fitly, self._place, _run_elsewhere, scenario, self.limit_s, self._twice, limit_s=self.limit_s
+            call_fitly, self._place, _run_elsewhere, scenario, *how, limit_s=self.limit_s
         )
         while not self.closed:
             if wait([future], timeout=LOOK_S).done:
@@ -206,36 +215,44 @@ def _get_ready() -> None:
     """Have a worker import all of this module before the time of a trial is measured."""
 
 
-def _run_elsewhere(scenario: Scenario, limit_s: float, twice: bool) -> Trial:
+def _run_elsewhere(scenario: Scenario, limit_s: float, twice: bool, apart: bool) -> Trial:
     """Run a trial in a worker on any machine, and keep nothing but its result."""
     with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-        return _run_unkept(scenario, Path(name) / "run", limit_s, twice)
+        return _run_unkept(scenario, Path(name) / "run", limit_s, twice, apart)
 
 
-def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float, twice: bool) -> Trial:
+def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float, twice: bool, apart: bool) -> Trial:
     """Run a trial in a worker, and keep nothing but its result: files take as long as a small run's checks."""
     folder = RunFolder.scratch(scratch)
     # Checks of the user's own may read what programs have printed.
     log = folder.logs / PROGRAMS_LOG if scenario.program.checks else Path(os.devnull)
-    return _run(scenario, folder, log, Path(os.devnull), limit_s, twice)
+    return _run(scenario, folder, log, Path(os.devnull), limit_s, twice, apart)
 
 
-def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float, twice: bool) -> Trial:
+def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float, twice: bool, apart: bool) -> Trial:
     """Run a trial in a worker. What its programs print, and where it stood if it hangs, is in the run's logs."""
+    if apart:
+        shutil.rmtree(folder, ignore_errors=True)  # of the attempt before
     run_folder = RunFolder.create(folder, scenario)
     log, stacks = run_folder.logs / PROGRAMS_LOG, run_folder.logs / "stacks.txt"
-    return _run(scenario, run_folder, log, stacks, limit_s, twice)
+    return _run(scenario, run_folder, log, stacks, limit_s, twice, apart)
 
 
 def _run(
-    scenario: Scenario, run_folder: RunFolder, log_path: Path, stacks_path: Path, limit_s: float, twice: bool
+    scenario: Scenario,
+    run_folder: RunFolder,
+    log_path: Path,
+    stacks_path: Path,
+    limit_s: float,
+    twice: bool,
+    apart: bool,
 ) -> Trial:
     with log_path.open("ab") as log, stacks_path.open("w") as stacks:
         before = os.dup(STDOUT)
         os.dup2(log.fileno(), STDOUT)
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:
-            return run_trial(scenario, run_folder, twice)
+            return run_trial(scenario, run_folder, twice, apart)
         except BaseException as error:
             traceback.print_exc(file=stacks)
             return Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")

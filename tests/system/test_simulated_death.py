@@ -1,8 +1,10 @@
 """A simulation in one process outlives what ends a process in its midst: that is the death of the vehicle."""
 
 import json
+import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -12,16 +14,19 @@ from tests.support.paths import ROOT
 from tests.system.conftest import TIMEOUT_S, VNET
 
 PROGRAM = """
-import ctypes, os, pathlib, signal
+import asyncio, ctypes, os, pathlib, signal, threading
 async def main(node):
     async for fix in node.gnss:
         if node.id == "v02" and fix.time_ns == 500_000_000:
             END
         await node.radio.broadcast(b"x")
 """
+FAULT = "ctypes.string_at(0)"
+ENDLESS = "pathlib.Path('new').write_text(str(os.getpid())); os.rename('new', 'pid')\n            while True: pass"
 
 
 def command(folder: Path, end: str) -> list[str]:
+    scenario(folder)
     (folder / "deadly.py").write_text(PROGRAM.replace("END", end))
     return [*VNET, "simulate", "beacon.toml", "--program", "deadly.py:main", "--out", "run", "--no-report"]
 
@@ -32,28 +37,162 @@ def scenario(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     "end",
-    ["ctypes.string_at(0)", "os.kill(os.getpid(), signal.SIGSEGV)", "ctypes.CDLL(None)._exit(0)"],
+    [
+        FAULT,
+        "os.kill(os.getpid(), signal.SIGSEGV)",
+        "ctypes.CDLL(None)._exit(0)",
+        "await asyncio.to_thread(ctypes.string_at, 0)",
+        "thread = threading.Thread(target=ctypes.string_at, args=(0,)); thread.start(); thread.join()",
+    ],
 )
 def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end: str) -> None:
-    scenario(tmp_path)
     done = subprocess.run(command(tmp_path, end), cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert done.returncode == 1, done.stderr
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
     assert verdict["verdict"] == "invalid"
     assert (tmp_path / "run" / "trace.parquet").exists()
-    events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
-    assert {event["node"] for event in events if event["kind"] == "died"} == {"v02"}
+    assert died(tmp_path / "run") == {"v02"}
     assert "v02" in done.stdout
+
+
+def died(folder: Path) -> set[str]:
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    return {event["node"] for event in events if event["kind"] == "died"}
+
+
+def test_vehicles_that_end_the_process_die_and_no_others(tmp_path: Path) -> None:
+    end = f"pass\n        if node.id in ('v04', 'v07') and fix.time_ns == 700_000_000:\n            {FAULT}"
+    done = subprocess.run(command(tmp_path, end), cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == 1, done.stderr
+    assert died(tmp_path / "run") == {"v04", "v07"}
+    end = end.replace("pass", FAULT, 1)
+    done = subprocess.run(
+        [*command(tmp_path, end), "--out", "all"], cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    assert died(tmp_path / "all") == {"v02", "v04", "v07"}
+
+
+@pytest.mark.parametrize(
+    "options", [["--quiet"], ["--log-format", "json"], ["--rerun", "save"], ["--check-determinism"]]
+)
+def test_options_hold_for_the_run_that_is_made_again(tmp_path: Path, options: list[str]) -> None:
+    """Standard output has one result, and the folder what was asked for."""
+    done = subprocess.run(
+        [*command(tmp_path, FAULT), *options], cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    assert done.returncode == 1, done.stderr
+    assert done.stdout.count('"verdict": "invalid"' if "json" in options else "verdict: invalid") >= 1
+    if options[0] in ("--quiet", "--log-format"):
+        assert len(done.stdout.splitlines()) == 1
+    verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
+    checks = {check["name"]: check for check in verdict["checks"]}
+    assert died(tmp_path / "run") == {"v02"}
+    assert (tmp_path / "run" / "recording.rrd").exists() is ("--rerun" in options)
+    if options == ["--check-determinism"]:
+        assert checks["replay"]["verdict"] == "unknown", "when a process ends depends on how the run is made"
+    assert [name for name, check in checks.items() if check["verdict"] == "invalid"] == ["agents_alive"]
+
+
+def test_no_folder_is_left_of_the_first_attempt(tmp_path: Path) -> None:
+    without_out = [each for each in command(tmp_path, FAULT) if each not in ("--out", "run")]
+    done = subprocess.run(without_out, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == 1, done.stderr
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["beacon-1", "latest"]
+    assert died(tmp_path / "runs" / "latest") == {"v02"}
+
+
+def test_a_closed_standard_output_does_not_lose_the_verdict(tmp_path: Path) -> None:
+    with subprocess.Popen(
+        command(tmp_path, FAULT), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        process.wait(TIMEOUT_S)
+    assert json.loads((tmp_path / "run" / "verdict.json").read_text())["verdict"] == "invalid"
+
+
+def waits(pid: int) -> bool:
+    """Return whether a process sleeps, and has taken every signal that was sent to it."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return "State:\tS" in status and "ShdPnd:\t0000000000000000" in status
+
+
+@pytest.mark.parametrize("to_all", [True, False])
+def test_one_interrupt_ends_the_run_once(tmp_path: Path, to_all: bool) -> None:
+    """Sent to the command alone, or to its group: either way programs yield, and the folder is kept."""
+    end = "pathlib.Path('reached').touch()\n            while not pathlib.Path('go').exists(): pass"
+    end += "\n            pathlib.Path('went').touch()"
+    arguments = [*command(tmp_path, end), "--duration", "600"]
+    process = subprocess.Popen(
+        arguments, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        while not (tmp_path / "reached").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGSTOP)  # so that a child in its group would see to the signal first
+        (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)
+        os.kill(process.pid, signal.SIGCONT)
+        assert process.stderr is not None
+        told = ""
+        while "vnet: interrupted" not in told:
+            told = process.stderr.readline()
+            assert told
+        while not waits(process.pid):  # what the command passed on now would be a second one
+            time.sleep(0.01)
+        (tmp_path / "go").touch()
+        _, errors = process.communicate(timeout=TIMEOUT_S)
+    finally:
+        process.kill()
+    assert process.returncode == 130, errors
+    assert (tmp_path / "went").exists(), "the program was to go on until it yields"
+    assert "vnet:" not in errors
+    events = (tmp_path / "run" / "events.jsonl").read_text()
+    assert events.count('"interrupted"') == 1 and '"died"' not in events
+    assert (tmp_path / "run" / "verdict.json").exists()
+
+
+def test_an_interrupt_at_the_terminal_comes_once(tmp_path: Path) -> None:
+    """The kernel sends it to all that are in the foreground."""
+    terminal, its = os.openpty()
+    arguments = [*command(tmp_path, "pathlib.Path('reached').touch()"), "--duration", "600", "--quiet"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", AT_TERMINAL, *arguments],
+        cwd=tmp_path,
+        start_new_session=True,
+        stdin=its,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        while not (tmp_path / "reached").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        os.write(terminal, b"\x03")
+        _, errors = process.communicate(timeout=TIMEOUT_S)
+    finally:
+        process.kill()
+        os.close(terminal)
+        os.close(its)
+    assert process.returncode == 130, errors
+    assert errors.splitlines() == ["vnet: interrupted, as soon as the programs yield; Ctrl-C again: at once"]
+    assert (tmp_path / "run" / "verdict.json").exists()
+
+
+AT_TERMINAL = (
+    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY); os.execv(sys.argv[1], sys.argv[1:])"
+)
+"""Make the terminal on standard input that of the session, whose foreground is this process, and run a command."""
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_signal_that_ends_the_command_ends_its_child(tmp_path: Path, number: signal.Signals) -> None:
     """And is not taken for the vehicle's death."""
-    scenario(tmp_path)
     pid_file = tmp_path / "pid"
-    end = f"pathlib.Path({str(tmp_path / 'new')!r}).write_text(str(os.getpid())); os.rename('new', 'pid')"
-    end += "\n            while True: pass"
-    process = subprocess.Popen(command(tmp_path, end), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        command(tmp_path, ENDLESS), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     try:
         while not pid_file.exists():
             assert process.poll() is None

@@ -6,9 +6,13 @@ import asyncio
 import time
 from collections import Counter
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from vnet.runtime.ready_queue import node_of
 from vnet.runtime.running_node import RunningNode
+
+if TYPE_CHECKING:
+    from vnet.node import Node
 
 
 class CpuMeter:
@@ -42,7 +46,11 @@ class CpuMeter:
         """The loop looks for callbacks: none is running."""
         if self._running is not None:
             self._charge(self._clock())
-            self._shown.show("")
+        self._shown.show("")
+
+    def wait_for(self, node: Node | None) -> None:
+        """The loop waits for a job of this node, on another thread."""
+        self._shown.show("" if node is None else node.id)
 
     def end_instant(self) -> None:
         """Nothing is left to do at this instant: count a wake-up of each node that has run."""

@@ -9,10 +9,13 @@ LONGEST_ID = 64
 
 
 class RunningNode:
-    """The node whose code runs in this process; processes that are forked from it later write to the same place."""
+    """The node whose code runs in this process; processes that are forked from it later write to the same place.
 
-    def __init__(self) -> None:
-        self._memory = mmap.mmap(-1, LONGEST_ID)
+    `file` is the descriptor of that place, of `LONGEST_ID` bytes, where a process that is not forked reads it.
+    """
+
+    def __init__(self, file: int = -1) -> None:
+        self._memory = mmap.mmap(file, LONGEST_ID)
         self._shown = ""
         self._written: dict[str, bytes] = {}
         """The bytes that stand for each node."""

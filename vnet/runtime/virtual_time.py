@@ -226,7 +226,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._rounds = 0
         self._now_ns = 0
         self._ending = False
-        self._jobs: list[tuple[Job[Any], asyncio.Future[Any]]] = []
+        self._jobs: list[tuple[Job[Any], Future]] = []
         self._timers = count()
         self._meter: CpuMeter | None = None
         self._ordered: OrderedQueue | None = None
@@ -453,7 +453,10 @@ class VirtualTimeLoop(SkewedLoop):
         return outer
 
     def _wait_for_jobs(self, poll: Callable[[float | None], list[Any]]) -> list[Any]:
-        if not all(job.done() for job, _ in self._jobs):
+        pending = next((outer for job, outer in self._jobs if not job.done()), None)
+        if pending is not None:
+            if self._meter is not None and pending.job_context is not None:
+                self._meter.wait_for(pending.job_context.get(current_node))
             return poll(None)  # a finished job, or a call from a job's thread, wakes the self-pipe
         jobs, self._jobs = self._jobs, []
         for job, outer in jobs:

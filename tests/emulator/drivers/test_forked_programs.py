@@ -68,6 +68,12 @@ async def ends_its_process(node: Node) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+async def two_end_their_process(node: Node) -> None:
+    async for fix in node.gnss:
+        if node.id in ("v03", "v05") and fix.time_ns == AT_NS:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
 kept_open: list[Any] = []
 
 
@@ -142,6 +148,22 @@ def test_a_vehicle_apart_dies_alone(tmp_path: Path) -> None:
     died = [event for event in emulation.folder.events if event.kind == "died"]
     assert [(event.node, event.details["how"]) for event in died] == [("v05", "SIGKILL")]
     assert "the reason\n" in (tmp_path / "run" / "logs" / "v05.log").read_text()
+
+
+def test_vehicles_that_end_their_processes_die_alone(tmp_path: Path) -> None:
+    emulation = emulate(tmp_path / "run", program=entry(two_end_their_process))
+    simulate(emulation, apart="v05")
+    assert {event.node for event in emulation.folder.events if event.kind == "died"} == {"v03", "v05"}
+
+
+def test_a_vehicle_that_ended_the_process_of_all_has_died_though_it_ends_not_its_own(tmp_path: Path) -> None:
+    emulation = emulate(tmp_path / "run")
+    simulate(emulation, apart="v05")
+    judgement, _ = conclude(emulation, 1.0, "simulate")
+    assert judgement.exit_status == 1
+    assert [event.node for event in emulation.folder.events if event.kind == "died"] == ["v05"]
+    with pytest.raises(VnetError, match="none did"):
+        simulate(emulate(tmp_path / "unknown"), apart="")
 
 
 def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,8 @@
 """Programs with planted mistakes, for campaigns and tests to find."""
 
 import asyncio
+import ctypes
+import os
 
 from vnet import Node
 
@@ -27,6 +29,26 @@ async def proud(node: Node) -> None:
             heard_ns = node.now_ns
         alone = node.now_ns - heard_ns > 5 * PERIOD_NS
         node.report((float("nan"), 0.0) if alone else fix.position_m, fix.covariance_m2)
+
+
+async def faulty(node: Node) -> None:
+    """A beacon whose first two vehicles address memory that is not there."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        if fix.time_ns == 5 * PERIOD_NS and node.id in ("v01", "v02"):
+            ctypes.string_at(0)
+
+
+async def faulty_in_company(node: Node) -> None:
+    """A beacon whose first vehicle ends its process if that is another's, too."""
+    company.append(node.id)
+    async for _ in node.gnss:
+        await node.radio.broadcast(b"here")
+        if node.id == "v01" and len(company) > 1:
+            os.abort()
+
+
+company: list[str] = []
 
 
 async def stubborn(node: Node) -> None:

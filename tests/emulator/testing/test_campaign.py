@@ -130,6 +130,27 @@ def test_on_an_executor_a_campaign_finds_the_same(tmp_path: Path) -> None:
     assert (Path(kept["folder"]) / "verdict.json").exists(), "what has failed is kept on this machine"
 
 
+def test_a_fatal_signal_is_the_death_of_its_vehicle(tmp_path: Path) -> None:
+    plan = Plan.of(planted("faulty"), "none", 1, seed=1, shrink_steps=3)
+    status, _ = run(plan, tmp_path / "campaign")
+    (row,) = results_of(tmp_path / "campaign")
+    assert status == 1
+    assert list(row["failed"]) == ["agents_alive"]
+    assert "SIGSEGV" in row["failed"]["agents_alive"]
+    verdict = json.loads((Path(row["folder"]) / "verdict.json").read_text())
+    (alive,) = (check for check in verdict["checks"] if check["name"] == "agents_alive")
+    assert "v01" in {each["node"] for each in alive["figures"]["gone"]}
+    assert list(failures(Path(row["folder"]) / "scenario.toml", tmp_path / "again", 60)) == ["agents_alive"]
+
+
+def test_a_process_that_ends_only_with_all_vehicles_in_it_has_failed() -> None:
+    pool = TrialPool(60.0, planted("faulty_in_company"))
+    trial = pool.run_anywhere(planted("faulty_in_company"))
+    pool.close()
+    assert trial.failed == ["emulator"]
+    assert "SIGABRT" in trial.texts["emulator"]
+
+
 @pytest.mark.parametrize(
     ("error", "failed"),
     [(WorkerTimeoutError("not over within 2 s"), ["hung"]), (WorkerDiedError("killed"), ["emulator"])],

@@ -17,7 +17,7 @@ class Here(TrialPool):
         super().__init__(60.0, scenario)
         self.runs = 0
 
-    def run(self, scenario: Scenario, folder: Path) -> Trial:
+    def run(self, scenario: Scenario, folder: Path, apart: bool = False) -> Trial:
         self.runs += 1
         return run_trial(scenario, RunFolder.create(folder, scenario))
 

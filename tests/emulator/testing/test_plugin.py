@@ -1,6 +1,7 @@
 """The pytest plugin: tests that pass, fail, step, break and judge runs, as users write them."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,18 @@ def run_tests(pytester: pytest.Pytester, code: str, *options: str) -> pytest.Run
     header = f"import pytest\nBEACON = {str(BEACON)!r}\nTWELVE = {str(TWELVE)!r}\n"
     pytester.makepyfile(header + code)
     return pytester.runpytest(*options)
+
+
+def session_of_its_own(pytester: pytest.Pytester, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run pytest in a process of its own, which may end by a signal."""
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", *options],
+        cwd=pytester.path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def verdict_of(folder: Path) -> dict[str, Any]:
@@ -50,6 +63,38 @@ async def test_steps(vnet_emulation):
 """,
     )
     result.assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize("options", [["-p", "no:xdist"], ["-n", "2"], ["-s", "-p", "no:faulthandler"]])
+def test_a_fatal_signal_ends_pytest_and_the_vehicle_is_named(pytester: pytest.Pytester, options: list[str]) -> None:
+    pytester.makepyfile(
+        f"""
+async def test_fatal(vnet_emulation):
+    changes = dict(duration=2, settle=0.5, program="tests.emulator.testing.programs:faulty")
+    async with vnet_emulation({str(BEACON)!r}, vehicles=3, **changes) as emu:
+        await emu.run_until(1.0)
+"""
+    )
+    done = session_of_its_own(pytester, *options)
+    assert done.returncode != 0, done.stdout
+    assert "vnet: pytest's process ended while the program of v01 ran" in done.stderr.splitlines()
+
+
+def test_a_session_that_ends_as_it_should_says_nothing(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        f"""
+import os
+async def test_leaves_in_the_midst(vnet_emulation):
+    async with vnet_emulation({str(BEACON)!r}, vehicles=2, duration=2, settle=0.5) as emu:
+        await emu.run_until(1.0)
+    pid = os.fork()
+    if not pid:
+        os._exit(0)
+    os.waitpid(pid, 0)
+"""
+    )
+    done = session_of_its_own(pytester)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_failed_check_names_the_folder_and_the_command(pytester: pytest.Pytester) -> None:
