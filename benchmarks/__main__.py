@@ -1,6 +1,6 @@
 """Run all benchmarks: a table on stderr, JSON on stdout. `python -m benchmarks [NAME ...]` runs some.
 
-`python -m benchmarks scale` prints the table of large runs instead.
+`python -m benchmarks scale` prints the table of large runs instead, `python -m benchmarks size` the code's size.
 """
 
 import json
@@ -312,6 +312,11 @@ def main() -> None:
         from benchmarks import scale
 
         scale.main(sys.argv[2:])
+        return
+    if sys.argv[1:] == ["size"]:
+        from benchmarks import size
+
+        print(size.table())
         return
     names = sys.argv[1:] or list(BENCHMARKS)
     for name in names:
