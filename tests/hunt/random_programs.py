@@ -22,6 +22,8 @@ from vnet import Node
 DELAYS_S = (0.0, 0.01, 0.02, 0.1)
 """Few, so that much happens at one instant."""
 LONGEST_PAYLOAD = 200
+FRAME_OF = 3
+"""Things said for a frame: the others only change the next one."""
 SHORTEST_STEP_S = 0.002
 """A pause behind each step: no vehicle does everything at one instant."""
 
@@ -36,10 +38,11 @@ class Vehicle:
         self.kept: list[Any] = []
 
     def say(self, text: str) -> None:
-        """Tell something by a frame, also where nothing can be awaited."""
+        """Tell something, now and then by a frame, also where nothing can be awaited."""
         self.digest = crc32(text.encode(), self.digest)
-        with suppress(StopIteration):
-            self.node.radio.broadcast(bytes(1 + self.digest % LONGEST_PAYLOAD)).send(None)
+        if self.digest % FRAME_OF == 0:
+            with suppress(StopIteration):
+                self.node.radio.broadcast(bytes(1 + self.digest % LONGEST_PAYLOAD)).send(None)
 
     def delay_s(self) -> float:
         """Draw a delay."""

@@ -102,9 +102,10 @@ _all_tasks, _as_completed, _wrap_future = asyncio.all_tasks, asyncio.as_complete
 
 def all_tasks(loop: asyncio.AbstractEventLoop | None = None) -> set[asyncio.Task[Any]]:
     """Return the pending tasks of a loop, of those that belong to programs only the present node's."""
+    loop = asyncio.get_running_loop() if loop is None else loop
     tasks = _all_tasks(loop)
     node = present_node()
-    if node is None:
+    if node is None or not _runs_programs(loop):
         return tasks
     own = sorted((each for each in tasks if getattr(each, "node", node) is node), key=hash)
     return set(own)
