@@ -46,20 +46,21 @@ class NodeLogHandler(logging.Handler):
 
 
 class NodeLines:
-    """Lines of nodes' logs, with the emulated time that `clock` gives in ns, up to `MOST_LINES` of each node."""
+    """Lines of nodes' logs, with their emulated time, up to `MOST_LINES` of each node."""
 
-    def __init__(self, write: Callable[[str, str], None], clock: Callable[[], int]) -> None:
+    def __init__(self, write: Callable[[str, str], None]) -> None:
         self._write = write
-        self._clock = clock
         self._count: Counter[str] = Counter()
 
-    def add(self, node: str, kind: str, level: str, text: str, details: Mapping[str, object]) -> None:
+    def add(
+        self, node: str, time_ns: int, kind: str, level: str, text: str, details: Mapping[str, object]
+    ) -> None:
         """Write a line of a program, or an event with its details, to a node's log, unless there were too many."""
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
         line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip().replace("\n", "\n    ")
         self._count[node] += 1
         if self._count[node] <= MOST_LINES:
-            self._write(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {line}")
+            self._write(node, f"{time_ns / NS_PER_S:.6f} {node} {level}: {line}")
         elif self._count[node] == MOST_LINES + 1:
             self._write(node, f"(further lines of {node} are left out after {MOST_LINES:,})")
 

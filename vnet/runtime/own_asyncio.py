@@ -88,6 +88,7 @@ class Task(asyncio.Task[Any], metaclass=_StandIn):
             self.node = present_node()
             if self.node is None and context is not None:
                 self.node = context.get(current_node)
+            loop.check_owner(self.node)  # type: ignore[union-attr]
             self._vnet_number = _next_number(self.node)
             if self.node is not None and options.get("name") is None:
                 options["name"] = f"Task-{next(self.node._task_names)}"
