@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from vnet.node import Node
 from vnet.runtime.current_node import present_node
@@ -29,6 +30,13 @@ class NodeLogHandler(logging.Handler):
     def createLock(self) -> None:
         """Make no lock: `write` needs none, and may wait for the emulator while others log."""
         self.lock = None
+
+    def handle(self, record: logging.LogRecord) -> Any:
+        """Take a record unless a filter refuses it; from Python 3.13 on logging's own method needs a lock."""
+        kept = self.filter(record)
+        if kept:
+            self.emit(kept if isinstance(kept, logging.LogRecord) else record)
+        return kept
 
     def emit(self, record: logging.LogRecord) -> None:
         """Take a record."""
