@@ -232,7 +232,7 @@ async def works_in_threads(v: Vehicle) -> None:
     """Give jobs to threads, some of which call what only the loop's may."""
     loop = asyncio.get_running_loop()
     refused: list[Callable[[], object]] = [
-        partial(v.say, "from a thread"),
+        lambda: v.node.radio.broadcast(b"from a thread").send(None),
         lambda: v.node.now_ns,
         v.node.radio.drain,
         partial(loop.call_soon_threadsafe, v.say, "soon"),
