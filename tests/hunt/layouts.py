@@ -1,4 +1,4 @@
-"""Run random programs in several layouts of processes, and compare what they sent and reported: `python -m tests.hunt.layouts`.
+"""Compare random programs in several layouts of processes: `python -m tests.hunt.layouts`.
 
 Simulations are made one after the other in workers that are kept: 2000 programs would else start 6000 interpreters.
 """
@@ -34,7 +34,11 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "pause", "at_s": 0.9, "duration_s": 0.3, "nodes": ["v03"]},  # while garbage is collected
     {"kind": "restart", "at_s": 1.1, "duration_s": 0.2, "nodes": ["v02"]},
 ]
-SIMULATED: dict[str, tuple[int, bool]] = {"simulated": (1, True), "3 processes": (3, True), "windows off": (1, False)}
+SIMULATED: dict[str, tuple[int, bool]] = {
+    "simulated": (1, True),
+    "3 processes": (3, True),
+    "windows off": (1, False),
+}
 """Number of processes, and whether there are windows."""
 LIVE: dict[str, list[str]] = {
     "live": ["run"],
@@ -128,13 +132,14 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="the first of their seeds")
     parser.add_argument("--workers", type=int, default=1, help="programs that are simulated at a time")
     options = parser.parse_args()
-    number = 0
+    found = 0
     for count, all_layouts in ((options.live, True), (options.simulated, False)):
         seeds = range(options.first, options.first + count)
-        for number, difference in enumerate(differences(seeds, all_layouts, options.workers), number + 1):
+        for difference in differences(seeds, all_layouts, options.workers):
             print(difference, flush=True)
-    print(f"{options.live} programs in all layouts, {options.simulated} in the simulated: {number} differences")
-    return 1 if number else 0
+            found += 1
+    print(f"{options.live} programs in all layouts, {options.simulated} in the simulated: {found} differences")
+    return 1 if found else 0
 
 
 if __name__ == "__main__":

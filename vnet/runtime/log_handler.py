@@ -60,9 +60,7 @@ class NodeLines:
         self._write = write
         self._count: Counter[str] = Counter()
 
-    def add(
-        self, node: str, time_ns: int, kind: str, level: str, text: str, details: Mapping[str, object]
-    ) -> None:
+    def add(self, node: str, time_ns: int, kind: str, level: str, text: str, details: Mapping[str, object]) -> None:
         """Write a line of a program, or an event with its details, to a node's log, unless there were too many."""
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
         line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip().replace("\n", "\n    ")

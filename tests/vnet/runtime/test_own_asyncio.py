@@ -166,7 +166,7 @@ def test_names_of_asyncio_stand_for_others_only_while_programs_run() -> None:
 
     World("v1").run(program)
     assert all(name is not own for name, own in zip(during[0], OWN, strict=True))
-    assert OWN == (asyncio.Future, asyncio.Task, asyncio.all_tasks, asyncio.as_completed, asyncio.wrap_future)
+    assert (asyncio.Future, asyncio.Task, asyncio.all_tasks, asyncio.as_completed, asyncio.wrap_future) == OWN
 
 
 def test_other_loops_have_asyncios_own_behaviour_while_programs_run() -> None:
