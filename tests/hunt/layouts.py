@@ -1,4 +1,7 @@
-"""Run random programs in several layouts of processes, and compare traces: `python -m tests.hunt.layouts`."""
+"""Compare random programs in several layouts of processes: `python -m tests.hunt.layouts`.
+
+Simulations are made one after the other in workers that are kept: 2000 programs would else start 6000 interpreters.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +9,37 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from zlib import crc32
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import tomli_w
+
+from emulator.cells.executors import each_done
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.scenario.source import scenario_of
+from emulator.world.world import build_world
 
 VNET = [sys.executable, "-P", "-W", "ignore", "-m", "emulator.cli"]
 FAULTS: list[dict[str, Any]] = [
-    {"kind": "restart", "at_s": 1.2, "duration_s": 0.4, "nodes": ["v02"]},
-    {"kind": "pause", "at_s": 0.9, "duration_s": 0.5, "nodes": ["v03"]},
+    {"kind": "pause", "at_s": 0.9, "duration_s": 0.3, "nodes": ["v03"]},  # while garbage is collected
+    {"kind": "restart", "at_s": 1.1, "duration_s": 0.2, "nodes": ["v02"]},
 ]
-SIMULATED: dict[str, list[str]] = {
-    "simulated": ["simulate"],
-    "processes": ["simulate", "--processes", "3"],
-    "windows off": ["simulate", "--set", "run.windows=false"],
+SIMULATED: dict[str, tuple[int, bool]] = {
+    "simulated": (1, True),
+    "3 processes": (3, True),
+    "windows off": (1, False),
 }
+"""Number of processes, and whether there are windows."""
 LIVE: dict[str, list[str]] = {
     "live": ["run"],
     "live, windows off": ["run", "--set", "run.windows=false"],
@@ -31,12 +48,13 @@ LIVE: dict[str, list[str]] = {
     "spawn": ["run", "--set", "run.start=spawn"],
     "two hosts": ["run", "--hosts", "2"],
 }
+"""Commands, with their options."""
 
 
-def scenario_of(seed: int) -> dict[str, Any]:
-    """Return the scenario of a random program; two of three have faults."""
+def settings_of(seed: int) -> dict[str, Any]:
+    """Return the scenario of a random program; two of three have faults, one of four has two collections."""
     return {
-        "run": {"name": f"random{seed}", "duration_s": 2.5, "settle_s": 0.5},
+        "run": {"name": f"random{seed}", "duration_s": 2.4 if seed % 4 == 3 else 1.4, "settle_s": 0.1},
         "network": {"vehicles": 3},
         "world": {"gnss": {"rate_hz": 5}},
         "radio": {"loss": 0.1, "range_m": 1e6},
@@ -45,32 +63,65 @@ def scenario_of(seed: int) -> dict[str, Any]:
     }
 
 
-def trace_of(folder: Path, seed: int, layout: list[str]) -> str:
-    """Run a program in a layout; returns the trace's hash, or why there is none."""
-    path, out = folder / "random.toml", folder / "run"
-    path.write_text(tomli_w.dumps(scenario_of(seed)))
-    command, *options = layout
-    words = [*VNET, command, str(path), "--out", str(out), "--no-report", "--quiet", *options]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=300)
-    try:
-        return str(json.loads((out / "verdict.json").read_text())["trace_sha256"])
-    except OSError:
-        return f"status {done.returncode}: {done.stderr[-300:]}"
+@dataclass(frozen=True)
+class RandomProgram:
+    """A random program, by its seed."""
+
+    seed: int
+
+    @property
+    def scenario(self) -> Scenario:
+        """Scenario that runs it."""
+        return with_order_steps(scenario_of(settings_of(self.seed), {"run.pacing": "lockstep"}))
+
+    @property
+    def labels(self) -> str:
+        """Name in messages."""
+        return f"seed {self.seed}"
 
 
-def differences(seeds: Iterable[int], layouts: dict[str, list[str]]) -> list[str]:
-    """Return the layouts in which programs gave another trace than in the first, with their seeds."""
-    found = []
-    for seed in seeds:
-        traces = {}
-        for name, layout in layouts.items():
-            if scenario_of(seed)["fault"] and name.startswith("nodes"):
-                continue  # faults of one vehicle in a process of several are refused
-            with TemporaryDirectory() as folder:
-                traces[name] = trace_of(Path(folder), seed, layout)
-        first = traces[next(iter(layouts))]
-        found += [f"seed {seed}, {name}: {trace}" for name, trace in traces.items() if trace != first]
-    return found
+def simulated(program: RandomProgram) -> dict[str, str]:
+    """Return digests of the program's runs, simulated from this process in each layout."""
+    traces = {}
+    for name, (processes, windows) in SIMULATED.items():
+        scenario = program.scenario
+        scenario = scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": windows})})
+        with TemporaryDirectory() as folder:
+            emulation = Emulation(scenario, build_world(scenario), RunFolder.scratch(Path(folder) / "run"))
+            simulate(emulation, processes=processes)
+            traces[name] = digest(emulation.engine.trace.sha256(), emulation.metrics.states_table())
+    return traces
+
+
+def digest(trace_sha256: str, states: pa.Table) -> str:
+    """Return a digest of what vehicles sent and reported; by text, because NaN is not equal to itself."""
+    return f"{trace_sha256[:16]} {crc32(repr(states.to_pydict()).encode()):08x}"
+
+
+def live(seed: int) -> Iterator[tuple[str, str]]:
+    """Yield the layouts with a process for some vehicles, and the run's digest, or why there is none."""
+    for name, (command, *options) in LIVE.items():
+        if settings_of(seed)["fault"] and name.startswith("nodes"):
+            continue  # faults of one vehicle in a process of several are refused
+        with TemporaryDirectory() as folder:
+            path, out = Path(folder) / "random.toml", Path(folder) / "run"
+            path.write_text(tomli_w.dumps(settings_of(seed)))
+            words = [*VNET, command, str(path), "--out", str(out), "--no-report", "--quiet", *options]
+            done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+            try:
+                verdict = json.loads((out / "verdict.json").read_text())
+                yield name, digest(verdict["trace_sha256"], pq.read_table(out / "states.parquet"))
+            except OSError:
+                yield name, f"status {done.returncode}: {done.stderr[-300:]}"
+
+
+def differences(seeds: Iterable[int], all_layouts: bool = False, workers: int = 1) -> Iterator[str]:
+    """Yield the layouts in which programs sent or reported something else than in the first, with their seeds."""
+    programs = [RandomProgram(seed) for seed in seeds]
+    for program, traces in each_done(programs, simulated, most=workers):
+        found: Mapping[str, str] = traces | dict(live(program.seed)) if all_layouts else traces
+        expected = found["simulated"]
+        yield from (f"seed {program.seed}, {name}: {found[name]}" for name in found if found[name] != expected)
 
 
 def main() -> int:
@@ -78,12 +129,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.hunt.layouts", description=__doc__)
     parser.add_argument("--simulated", type=int, default=2000, help="programs in the simulated layouts")
     parser.add_argument("--live", type=int, default=100, help="programs in all layouts")
+    parser.add_argument("--first", type=int, default=0, help="the first of their seeds")
+    parser.add_argument("--workers", type=int, default=1, help="programs that are simulated at a time")
     options = parser.parse_args()
-    found = differences(range(options.simulated), SIMULATED)
-    found += differences(range(options.live), {"simulated": SIMULATED["simulated"], **SIMULATED, **LIVE})
-    print("\n".join(found) or f"{options.simulated} and {options.live} programs: no differences")
+    found = 0
+    for count, all_layouts in ((options.live, True), (options.simulated, False)):
+        seeds = range(options.first, options.first + count)
+        for difference in differences(seeds, all_layouts, options.workers):
+            print(difference, flush=True)
+            found += 1
+    print(f"{options.live} programs in all layouts, {options.simulated} in the simulated: {found} differences")
     return 1 if found else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from tests.hunt import layouts  # workers import it by this name
+
+    sys.exit(layouts.main())

@@ -22,6 +22,8 @@ from vnet import Node
 DELAYS_S = (0.0, 0.01, 0.02, 0.1)
 """Few, so that much happens at one instant."""
 LONGEST_PAYLOAD = 200
+FRAME_OF = 3
+"""Things said for a frame: the others only change the next one."""
 SHORTEST_STEP_S = 0.002
 """A pause behind each step: no vehicle does everything at one instant."""
 
@@ -36,10 +38,11 @@ class Vehicle:
         self.kept: list[Any] = []
 
     def say(self, text: str) -> None:
-        """Tell something by a frame, also where nothing can be awaited."""
+        """Tell something, now and then by a frame, also where nothing can be awaited."""
         self.digest = crc32(text.encode(), self.digest)
-        with suppress(StopIteration):
-            self.node.radio.broadcast(bytes(1 + self.digest % LONGEST_PAYLOAD)).send(None)
+        if self.digest % FRAME_OF == 0:
+            with suppress(StopIteration):
+                self.node.radio.broadcast(bytes(1 + self.digest % LONGEST_PAYLOAD)).send(None)
 
     def delay_s(self) -> float:
         """Draw a delay."""
@@ -229,7 +232,7 @@ async def works_in_threads(v: Vehicle) -> None:
     """Give jobs to threads, some of which call what only the loop's may."""
     loop = asyncio.get_running_loop()
     refused: list[Callable[[], object]] = [
-        partial(v.say, "from a thread"),
+        lambda: v.node.radio.broadcast(b"from a thread").send(None),
         lambda: v.node.now_ns,
         v.node.radio.drain,
         partial(loop.call_soon_threadsafe, v.say, "soon"),

@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from msgspec.structs import replace
+
 from vnet.driving import Action
 from vnet.mailbox import Mailbox
 from vnet.node import Fix, Node
@@ -78,7 +80,7 @@ class Host:
         self._on_traffic = on_traffic
         self._on_line = on_line
         self._outbox = Outbox()
-        self._lines = NodeLines(on_line, clock)
+        self._lines = NodeLines(on_line)
         self._log_handler = NodeLogHandler(self._log)
         self._window = Window()
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
@@ -91,8 +93,9 @@ class Host:
         self.busy = MeasuredBusyRatios([*self.nodes], clock)
         self.news = News()
         self._paused: set[str] = set()
-        self._late: list[tuple[str, str, object]] = []
-        """Sends of finalizers of paused programs: in a process of its own the collector runs after the pause."""
+        self._late: list[tuple[str, Callable[[int], None]]] = []
+        """Sends of finalizers of paused programs, to be called with the time at which the pause is over: in a
+        process of its own the collector runs then."""
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
@@ -170,10 +173,22 @@ class Host:
         if self.nodes.get(node.id) is node:
             self._note(node.id, "log", level, text, {})
 
-    def _note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
-        note = wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details)  # type: ignore[arg-type]
+    def _note(
+        self,
+        node: str,
+        kind: str,
+        level: str,
+        text: str,
+        details: dict[str, NoteDetail],
+        time_ns: int | None = None,
+    ) -> None:
+        if node in self._paused:
+            self._late.append((node, partial(self._note, node, kind, level, text, details)))
+            return
+        time_ns = self._clock() if time_ns is None else time_ns
+        note = wire.Note(node, time_ns, kind, level, text[:LONGEST_NOTE], details)  # type: ignore[arg-type]
         self._outbox.notes.append(note)
-        self._lines.add(node, kind, level, text, details)
+        self._lines.add(node, time_ns, kind, level, text, details)
         self._on_traffic()
 
     def send_action(self, action: Action) -> None:
@@ -181,13 +196,15 @@ class Host:
         self._check_thread(action.node, "drive()")
         self._enqueue(action.node, "actions", action)
 
-    def _enqueue(self, node: str, queue: str, item: object) -> None:
+    def _enqueue(self, node: str, queue: str, item: object, time_ns: int | None = None) -> None:
         if node in self._paused:
-            self._late.append((node, queue, item))
+            self._late.append((node, partial(self._enqueue, node, queue, item)))
         elif self._active[node]:
+            if time_ns is not None and isinstance(item, Report):
+                item = replace(item, time_ns=self._clocks.shown_ns(node, time_ns))
             getattr(self._outbox, queue).append(item)
             if self._call_log is not None:
-                self._call_log.add(node, self._clock(), item)
+                self._call_log.add(node, self._clock() if time_ns is None else time_ns, item)
             self._on_traffic()
 
     # What the transport asks of the host.
@@ -271,9 +288,6 @@ class Host:
         """Pause these nodes from now on, and no others: their callbacks wait (simulated)."""
         self._paused = set(nodes)
         self._hold()
-        late, self._late = self._late, []
-        for node, queue, item in late:
-            self._enqueue(node, queue, item)
 
     def _hold(self) -> None:
         assert isinstance(self._loop, VirtualTimeLoop)
@@ -319,6 +333,9 @@ class Host:
         """
         if self._heap is not None:
             self._heap.scatter()
+        late, self._late = self._late, []
+        for _, say in late:
+            say(grant.time_ns)
         packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
         self._window.open(grant.end_ns, packets)
         if grant.busy:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from vnet.node import Node
 from vnet.runtime.current_node import present_node
@@ -30,6 +31,13 @@ class NodeLogHandler(logging.Handler):
         """Make no lock: `write` needs none, and may wait for the emulator while others log."""
         self.lock = None
 
+    def handle(self, record: logging.LogRecord) -> Any:
+        """Take a record unless a filter refuses it; from Python 3.13 on logging's own method needs a lock."""
+        kept = self.filter(record)
+        if kept:
+            self.emit(kept if isinstance(kept, logging.LogRecord) else record)
+        return kept
+
     def emit(self, record: logging.LogRecord) -> None:
         """Take a record."""
         node = present_node()
@@ -46,20 +54,19 @@ class NodeLogHandler(logging.Handler):
 
 
 class NodeLines:
-    """Lines of nodes' logs, with the emulated time that `clock` gives in ns, up to `MOST_LINES` of each node."""
+    """Lines of nodes' logs, with their emulated time, up to `MOST_LINES` of each node."""
 
-    def __init__(self, write: Callable[[str, str], None], clock: Callable[[], int]) -> None:
+    def __init__(self, write: Callable[[str, str], None]) -> None:
         self._write = write
-        self._clock = clock
         self._count: Counter[str] = Counter()
 
-    def add(self, node: str, kind: str, level: str, text: str, details: Mapping[str, object]) -> None:
+    def add(self, node: str, time_ns: int, kind: str, level: str, text: str, details: Mapping[str, object]) -> None:
         """Write a line of a program, or an event with its details, to a node's log, unless there were too many."""
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
         line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip().replace("\n", "\n    ")
         self._count[node] += 1
         if self._count[node] <= MOST_LINES:
-            self._write(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {line}")
+            self._write(node, f"{time_ns / NS_PER_S:.6f} {node} {level}: {line}")
         elif self._count[node] == MOST_LINES + 1:
             self._write(node, f"(further lines of {node} are left out after {MOST_LINES:,})")
 

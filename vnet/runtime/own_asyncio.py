@@ -88,6 +88,7 @@ class Task(asyncio.Task[Any], metaclass=_StandIn):
             self.node = present_node()
             if self.node is None and context is not None:
                 self.node = context.get(current_node)
+            loop.check_owner(self.node)  # type: ignore[union-attr]
             self._vnet_number = _next_number(self.node)
             if self.node is not None and options.get("name") is None:
                 options["name"] = f"Task-{next(self.node._task_names)}"
@@ -102,9 +103,10 @@ _all_tasks, _as_completed, _wrap_future = asyncio.all_tasks, asyncio.as_complete
 
 def all_tasks(loop: asyncio.AbstractEventLoop | None = None) -> set[asyncio.Task[Any]]:
     """Return the pending tasks of a loop, of those that belong to programs only the present node's."""
+    loop = asyncio.get_running_loop() if loop is None else loop
     tasks = _all_tasks(loop)
     node = present_node()
-    if node is None:
+    if node is None or not _runs_programs(loop):
         return tasks
     own = sorted((each for each in tasks if getattr(each, "node", node) is node), key=hash)
     return set(own)

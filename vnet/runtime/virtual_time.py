@@ -33,7 +33,7 @@ from vnet.runtime.asyncio_internals import NodeHandle, NumberedTimer
 from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.current_node import current_node, present_node
 from vnet.runtime.event_order import Chooser
-from vnet.runtime.outside_loop import collected_by_schedule
+from vnet.runtime.outside_loop import collected_by_schedule, collector
 from vnet.runtime.own_asyncio import Future, Task
 from vnet.runtime.ready_queue import OrderedQueue, ReadyQueue
 from vnet.transport.orders import Deviation
@@ -77,6 +77,9 @@ class SkewedLoop(asyncio.SelectorEventLoop):
     """Called with the same; returns the node that has left the exception unhandled."""
     on_task: Callable[[Task], None] = staticmethod(lambda task: None)
     """Called with each new task."""
+
+    def check_owner(self, node: Node | None) -> None:
+        """Check whose a new task or callback is."""
 
     def __init__(self, selector: selectors.BaseSelector | None = None) -> None:
         self._handlers: WeakKeyDictionary[Node, Callable[[Any, dict[str, Any]], object] | None] = (
@@ -292,6 +295,7 @@ class VirtualTimeLoop(SkewedLoop):
             when = round(when * NS_PER_S) / NS_PER_S
         timer = NumberedTimer(next(self._timers), when, callback, args, self, context)
         timer.node = self._node_of(timer, callback)
+        self.check_owner(timer.node)
         if self._ordered is not None:
             timer.setter = self._ordered.setter(present_node(), asyncio.current_task(self))
         asyncio_internals.push_timer(self, timer)
@@ -308,6 +312,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._check_thread()
         handle = NodeHandle(callback, args, self, context)
         handle.node = self._node_of(handle, callback)
+        self.check_owner(handle.node)
         asyncio_internals.push_ready(self, handle)
         return handle
 
@@ -317,6 +322,14 @@ class VirtualTimeLoop(SkewedLoop):
             return node  # type: ignore[return-value]
         task = getattr(callback, "__self__", None)
         return task.node if isinstance(task, Task) else self.running_node
+
+    def check_owner(self, node: Node | None) -> None:
+        """Check whose a new task or callback is. Raises RuntimeError for a finalizer's, which is nobody's."""
+        if node is None and collector.runs:
+            raise RuntimeError(
+                "a finalizer (__del__) that the garbage collector calls starts a task, a callback or a timer: "
+                "nothing says which vehicle's it is; close what must end by `async with` or `try … finally`"
+            )
 
     def _check_thread(self) -> None:
         if self._thread is not None and self._thread != threading.get_ident():

@@ -1,0 +1,196 @@
+"""Garbage of programs: when it is collected, and what acts then."""
+
+import asyncio
+import gc
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.vnet.runtime.test_host import World
+from vnet import Node
+from vnet.reports import Report
+from vnet.runtime.outside_loop import MOST_UNCOLLECTED, collected_by_schedule
+from vnet.transport import wire
+
+SECOND_NS = 1_000_000_000
+
+
+class InCycle:
+    """An object that calls `act` when the collector finds it."""
+
+    def __init__(self, act: Callable[[], object]) -> None:
+        self.itself, self.act = self, act
+
+    def __del__(self) -> None:
+        self.act()
+
+
+@pytest.fixture
+def thresholds() -> Iterator[tuple[int, int, int]]:
+    """Have the collector's thresholds as they were, whatever a test does."""
+    before = gc.get_threshold()
+    yield before
+    gc.set_threshold(*before)
+
+
+def test_the_collector_waits_within_the_block_alone(thresholds: tuple[int, int, int]) -> None:
+    gc.set_threshold(500, 7, 8)
+    gc.unfreeze()  # what an earlier test has left
+    with collected_by_schedule():
+        with collected_by_schedule():
+            assert gc.get_threshold()[0] == MOST_UNCOLLECTED
+            assert gc.get_freeze_count() > 0
+        assert gc.get_threshold()[0] == MOST_UNCOLLECTED
+    assert gc.get_threshold() == (500, 7, 8)
+    assert gc.get_freeze_count() == 0
+
+
+def test_a_collector_that_is_switched_off_by_its_threshold_stays_so(thresholds: tuple[int, int, int]) -> None:
+    gc.set_threshold(0)
+    with collected_by_schedule():
+        assert gc.get_threshold()[0] == 0
+    assert gc.get_threshold()[0] == 0
+
+
+def test_what_was_frozen_before_stays_frozen() -> None:
+    gc.freeze()
+    try:
+        with collected_by_schedule():
+            pass
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()
+
+
+@pytest.mark.parametrize("others", [(), ("v2",), ("v2", "v3")])
+def test_garbage_is_found_at_the_next_second_whoever_shares_the_loop(others: tuple[str, ...]) -> None:
+    found_ns: list[int] = []
+
+    async def program(node: Node) -> None:
+        if node.id != "v1":
+            while True:
+                await asyncio.sleep(0.07)
+        for _ in range(4):
+            await asyncio.sleep(0.65)
+            InCycle(lambda: found_ns.append(node.now_ns))
+
+    World(*others, "v1").run(program)
+    assert found_ns == [SECOND_NS, 2 * SECOND_NS, 2 * SECOND_NS, 3 * SECOND_NS]
+
+
+def test_nothing_is_collected_where_nothing_has_run() -> None:
+    collections: list[int] = []
+    world = World("v1")
+
+    def count(phase: str, info: dict[str, int]) -> None:
+        if phase == "start" and info["generation"] == 2:
+            collections.append(world.loop.now_ns)
+
+    async def program(node: Node) -> None:
+        gc.callbacks.append(count)
+        await asyncio.sleep(5.5)
+        await asyncio.sleep(3)
+        gc.callbacks.remove(count)
+
+    world.run(program)
+    assert collections == [SECOND_NS, 6 * SECOND_NS]
+
+
+def test_an_abandoned_generator_is_closed_by_its_program_at_the_next_second() -> None:
+    closed: list[tuple[int, int]] = []
+
+    async def numbers(node: Node) -> AsyncIterator[int]:
+        try:
+            for number in range(9):
+                yield number
+        finally:
+            at_ns = node.now_ns
+            await asyncio.sleep(0.25)
+            closed.append((at_ns, node.now_ns))
+
+    async def program(node: Node) -> None:
+        kept: list[Any] = [numbers(node)]
+        kept.append(kept)
+        await anext(kept[0])
+        del kept
+        await asyncio.sleep(2)
+
+    World("v1").run(program)
+    assert closed == [(SECOND_NS, SECOND_NS + 250_000_000)]
+
+
+class Pauses(World):
+    """A world in which v1 is paused from 0.9 s on, until 1.5 s, where another shares its loop."""
+
+    def __init__(self, *nodes: str) -> None:
+        super().__init__(*nodes)
+        opens = self.host.open_window
+
+        def open_window(grant: wire.Grant) -> int:
+            self.host.pause(["v1"] if 900_000_000 <= grant.time_ns < 1_500_000_000 else [])
+            return opens(grant)
+
+        self.host.open_window = open_window  # type: ignore[method-assign, assignment]
+
+    @property
+    def reports(self) -> list[Report]:
+        return [report for traffic in self.traffic for report in traffic.reports]
+
+    @property
+    def notes(self) -> list[wire.Note]:
+        return [note for traffic in self.traffic for note in traffic.notes]
+
+
+def test_what_is_found_of_a_paused_vehicle_is_said_when_its_pause_is_over() -> None:
+    """A process that is paused collects when it goes on."""
+
+    async def program(node: Node) -> None:
+        def says() -> None:
+            node.report(late=True)
+            node.log("late")
+            node.event("late")
+
+        if node.id == "v1":
+            InCycle(says)
+        while True:
+            await asyncio.sleep(0.1)
+
+    world = Pauses("v1", "v2")
+    world.run(program)
+    assert [report.time_ns for report in world.reports] == [1_500_000_000]
+    assert [note.time_ns for note in world.notes] == [1_500_000_000] * 2
+
+
+def test_what_is_found_starts_no_task_that_would_be_nobodys() -> None:
+    refused: list[str] = []
+    acted: list[str] = []
+
+    async def acts() -> None:
+        acted.append("task")
+
+    async def program(node: Node) -> None:
+        loop = asyncio.get_running_loop()
+
+        def starts(start: Callable[[], object]) -> None:
+            try:
+                start()
+            except RuntimeError as error:
+                refused.append(str(error))
+
+        def task() -> None:
+            coroutine = acts()
+            try:
+                acted.append(asyncio.create_task(coroutine).get_name())
+            finally:
+                coroutine.close()
+
+        InCycle(lambda: starts(task))
+        InCycle(lambda: starts(lambda: loop.call_soon(acted.append, "soon")))
+        InCycle(lambda: starts(lambda: loop.call_later(0.1, acted.append, "later")))
+        await asyncio.sleep(2)
+
+    World("v1").run(program)
+    assert acted == []
+    assert len(refused) == 3
+    assert all("garbage collector" in text for text in refused)
