@@ -21,13 +21,10 @@ import pyarrow.parquet as pq
 import tomli_w
 
 from emulator.cells.executors import each_done
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.order_length import with_order_steps
-from emulator.drivers.simulate import simulate
+from emulator.drivers.session import Local, Session, with_order_steps
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.source import scenario_of
-from emulator.world.world import build_world
 
 VNET = [sys.executable, "-P", "-W", "ignore", "-m", "emulator.cli"]
 FAULTS: list[dict[str, Any]] = [
@@ -87,8 +84,9 @@ def simulated(program: RandomProgram) -> dict[str, str]:
         scenario = program.scenario
         scenario = scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": windows})})
         with TemporaryDirectory() as folder:
-            emulation = Emulation(scenario, build_world(scenario), RunFolder.scratch(Path(folder) / "run"))
-            simulate(emulation, processes=processes)
+            session = Session(scenario, RunFolder.scratch(Path(folder) / "run"), Local(processes))
+            session.run()
+            emulation = session.emulation
             traces[name] = digest(emulation.engine.trace.sha256(), emulation.metrics.states_table())
     return traces
 

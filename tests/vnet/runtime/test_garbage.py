@@ -10,10 +10,12 @@ import pytest
 from tests.vnet.runtime.test_host import World
 from vnet import Node
 from vnet.reports import Report
+from vnet.runtime import host
 from vnet.runtime.outside_loop import MOST_UNCOLLECTED, collected_by_schedule
 from vnet.transport import wire
 
 SECOND_NS = 1_000_000_000
+PERIOD_NS = 100_000_000
 
 
 class InCycle:
@@ -79,22 +81,43 @@ def test_garbage_is_found_at_the_next_second_whoever_shares_the_loop(others: tup
     assert found_ns == [SECOND_NS, 2 * SECOND_NS, 2 * SECOND_NS, 3 * SECOND_NS]
 
 
+@pytest.fixture
+def collects_each_period(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have young garbage collected each 100 ms, and so all of it each second."""
+    monkeypatch.setattr(host, "COLLECTION_NS", PERIOD_NS)
+
+
+@pytest.mark.usefixtures("collects_each_period")
 def test_nothing_is_collected_where_nothing_has_run() -> None:
-    collections: list[int] = []
+    collections: dict[int, list[int]] = {1: [], 2: []}
     world = World("v1")
 
     def count(phase: str, info: dict[str, int]) -> None:
-        if phase == "start" and info["generation"] == 2:
-            collections.append(world.loop.now_ns)
+        if phase == "start" and info["generation"]:
+            collections[info["generation"]].append(world.loop.now_ns // PERIOD_NS)
 
     async def program(node: Node) -> None:
         gc.callbacks.append(count)
-        await asyncio.sleep(5.5)
-        await asyncio.sleep(3)
+        for duration_s in (0.55, 0.3, 1.5):
+            await asyncio.sleep(duration_s)
         gc.callbacks.remove(count)
 
     world.run(program)
-    assert collections == [SECOND_NS, 6 * SECOND_NS]
+    assert collections == {1: [1, 6, 9], 2: [10]}
+
+
+@pytest.mark.usefixtures("collects_each_period")
+def test_what_has_grown_old_is_found_with_all_the_rest() -> None:
+    found_ns: list[int] = []
+
+    async def program(node: Node) -> None:
+        kept = [InCycle(lambda: found_ns.append(node.now_ns))]
+        await asyncio.sleep(0.35)
+        kept.clear()
+        await asyncio.sleep(1.5)
+
+    World("v1").run(program)
+    assert found_ns == [SECOND_NS]
 
 
 def test_an_abandoned_generator_is_closed_by_its_program_at_the_next_second() -> None:
