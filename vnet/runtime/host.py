@@ -15,6 +15,7 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
@@ -129,7 +130,7 @@ class Host:
         return node
 
     def _check_thread(self, node: str, call: str) -> None:
-        if self._thread is not None and self._thread != threading.get_ident():
+        if self._thread is not None and self._thread != get_ident():
             raise RuntimeError(
                 f"{node}: node.{call} in another thread than the event loop's: in lockstep nothing says at which "
                 "emulated time it acts; give the thread what it needs, return what it has found from "
@@ -224,7 +225,7 @@ class Host:
             self._debugger.attach(self._is_debugged, self._clock)
         loop.on_task = self._new_task
         if isinstance(loop, VirtualTimeLoop):
-            self._thread = threading.get_ident()
+            self._thread = get_ident()
             period_ns = next(iter(self.nodes.values())).period_ns
             loop.collect_every(max(1, round(COLLECTION_NS / period_ns)) * period_ns)
         for node in self.nodes.values():
@@ -398,7 +399,7 @@ class Host:
         """
         with self._lock:
             self._calls.append((self.nodes[self._fallback] if node is None else node, call, line_of_caller()))
-        if threading.get_ident() == self._thread:
+        if get_ident() == self._thread:
             self._take_process_ends()
 
     def _take_process_ends(self) -> None:

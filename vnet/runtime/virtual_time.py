@@ -17,13 +17,13 @@ import gc
 import os
 import selectors
 import sys
-import threading
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor
 from concurrent.futures import Future as Job
 from contextvars import Context, copy_context
 from functools import partial
 from itertools import count
+from threading import get_ident
 from typing import TYPE_CHECKING, Any, NoReturn
 from weakref import WeakKeyDictionary
 
@@ -309,10 +309,14 @@ class VirtualTimeLoop(SkewedLoop):
         return getattr(self._queue.running, "node", None)
 
     def _call_soon(self, callback: Callable[..., object], args: Any, context: Context | None) -> asyncio.Handle:
-        self._check_thread()
+        # Each callback passes here, so what seldom matters is asked for in one comparison.
+        if self._thread != get_ident():
+            self._check_thread()
         handle = NodeHandle(callback, args, self, context)
-        handle.node = self._node_of(handle, callback)
-        self.check_owner(handle.node)
+        node = self if context is None else context.get(current_node, self)
+        handle.node = self._node_of(handle, callback) if node is self else node
+        if handle.node is None:
+            self.check_owner(None)
         asyncio_internals.push_ready(self, handle)
         return handle
 
@@ -332,7 +336,7 @@ class VirtualTimeLoop(SkewedLoop):
             )
 
     def _check_thread(self) -> None:
-        if self._thread is not None and self._thread != threading.get_ident():
+        if self._thread is not None and self._thread != get_ident():
             raise RuntimeError(
                 "a thread calls into the event loop (loop.call_soon_threadsafe(), a future's set_result(), "
                 "asyncio.run_coroutine_threadsafe()): in lockstep nothing says at which emulated time it acts; "
@@ -365,7 +369,7 @@ class VirtualTimeLoop(SkewedLoop):
 
     def run_forever(self) -> None:
         """Run until the loop is stopped."""
-        self._thread = threading.get_ident()
+        self._thread = get_ident()
         try:
             with collected_by_schedule():
                 super().run_forever()
