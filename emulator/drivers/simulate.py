@@ -26,6 +26,7 @@ from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.memory import first_over
 from emulator.drivers.process_count import split_evenly
 from emulator.drivers.signals import signals_handled, tell_from_handler
+from emulator.records.events import EventKind
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_programs
@@ -68,7 +69,7 @@ def simulate(
         simulation = _Apart(emulation, barrier, groups, prints=apart is None)
     else:
         simulation = _Together(emulation, barrier, debug)
-    emulation.folder.event(0, "started", start_up_s=0.0)
+    emulation.folder.event(0, EventKind.started, start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
     try:
@@ -80,7 +81,7 @@ def simulate(
     except KeyboardInterrupt:
         interrupted = not barrier.is_over_limit
         if interrupted:
-            emulation.folder.event(simulation.now_ns, "interrupted")
+            emulation.folder.event(simulation.now_ns, EventKind.interrupted)
         emulation.finish(simulation.now_ns)
     return time.monotonic() - started, interrupted
 
