@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario, dump_scenario
 

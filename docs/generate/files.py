@@ -15,6 +15,7 @@ from emulator.records.backbone_table import BACKBONE
 from emulator.records.background_table import BACKGROUND
 from emulator.records.busy import busy_table
 from emulator.records.driven_table import driven_table
+from emulator.records.events import EventKind
 from emulator.records.metrics import METRICS
 from emulator.records.payloads import PAYLOADS
 from emulator.records.period_figures import PeriodFigures
@@ -192,91 +193,6 @@ STATES_ABOUT = (
     "of their own, called as they call it: [own figures](../how-to/own-figures.md). Those after the first "
     f"{MOST_COLUMNS} names stay in `values`."
 )
-EVENTS = {
-    "note": (
-        "",
-        "`what`",
-        "oddities of the input: vehicles left out, ids escaped, ways clipped",
-    ),
-    "code_changed": ("", "`what`", "program or vnet have changed since the run whose scenario this one repeats"),
-    "started": ("", "`start_up_s`", "all have joined; time 0"),
-    "ended": ("", "`wall_s`", "the run is over"),
-    "interrupted": ("", "", "Ctrl-C or SIGTERM"),
-    "finished": ("vehicle", "", "its program returned"),
-    "crashed": ("vehicle", "`error`, `where`", "its program raised; the traceback"),
-    "exception": (
-        "vehicle",
-        "`error`, `place`, `where`",
-        "its program raised and nobody handled it: at that instant, so that the line may come after later ones; "
-        "where, and the traceback",
-    ),
-    "log": ("vehicle", "`level`, `text`", "a line of `node.log`, or of the standard `logging` of its program"),
-    "event": ("vehicle", "`name`, `details`", "an event of its program: `node.event`"),
-    "left_out": ("vehicle", "`what`, `count`", "how many events of this kind are not here: there were too many"),
-    "files_left_out": (
-        "vehicle",
-        "`count`, `which`",
-        "how many files of its disk are not in `files/`, and of the first three the name and the reason",
-    ),
-    "spun": (
-        "vehicle",
-        "`error`, `where`",
-        "its program did not let time advance (busy loop); where its tasks stood",
-    ),
-    "died": ("vehicle", "`how`, `log_tail` or `process`", "its process ended without being told to"),
-    "stalled": (
-        "vehicle",
-        "`error`, `where`, `refused`",
-        "its process did not yield, or did not come back, in time; why its last message was refused, if it was",
-    ),
-    "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),
-    "entered": ("vehicle", "`incarnation`", "it is in the network, and its program starts"),
-    "left": ("vehicle", "", "it is not in the network any more"),
-    "drive_limited": (
-        "vehicle",
-        "`acceleration_m_s2`, `limit_m_s2` or `lane`, `reason`",
-        "`node.drive` asked for what the vehicle cannot do; of an acceleration the first time in a row",
-    ),
-    "collision": (
-        "vehicle",
-        "`with`, `closing_m_s`",
-        "a driven vehicle has run into another, which was ahead, or crossed its way",
-    ),
-    "lane_ended": ("vehicle", "`lane`", "on a map: a driven vehicle's lane has ended, and it is in this one now"),
-    "rule_failed": (
-        "",
-        "`fault`, `rule`, `sender`, `error`, `where`",
-        "a rule of your own raised, did not answer, or answered nonsense: it lets everything pass from then on",
-    ),
-    "fault_started": ("", "`fault`, `nodes`", "a fault begins to act, and on whom"),
-    "fault_ended": ("", "`fault`", "it has healed"),
-    "judged_by_test": ("", "`checks`", "which properties of a test have judged the run, beside its scenario"),
-    "emulator_restarted": ("", "`down_s`", "the emulator's connection is back"),
-    "router_restarted": ("", "`down_s`", "the separate router is back"),
-    "refused": ("vehicle", "`key`, `reason`", "the first message on this key that was not believed"),
-    "refused_total": ("", "`key`, `count`", "how many there were"),
-    "observer_ended": ("process", "`how`", "a recorder ended before the run did"),
-    "host_gone": ("", "`host`, `where`", "the connection of this host closed; its processes have `died` with it"),
-    "host_silent": (
-        "",
-        "`host`, `where`",
-        "this host did not hand in all logs and files of its vehicles at the end",
-    ),
-    "log_left_out": ("vehicle", "`bytes`", "how much of the beginning of its log is still on its host"),
-    "memory": ("process", "`time_s`, `private_kb`", "private memory in KiB, as two lists"),
-    "memory_exceeded": (
-        "process",
-        "`nodes`, `memory_mb`, `limit_mb`",
-        "its private memory exceeded `run.memory_limit_mb`, which ended the run",
-    ),
-    "transport_gap": ("", "`count`", "real time: how often something went missing on the way"),
-    "late_deliveries": (
-        "",
-        "`total`, `count`, `p50_ms`, `p99_ms`, `max_ms`, `worst`, `worst_s`",
-        "real time: all deliveries, those over 20 ms late, how late they were, the processes with most of them, "
-        "and the seconds in which most were told of",
-    ),
-}
 VERDICT = {
     "format": "version of the folder, [3](#formats)",
     "verdict": "`valid`, `invalid` or `unknown`",
@@ -338,7 +254,7 @@ def page() -> str:
         "## `events.jsonl`",
         "Each line is an object with `time_ns`, `kind`, `node` (or null) and what is named here.",
     ]
-    rows = ([f"`{kind}`", *words] for kind, words in EVENTS.items())
+    rows = ([f"`{k}`", k.node_is, ", ".join(f"`{name}`" for name in k.details), k.meaning] for k in EventKind)
     parts.append(table(["kind", "node", "besides", "what happened"], rows))
     parts += ["## `verdict.json`", "[checks.md](../checks.md) says what each check claims."]
     parts.append(table(["key", "what"], ([f"`{key}`", what] for key, what in VERDICT.items())))

@@ -27,12 +27,11 @@ from emulator.cells.worker import modules_of
 from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.records.atomic import atomically, disk_errors, write_atomically
 from emulator.records.code_digest import digests_of
+from emulator.records.events import Level
 from emulator.scenario.scenario import Scenario, dump_scenario
 from vnet.errors import VnetError
 
 FORMAT = 2
-BROKEN = ("died", "crashed", "exception", "spun", "stalled", "rule_failed")
-"""Events after which a run says nothing about its program's figures."""
 _code_digests = cache(digests_of)
 
 
@@ -115,7 +114,7 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
         _, verdict = session.close()
         figures, metrics = judged_figures(verdict), emulation.metrics.metrics_table()
     else:
-        if broken := [event for event in session.folder.events if event.kind in BROKEN]:
+        if broken := [event for event in session.folder.events if event.level is Level.FAILURE]:
             event = broken[0]
             raise VnetError(f"{event.node} {event.kind}: {event.details.get('error', '')}")
         figures, metrics = measure(emulation, cell.from_s)

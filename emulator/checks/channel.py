@@ -10,6 +10,7 @@ import numpy as np
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.distributions import binomial_interval
+from emulator.records.events import EventKind
 from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
@@ -292,7 +293,7 @@ def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, 
 def check_isolation(recorded: RecordedRun) -> Finding:
     """Check that every arrival was sent, byte for byte, and that programs report no more than arrived."""
     name = "isolation"
-    refused = sum(int(event.details.get("count", 0)) for event in recorded.event("refused_total"))
+    refused = sum(int(event.details.get("count", 0)) for event in recorded.event(EventKind.refused_total))
     arrived = int(recorded.arrived.sum())
     if not arrived:
         return nothing_seen(name, recorded, "nothing arrived")

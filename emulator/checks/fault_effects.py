@@ -17,6 +17,7 @@ from emulator.checks.senders import is_noise, receiver_noise_m
 from emulator.faults.plan import PlannedFault
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import SLOT_NS
+from emulator.records.events import EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
 from emulator.scenario.fault_families import (
@@ -235,7 +236,7 @@ def _(fault: Infrastructure, recorded: RecordedRun, planned: PlannedFault, name:
     done = [e for e in recorded.event(f"{fault.kind}ed") if e.time_ns >= planned.start_ns]
     if done:
         return _found(name, len(done), "restart|restarts", "")
-    started = recorded.event("started")
+    started = recorded.event(EventKind.started)
     if started and not started[0].details.get("start_up_s"):
         return NotExercised(name, "a simulation has neither router nor sessions")
     return unknown(name, "no event says that anything was restarted")

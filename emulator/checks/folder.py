@@ -21,6 +21,7 @@ from emulator.records.backbone_table import backbone_figures
 from emulator.records.code_digest import vnet_digest
 from emulator.records.costs import Costs, PayloadSizes, RunCost, run_cost
 from emulator.records.driven_table import driving_figures
+from emulator.records.events import EventKind
 from emulator.records.manifest import differing_files, read_manifest
 from emulator.records.metrics import rows_of, summarize
 from emulator.records.period_figures import PeriodFigures
@@ -116,8 +117,8 @@ def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
 
 def _of_the_course(recorded: OpenedRun) -> Iterator[tuple[str, Any]]:
     """Yield what events and figures say of the run's wall clock."""
-    wall_s = [event.details.get("wall_s") for event in recorded.event("ended")]
-    start_up_s = [event.details.get("start_up_s") for event in recorded.event("started")]
+    wall_s = [event.details.get("wall_s") for event in recorded.event(EventKind.ended)]
+    start_up_s = [event.details.get("start_up_s") for event in recorded.event(EventKind.started)]
     yield "wall_s", wall_s[-1] if wall_s else None
     yield "start_up_s", start_up_s[0] if start_up_s else None
 
@@ -180,7 +181,7 @@ def _wrong_checks(recorded: OpenedRun, judgement: Judgement) -> list[dict[str, A
     wrong = []
     ours = _by_name(record.judgement)
     theirs = _by_name(judgement)
-    of_tests = [event.details.get("checks") for event in recorded.event("judged_by_test")]
+    of_tests = [event.details.get("checks") for event in recorded.event(EventKind.judged_by_test)]
     asked = {name for names in of_tests if isinstance(names, list) for name in names if isinstance(name, str)}
     for name in ours:
         if name.startswith(PREFIX) and not program.checks and name not in asked:

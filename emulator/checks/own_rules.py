@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from emulator.records.events import Event, EventKind
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event
 from emulator.records.verdicts import Finding, NotExercised, result
 from emulator.scenario.fault_families import OwnRule
 from vnet.counted import counted
@@ -16,7 +16,7 @@ def check_own_rules(recorded: RecordedRun) -> Finding:
     """Check that no rule of the user's own raised, answered nonsense, or did not answer at all."""
     name = "own_rules"
     rules = [fault for fault in recorded.scenario.fault if isinstance(fault, OwnRule)]
-    failed = recorded.event("rule_failed")
+    failed = recorded.event(EventKind.rule_failed)
     sensors = recorded.scenario.world.sensor
     if not rules and not sensors and not failed:
         return NotExercised(name, "no rule and no sensor of your own")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from emulator.checks.own import Result
+from emulator.records.events import EventKind
 from emulator.records.parting import before
 from emulator.records.run import Run
 from vnet.counted import counted
@@ -25,7 +26,7 @@ from vnet.units import NS_PER_S
 MOST_TOLD = 10
 """Failures whose time and vehicle are told."""
 PERIOD, EVENT, ANY = "period", "event", "any"
-FAULT_EVENTS = ("fault_started", "fault_ended")
+FAULT_EVENTS = (EventKind.fault_started, EventKind.fault_ended)
 _ROUNDING_S = 1e-9
 
 

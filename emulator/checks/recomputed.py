@@ -17,9 +17,10 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.radio.engine import Engine
+from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, EventKind, kinds_with
 from emulator.records.metrics import rows_of, sha256_of_rows
 from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of
-from emulator.records.recorded_run import ENDINGS, OpenedRun, RecordedRun
+from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.recorded_world import ARRAYS, RecordedWorld
 from emulator.records.run_folder import BUSY_FILE, STATES_FILE, WORLD_FILE
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result
@@ -218,7 +219,7 @@ def _why_not_decided_again(recorded: RecordedRun) -> str:
         "no frame was sent": not len(recorded.trace),
         "in real time the machine has a part in it": run.pacing == "realtime",
         "the order of events was not FIFO": run.order != "fifo" or run.tape is not None,
-        "the run was cut short": bool(recorded.event("interrupted", "stalled", "spun", "died")),
+        "the run was cut short": bool(recorded.event(*kinds_with(CUTS_RUN), EventKind.spun, EventKind.died)),
         f"receptions: more than {MOST_RECEPTIONS:,}": len(recorded.trace) > MOST_RECEPTIONS,
         f"more than {MOST_BYTES:,} bytes": int(np.maximum(_originals(recorded)[3], 0).sum()) > MOST_BYTES,
         "programs send to single vehicles": bool((recorded.attempt > 0).any()),
@@ -255,7 +256,7 @@ def _decided_again(recorded: RecordedRun) -> Engine:
     )
     sender, seq, sent_ns, size = _originals(recorded)
     changes_ns = _changes_ns(recorded)
-    endings = {event.time_ns for event in recorded.event(*ENDINGS)}
+    endings = {event.time_ns for event in recorded.event(*kinds_with(ENDS_PROGRAM))}
     everybody = np.arange(len(recorded.node_ids))
     up = np.ones(len(everybody), dtype=bool)
 

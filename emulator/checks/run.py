@@ -11,11 +11,11 @@ import pyarrow.compute as pc
 
 from emulator.checks.memory_growth import is_long_enough, steady_growth_kib_per_s
 from emulator.records.distributions import lowest_share
+from emulator.records.events import Event, EventKind
 from emulator.records.failures import in_words, kinds_of
 from emulator.records.period_figures import VECTORS
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
-from emulator.records.run_folder import Event
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result, unknown
 from emulator.scenario.fault_families import ProcessFault
 from vnet.counted import counted
@@ -34,7 +34,7 @@ START_UP_NS = 5 * NS_PER_S
 def check_transport(recorded: RecordedRun) -> Finding:
     """Check that no message between agents and emulator went missing."""
     name = "transport"
-    gaps = sum(int(event.details.get("count", 1)) for event in recorded.event("transport_gap"))
+    gaps = sum(int(event.details.get("count", 1)) for event in recorded.event(EventKind.transport_gap))
     lost = recorded.outcome_is("transport")
     if gaps or lost.any():
         count = int(lost.sum())
@@ -49,8 +49,10 @@ def check_transport(recorded: RecordedRun) -> Finding:
 def check_agents_alive(recorded: RecordedRun) -> Finding:
     """Check that no process died and no program crashed, except those that a fault ended."""
     name = "agents_alive"
-    gone = [event for event in recorded.event("died", "crashed") if not _was_killed(recorded, event)]
-    if not gone and not recorded.event("started"):
+    gone = [
+        event for event in recorded.event(EventKind.died, EventKind.crashed) if not _was_killed(recorded, event)
+    ]
+    if not gone and not recorded.event(EventKind.started):
         return unknown(name, "no event says that the run started")
     if not gone:
         who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
@@ -62,14 +64,16 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
 def check_no_exceptions(recorded: RecordedRun) -> Finding:
     """Check that programs handled every exception that was raised in their tasks, callbacks, jobs and threads."""
     name = "no_exceptions"
-    raised = recorded.event("exception")
-    if not raised and not recorded.event("started"):
+    raised = recorded.event(EventKind.exception)
+    if not raised and not recorded.event(EventKind.started):
         return unknown(name, "no event says that the run started")
     if not raised:
         return CheckResult(name, Verdict.VALID, "no exception was left unhandled")
     kinds = kinds_of(raised)
     left_out = sum(
-        int(e.details["count"]) for e in recorded.event("left_out") if e.details.get("what") == "exception"
+        int(e.details["count"])
+        for e in recorded.event(EventKind.left_out)
+        if e.details.get("what") == EventKind.exception
     )
     rows = [
         {
@@ -87,7 +91,7 @@ def check_no_exceptions(recorded: RecordedRun) -> Finding:
 
 def _was_killed(recorded: RecordedRun, event: Event) -> bool:
     """Return whether a fault ended the process that died."""
-    if event.kind != "died" or event.node not in recorded.number:
+    if event.kind != EventKind.died or event.node not in recorded.number:
         return False
     node = recorded.number_of(event.node)
     ended = [p for p in recorded.plan if isinstance(p.fault, ProcessFault) and p.fault.ends and p.nodes[node]]
@@ -97,12 +101,12 @@ def _was_killed(recorded: RecordedRun, event: Event) -> bool:
 def check_progress(recorded: RecordedRun) -> Finding:
     """Check that the run reached its end: no busy loop, no hang, no interruption."""
     name = "progress"
-    if spun := recorded.event("spun"):
+    if spun := recorded.event(EventKind.spun):
         event = spun[0]
         when = f"at {event.time_ns / 1e9:.3f} s"
         text = f"{event.node} does not let time advance (busy loop) {when}: {event.details.get('error')}"
         return CheckResult(name, Verdict.INVALID, text, {"node": event.node, **event.details})
-    if stalled := recorded.event("stalled"):
+    if stalled := recorded.event(EventKind.stalled):
         event = stalled[0]
         when, error, refused = (
             f"{event.time_ns / 1e9:.3f} s",
@@ -113,11 +117,11 @@ def check_progress(recorded: RecordedRun) -> Finding:
         if refused is not None:
             text = f"the last message of {event.node} at {when} was refused: {refused}; since then {error}"
         return CheckResult(name, Verdict.UNKNOWN, text, {"node": event.node, **event.details})
-    if exceeded := recorded.event("memory_exceeded"):
+    if exceeded := recorded.event(EventKind.memory_exceeded):
         return unknown(name, memory_exceeded(exceeded[0]), node=exceeded[0].node)
-    if interrupted := recorded.event("interrupted"):
+    if interrupted := recorded.event(EventKind.interrupted):
         return unknown(name, f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
-    if not recorded.event("ended"):
+    if not recorded.event(EventKind.ended):
         return unknown(name, "no event says that the run ended")
     due = recorded.scenario.duration_ns // recorded.scenario.period_ns
     if len(recorded.metrics) != due or len(recorded.states) != due * len(recorded.node_ids):
@@ -179,7 +183,7 @@ def check_kept_up(recorded: RecordedRun) -> Finding:
     name = "kept_up"
     if recorded.scenario.run.pacing != "realtime":
         return NotExercised(name, "lockstep: nothing can be late")
-    late = recorded.event("late_deliveries")
+    late = recorded.event(EventKind.late_deliveries)
     if not late or not late[-1].details["total"]:
         return unknown(name, "no delivery was timed")
     figures = late[-1].details
@@ -262,17 +266,17 @@ def check_presence(recorded: RecordedRun) -> Finding:
         return NotExercised(name, "vehicles stand where they are")
     there = recorded.places.present()
     changes = _changes(recorded, there)
-    if not changes and not recorded.event("entered", "left"):
+    if not changes and not recorded.event(EventKind.entered, EventKind.left):
         return NotExercised(name, "all vehicles are in the network throughout")
     known_ns = len(there) * recorded.scenario.period_ns  # of what came later no states are kept
-    events = [event for event in recorded.event("entered", "left") if event.time_ns < known_ns]
+    events = [event for event in recorded.event(EventKind.entered, EventKind.left) if event.time_ns < known_ns]
     told = {(event.kind, str(event.node), event.time_ns) for event in events}
     missing = [change for change in changes if not _is_told(recorded, change, told)]
     due = set(changes)
     odd = [one for one in told if one not in due and not _may_come_late(recorded, one, there)]
     rows = [{"what": what, "node": node, "time_ns": t, "event": "missing"} for what, node, t in missing]
     rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
-    entered = sum(kind == "entered" for kind, _, _ in changes)
+    entered = sum(kind == EventKind.entered for kind, _, _ in changes)
     text = f"vehicles entered ({entered}) and left ({len(changes) - entered}) as their trips do"
     return result(
         name, len(rows), text, f"{counted(len(rows), 'event')} against the trips", rows, changes=len(changes)
@@ -286,7 +290,7 @@ Change = tuple[str, str, int]
 def _changes(recorded: RecordedRun, there: Mask) -> list[Change]:
     """Vehicles that enter and leave, by the true positions."""
     period, node = np.nonzero(there[1:] != there[:-1])
-    kinds = np.where(there[1:][period, node], "entered", "left").tolist()
+    kinds = np.where(there[1:][period, node], EventKind.entered, EventKind.left).tolist()
     times_ns = ((period + 1) * recorded.scenario.period_ns).tolist()
     names = [recorded.node_ids[number] for number in node.tolist()]
     return list(zip(kinds, names, times_ns, strict=True))
@@ -297,11 +301,11 @@ def _is_told(recorded: RecordedRun, change: Change, told: set[Change]) -> bool:
     kind, node, time_ns = change
     if change in told:
         return True
-    if kind == "left":
+    if kind == EventKind.left:
         before = [one for one in told if one[1] == node and one[2] < time_ns]
         last = max(before, key=lambda one: one[2], default=None)
         absent_at_first = not recorded.places.present()[0][recorded.number[node]]
-        return last[0] == "left" if last else absent_at_first
+        return last[0] == EventKind.left if last else absent_at_first
     number = recorded.number[node]
     if recorded.deaths_ns.get(number, END_OF_TIME_NS) <= time_ns or recorded.scenario.run.pacing == "realtime":
         return True
@@ -315,7 +319,7 @@ def _may_come_late(recorded: RecordedRun, one: Change, there: Mask) -> bool:
     In real time its process has to start first, and one that a fault has taken waits until it ends.
     """
     kind, node, time_ns = one
-    if kind == "left" or not there[time_ns // recorded.scenario.period_ns, recorded.number_of(node)]:
+    if kind == EventKind.left or not there[time_ns // recorded.scenario.period_ns, recorded.number_of(node)]:
         return False
     return recorded.scenario.run.pacing == "realtime" or any(planned.end_ns == time_ns for planned in recorded.plan)
 
@@ -327,9 +331,11 @@ def check_memory(recorded: RecordedRun) -> Finding:
     the emulator's own grows with the trace that it keeps, and is not judged.
     """
     name = "memory"
-    if exceeded := recorded.event("memory_exceeded"):
+    if exceeded := recorded.event(EventKind.memory_exceeded):
         return unknown(name, memory_exceeded(exceeded[0]), node=exceeded[0].node, **exceeded[0].details)
-    measured = [e for e in recorded.event("memory") if e.node in recorded.number and "private_kb" in e.details]
+    measured = [
+        e for e in recorded.event(EventKind.memory) if e.node in recorded.number and "private_kb" in e.details
+    ]
     if not measured:
         return NotExercised(name, "not measured by vnet simulate")
     judged = [e for e in measured if is_long_enough(e.details["time_s"])]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 
+from emulator.records.events import EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import is_text
 from emulator.records.run_tables import VALUES_AS_LIST
@@ -123,7 +124,7 @@ def _allowed(name: str) -> bool:
 def check_fault_events(recorded: RecordedRun) -> Finding:
     """Check that events tell the start and the end of each fault, and each restart, at their instants."""
     name = "fault_events"
-    told_of = recorded.event("fault_started", "fault_ended", "restarted")
+    told_of = recorded.event(EventKind.fault_started, EventKind.fault_ended, EventKind.restarted)
     if not recorded.plan and not told_of:
         return NotExercised(name, NO_FAULTS)
     in_real_time = recorded.scenario.run.pacing == "realtime"
@@ -132,15 +133,15 @@ def check_fault_events(recorded: RecordedRun) -> Finding:
         if planned.start_ns >= min(planned.end_ns, recorded.closed_ns):
             continue  # it never acts
         nodes = [recorded.node_ids[node] for node in np.flatnonzero(planned.placed(planned.start_ns).nodes)]
-        due["fault_started", planned.start_ns, planned.label, tuple(nodes)] += 1
+        due[EventKind.fault_started, planned.start_ns, planned.label, tuple(nodes)] += 1
         if planned.end_ns < recorded.closed_ns:
-            due["fault_ended", planned.end_ns, planned.label, ()] += 1
+            due[EventKind.fault_ended, planned.end_ns, planned.label, ()] += 1
     for node, time_ns in _restarts(recorded):
-        due["restarted", time_ns, node, ()] += 1
+        due[EventKind.restarted, time_ns, node, ()] += 1
     told: Counter[tuple[Any, ...]] = Counter()
     for event in told_of:
-        what = event.node if event.kind == "restarted" else event.details.get("fault")
-        nodes = event.details.get("nodes", []) if event.kind == "fault_started" else []
+        what = event.node if event.kind == EventKind.restarted else event.details.get("fault")
+        nodes = event.details.get("nodes", []) if event.kind == EventKind.fault_started else []
         told[event.kind, event.time_ns, what, tuple(nodes) if isinstance(nodes, list) else ()] += 1
     if in_real_time:  # processes take their time, and the run acts when it comes to it
         due, told = (_without_times(events) for events in (due, told))
@@ -157,12 +158,12 @@ def check_fault_events(recorded: RecordedRun) -> Finding:
 
 
 def _without_times(events: Counter[tuple[Any, ...]]) -> Counter[tuple[Any, ...]]:
-    return Counter((kind, 0, what, ()) for kind, _, what, _ in events.elements() if kind != "restarted")
+    return Counter((kind, 0, what, ()) for kind, _, what, _ in events.elements() if kind != EventKind.restarted)
 
 
 def _restarts(recorded: RecordedRun) -> list[tuple[str, int]]:
     """Return the nodes that come back because a fault ends, and when; not those that enter the network."""
-    entered = {(event.node, event.time_ns) for event in recorded.event("entered")}
+    entered = {(event.node, event.time_ns) for event in recorded.event(EventKind.entered)}
     ending = [
         planned for planned in recorded.plan if isinstance(planned.fault, ProcessFault) and planned.fault.ends
     ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from emulator.checks.own import load_checks
 from emulator.radio.own_rules import load_rules
 from emulator.records.code_digest import changed_code
+from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.recorded import recorded_code
 from emulator.scenario.scenario import Scenario
@@ -29,8 +30,8 @@ def prepare_folder(
     folder = RunFolder.prepare(out, scenario)
     for note in notes:
         tell(note, log_format)
-        folder.event(0, "note", what=note)
+        folder.event(0, EventKind.note, what=note)
     if changed := changed_code(recorded_code(path), folder.code):
         tell(f"{path}: {changed}", log_format)
-        folder.event(0, "code_changed", what=changed)
+        folder.event(0, EventKind.code_changed, what=changed)
     return folder

@@ -23,6 +23,7 @@ from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
 from emulator.records.busy import busy_table
 from emulator.records.costs import run_cost
+from emulator.records.events import EventKind
 from emulator.records.manifest import write_manifest
 from emulator.records.node_files import collect
 from emulator.records.recorded_world import RecordedWorld
@@ -49,7 +50,7 @@ from vnet.runtime.environment import arithmetic
 
 def _start_up_s(emulation: Emulation) -> float | None:
     """Time in s that the processes took to start and join; None if they never did."""
-    started = [event for event in emulation.folder.events if event.kind == "started"]
+    started = [event for event in emulation.folder.events if event.kind == EventKind.started]
     return float(started[0].details["start_up_s"]) if started else None
 
 
@@ -58,8 +59,10 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
     folder = emulation.folder
     emulation.log_book.tell_left_out(emulation.emulated_ns)
     for node, left_out in collect(folder, emulation.world.node_ids, emulation.scenario.run.files_max_mb).items():
-        folder.event(emulation.emulated_ns, "files_left_out", node, count=left_out.count, which=left_out.which)
-    folder.event(emulation.emulated_ns, "ended", wall_s=round(wall_s, 3))
+        folder.event(
+            emulation.emulated_ns, EventKind.files_left_out, node, count=left_out.count, which=left_out.which
+        )
+    folder.event(emulation.emulated_ns, EventKind.ended, wall_s=round(wall_s, 3))
     return RecordedRun(
         emulation.scenario,
         emulation.engine.trace.to_table(),
@@ -218,7 +221,7 @@ def judge_further(
     for finding in findings:
         judgement.put(finding)
     if own := [finding.name for finding in findings if finding.name.startswith(PREFIX)]:  # no scenario names them
-        emulation.folder.event(emulation.emulated_ns, "judged_by_test", checks=own)
+        emulation.folder.event(emulation.emulated_ns, EventKind.judged_by_test, checks=own)
     verdict = {**verdict, **_judged(judgement)}
     _put_verdict(emulation.folder, verdict)
     return verdict

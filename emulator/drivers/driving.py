@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from emulator.records.background_table import background_table
 from emulator.records.driven_table import driven_table
+from emulator.records.events import KINDS
 from emulator.records.run_folder import RunFolder
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
@@ -86,4 +87,4 @@ class Driving:
 
     def _tell(self, happened: Iterable[Happening]) -> None:
         for each in happened:
-            self._folder.event(each.time_ns, each.kind, self._node_ids[each.number], **each.details)
+            self._folder.event(each.time_ns, KINDS[each.kind], self._node_ids[each.number], **each.details)

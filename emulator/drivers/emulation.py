@@ -27,6 +27,7 @@ from emulator.radio.dot11p import abilities_of
 from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.records.costs import Costs
+from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
 from emulator.records.period_figures import PeriodFigures
@@ -249,15 +250,15 @@ class Emulation:
     def _end(self, time_ns: int, ending: wire.Ending) -> None:
         details: dict[str, Any] = {}
         if ending.error:
-            details = {"how" if ending.kind == "died" else "error": ending.error, "where": ending.details}
+            details = {"how" if ending.kind == EventKind.died else "error": ending.error, "where": ending.details}
             details |= {"place": ending.place} if ending.place else {}
-        self._program_over(time_ns, ending.node, ending.kind, details)
+        self._program_over(time_ns, ending.node, KINDS[ending.kind], details)
 
     def died(self, time_ns: int, node: str, **details: Any) -> None:
         """Take a node down whose process has ended without being told to."""
-        self._program_over(time_ns, node, "died", details)
+        self._program_over(time_ns, node, EventKind.died, details)
 
-    def _program_over(self, time_ns: int, node: str, kind: str, details: dict[str, Any]) -> None:
+    def _program_over(self, time_ns: int, node: str, kind: EventKind, details: dict[str, Any]) -> None:
         if self.presence.end(node):
             self.folder.event(time_ns, kind, node, **details)
             self.engine.set_up(self.number[node], False)
@@ -304,7 +305,7 @@ class Emulation:
             self.engine.set_up(self.number[node], False)
             self.driving.release(time_ns, node)
         for node in changes.left:
-            self.folder.event(time_ns, "left", node)
+            self.folder.event(time_ns, EventKind.left, node)
         if starts_at_once:
             self.come_back(changes.started, time_ns)
         return ProcessActions(
@@ -320,7 +321,7 @@ class Emulation:
         """Nodes that have been started are up."""
         for node, entered in self.presence.come_up(nodes).items():
             self.engine.set_up(self.number[node], True)
-            kind = "entered" if entered else "restarted"
+            kind = EventKind.entered if entered else EventKind.restarted
             self.folder.event(time_ns, kind, node, incarnation=self.incarnation[node])
 
     def _nodes_under(self, active: Sequence[PlannedFault], is_meant: Callable[[ProcessFault], bool]) -> set[str]:
@@ -333,9 +334,9 @@ class Emulation:
         for planned in active:
             if planned.label not in self._acting:
                 nodes = [node for node, number in self.number.items() if planned.nodes[number]]
-                self.folder.event(time_ns, "fault_started", None, fault=planned.label, nodes=nodes)
+                self.folder.event(time_ns, EventKind.fault_started, None, fault=planned.label, nodes=nodes)
         for label in sorted(self._acting - acting):
-            self.folder.event(time_ns, "fault_ended", None, fault=label)
+            self.folder.event(time_ns, EventKind.fault_ended, None, fault=label)
         self._acting = acting
 
     def inject(self, fault: Fault, now_ns: int) -> PlannedFault:
@@ -361,11 +362,11 @@ class Emulation:
 
     def _rule_failed(self, failure: RuleFailure) -> None:
         details = {"fault": failure.fault, "rule": failure.rule, "sender": failure.sender, "error": failure.error}
-        self.folder.event(failure.time_ns, "rule_failed", None, **details, where=failure.where)
+        self.folder.event(failure.time_ns, EventKind.rule_failed, None, **details, where=failure.where)
 
     def _sensor_failed(self, failure: SensorFailure) -> None:
         details = {"fault": f"world.sensor.{failure.sensor}", "rule": failure.model, "error": failure.error}
-        self.folder.foresee(failure.time_ns, "rule_failed", None, **details, where=failure.where)
+        self.folder.foresee(failure.time_ns, EventKind.rule_failed, None, **details, where=failure.where)
 
     def heal(self, label: str, now_ns: int) -> PlannedFault:
         """End a fault right after `now_ns`, and write that down. Raises ScenarioError if there is no such fault."""
@@ -423,7 +424,7 @@ class Emulation:
     def memory_exceeded(self, time_ns: int, process_id: str, memory_mb: float, nodes: Sequence[str]) -> None:
         """Write the event of the process of these nodes that holds more than `run.memory_limit_mb`."""
         limits = {"memory_mb": memory_mb, "limit_mb": self.scenario.run.memory_limit_mb}
-        self.folder.event(time_ns, "memory_exceeded", process_id, nodes=list(nodes), **limits)
+        self.folder.event(time_ns, EventKind.memory_exceeded, process_id, nodes=list(nodes), **limits)
 
     def close_periods(self, time_ns: int) -> None:
         """Record the periods that end by then; nobody has anything more to report of them.

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
+from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.transport import wire
 
@@ -35,9 +36,9 @@ class LogBook:
                 self._write(min(time_ns, note.time_ns), note)
         raised = [(time_ns if each.time_ns is None else min(time_ns, each.time_ns), each) for each in unhandled]
         for raised_ns, each in sorted(raised, key=lambda pair: (pair[0], self._number[pair[1].node])):
-            if self._fits(each.node, "exception"):
+            if self._fits(each.node, EventKind.exception):
                 details = {"error": each.error[:LONGEST_TEXT], "place": each.place, "where": each.details}
-                self._folder.event(raised_ns, "exception", each.node, **details)
+                self._folder.event(raised_ns, EventKind.exception, each.node, **details)
 
     def _fits(self, node: str, kind: str) -> bool:
         self._counts[node, kind] += 1
@@ -46,16 +47,16 @@ class LogBook:
     def _write(self, time_ns: int, note: wire.Note) -> None:
         text = note.text[:LONGEST_TEXT]
         if note.kind == "log":
-            self._folder.event(time_ns, "log", note.node, level=note.level, text=text)
+            self._folder.event(time_ns, EventKind.log, note.node, level=note.level, text=text)
             return
         details = {key: _plain(value) for key, value in list(note.details.items())[:MOST_DETAILS]}
-        self._folder.event(time_ns, "event", note.node, name=text, details=details)
+        self._folder.event(time_ns, EventKind.event, note.node, name=text, details=details)
 
     def tell_left_out(self, time_ns: int) -> None:
         """Write down how much of each kind is missing of each node, because there was too much."""
         for (node, kind), count in sorted(self._counts.items(), key=lambda item: self._number[item[0][0]]):
             if count > MOST[kind]:
-                self._folder.event(time_ns, "left_out", node, what=kind, count=count - MOST[kind])
+                self._folder.event(time_ns, EventKind.left_out, node, what=kind, count=count - MOST[kind])
 
 
 def _plain(value: bool | int | float | str) -> bool | int | float | str:

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from emulator.records.events import EventKind
+
 if TYPE_CHECKING:  # slow to import, and hosts write no events
     from emulator.records.run_folder import RunFolder
 
@@ -86,4 +88,4 @@ class MemoryWatch:
     def write(self, folder: RunFolder, time_ns: int) -> None:
         """One event `memory` a process: `time_s` and `private_kb` of its samples."""
         for name, time_s, sizes_kb in self.series():
-            folder.event(time_ns, "memory", name, time_s=time_s, private_kb=sizes_kb)
+            folder.event(time_ns, EventKind.memory, name, time_s=time_s, private_kb=sizes_kb)

@@ -14,6 +14,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import check_ownership, wire_packet
 from emulator.radio.engine import Delivery
+from emulator.records.events import EventKind
 from vnet.runtime.news import NewsItem
 from vnet.transport import lateness, wire
 from vnet.transport.backbone import SentMessage, WireMessage
@@ -264,7 +265,7 @@ class RealTime:
             for sent in waiting.values():
                 self._lose(sent.deliveries)
         if self.gaps:
-            self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
+            self._emulation.folder.event(self._emulation.duration_ns, EventKind.transport_gap, count=self.gaps)
         counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
         if sum(counts):
             figures = lateness_figures(counts)
@@ -274,7 +275,7 @@ class RealTime:
             }
             worst_s = self._late_in.most_common(WORST_SECONDS)
             figures["worst_s"] = {str(second): count for second, count in worst_s if count > 0}
-            self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", None, **figures)
+            self._emulation.folder.event(self._emulation.duration_ns, EventKind.late_deliveries, None, **figures)
 
 
 def _late(counts: Sequence[int]) -> int:

@@ -26,6 +26,7 @@ from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.memory import first_over
 from emulator.drivers.process_count import split_evenly
 from emulator.drivers.signals import signals_handled, tell_from_handler
+from emulator.records.events import EventKind
 from vnet.errors import VnetError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.program_path import search_programs_in
@@ -74,7 +75,7 @@ def simulate(
         simulation = _Apart(emulation, barrier, groups, prints=apart is None)
     else:
         simulation = _Together(emulation, barrier, debug)
-    emulation.folder.event(0, "started", start_up_s=0.0)
+    emulation.folder.event(0, EventKind.started, start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
     try:
@@ -86,13 +87,13 @@ def simulate(
     except KeyboardInterrupt:
         interrupted = not barrier.is_over_limit
         if interrupted:
-            emulation.folder.event(simulation.now_ns, "interrupted")
+            emulation.folder.event(simulation.now_ns, EventKind.interrupted)
         emulation.finish(simulation.now_ns)
-    if apart is not None and not interrupted and not any(each.kind == "died" for each in emulation.folder.events):
+    if apart is not None and not interrupted and not any(each.kind == EventKind.died for each in emulation.folder.events):
         if not apart:
             raise VnetError("a process of programs ended, and none did when each vehicle had one of its own")
         how = "ended the process of all vehicles, and not one of its own"
-        emulation.folder.event(simulation.now_ns, "died", apart, how=how)
+        emulation.folder.event(simulation.now_ns, EventKind.died, apart, how=how)
     return time.monotonic() - started, interrupted
 
 

@@ -14,8 +14,8 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.memory import resident_kb
 from emulator.faults.plan import PlannedFault
 from emulator.radio.outcomes import Outcome
+from emulator.records.events import MEASURED, SAID, Event
 from emulator.records.failures import merged
-from emulator.records.run_folder import Event
 from vnet.units import NS_PER_S
 
 BINS = 120
@@ -30,8 +30,6 @@ FIGURES = ("common_error_rmse_m", "deviation_m", "position_rmse_m", "fix_rmse_m"
 EVENTS_KEPT = 8
 EVENTS_LOOKED_AT = 200
 """Last events among which those of one kind of failure are told as one."""
-FOR_THE_CHECKS = ("memory", "late_deliveries", "refused_total", "log", "event")
-"""Kinds of events that hold measurements, or what programs say, and are no news."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +142,7 @@ class Course:
 
     def news(self, after: int = 0) -> list[Event]:
         """Events of the run, but for the first `after` events of the run."""
-        return [event for event in self._emulation.folder.events[after:] if event.kind not in FOR_THE_CHECKS]
+        return [event for event in self._emulation.folder.events[after:] if not event.has(MEASURED | SAID)]
 
     def snapshot(self, now_ns: int | None = None) -> Snapshot:
         """Status of the run at this emulated instant, or at the end of its last period."""

@@ -20,7 +20,8 @@ import numpy as np
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Session
-from emulator.records.run_folder import Event, RunFolder
+from emulator.records.events import Event
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from vnet.node import Fix, Node
 from vnet.radio import Packet

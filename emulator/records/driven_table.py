@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from emulator.records.run_folder import Event
-from emulator.world.driven.vehicles import COLLISION, LIMITED, Log
+from emulator.records.events import Event, EventKind
+from emulator.world.driven.vehicles import Log
 from vnet.types import Array
 
 QUANTITIES = ("along_m", "left_m", "speed_m_s", "acceleration_m_s2", "command_m_s2")
@@ -43,7 +43,7 @@ def driving_figures(table: pa.Table | None, events: Sequence[Event]) -> dict[str
         return {}
     lowest = pc.min(pc.if_else(pc.is_nan(table["acceleration_m_s2"]), None, table["acceleration_m_s2"])).as_py()
     return {
-        "collisions": sum(event.kind == COLLISION for event in events),
-        "limited_actions": sum(event.kind == LIMITED for event in events),
+        "collisions": sum(event.kind == EventKind.collision for event in events),
+        "limited_actions": sum(event.kind == EventKind.drive_limited for event in events),
         "hardest_braking_m_s2": None if lowest is None else max(0.0, -lowest),
     }

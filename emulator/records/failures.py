@@ -7,10 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from emulator.records.run_folder import Event
+from emulator.records.events import GROUPED, Event, EventKind
 
-FAILURES = ("crashed", "died", "exception")
-"""Events that tell of a failing program or process."""
 _FRAME = re.compile(r'^ *File "(.*)", line (\d+)', re.MULTILINE)
 
 
@@ -49,18 +47,18 @@ class Kind:
     def when(self) -> str:
         """The instant, or that of the first one."""
         instant = f"at {shown_s(self.first.time_ns)}"
-        if self.first.kind == "exception":
+        if self.first.kind == EventKind.exception:
             return instant if len(self.events) == 1 else f"first {instant}"
         return instant if len({event.time_ns for event in self.events}) == 1 else f"first {instant}"
 
     @property
     def untimed(self) -> str:
         """The kind in one line without its instant."""
-        ended = "" if self.first.kind == "exception" else f" {self.first.kind}"
+        ended = "" if self.first.kind == EventKind.exception else f" {self.first.kind}"
         return f"{self.who}{ended}: {self.why}"
 
     def __str__(self) -> str:
-        if self.first.kind == "exception":
+        if self.first.kind == EventKind.exception:
             return f"{self.untimed}, {self.when}"
         comma = "," if self.when.startswith("first") else ""
         return f"{self.who} {self.first.kind}{comma} {self.when}: {self.why}"
@@ -80,7 +78,7 @@ def merged(events: Iterable[Event]) -> list[Event]:
     """Return the events with one for each kind of failure, which names how many vehicles it befell."""
     by_kind: dict[tuple[str, ...] | int, list[Event]] = {}
     for number, event in enumerate(events):
-        by_kind.setdefault(key_of(event) if event.kind in FAILURES else number, []).append(event)
+        by_kind.setdefault(key_of(event) if event.has(GROUPED) else number, []).append(event)
     return [replace(each[0], node=Kind(tuple(each)).who) if len(each) > 1 else each[0] for each in by_kind.values()]
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from emulator.records.events import SAMPLES, Event
 from emulator.records.recorded_run import OpenedRun
 from emulator.records.reported import value_columns
-from emulator.records.run_folder import Event
 from emulator.records.tape import TAPE_FILE, TapeEntry, described, read_tape
 from vnet.transport.orders import Deviation
 from vnet.units import NS_PER_S
@@ -21,8 +21,6 @@ FRAME = ("sent_ns", "sender", "seq", "size_bytes", "payload_digest")
 RECEPTION = ("sent_ns", "sender", "seq", "copy", "receiver", "outcome", "cause", "arrival_ns")
 REPORT = ("estimate_m", "covariance_m2", "common_error_estimate_m", "mean_m")
 """Columns of states that programs report, beside those of their own names."""
-OF_THE_MACHINE = ("started", "ended", "memory", "code_changed")
-"""Kinds of events that differ from run to run, or tell of no node."""
 MOST_BEFORE = 8
 """Events and frames that are told of before a parting."""
 
@@ -110,7 +108,7 @@ def _node(entry: TapeEntry) -> str:
 def _events(run: OpenedRun) -> list[Entry]:
     entries = []
     for event in run.events:
-        if event.node is not None and event.kind not in OF_THE_MACHINE:
+        if event.node is not None and not event.has(SAMPLES):
             details = ", ".join(f"{key} = {value}" for key, value in event.details.items() if key != "where")
             entries.append((event.time_ns, event.node, f"{event.kind} {details}".rstrip() + _line(event.details)))
     return sorted(entries)

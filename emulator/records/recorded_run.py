@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
 from emulator.radio.outcomes import Stage, decided_at
+from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with
 from emulator.records.recorded_tables import ARRIVED, ON_AIR, RecordedTables
 from emulator.records.run_files import Columns, RunFiles
-from emulator.records.run_folder import Event
 from emulator.scenario.fault_families import ProcessFault, SenderFault
 from emulator.scenario.faults import Range, Swizzle
 from vnet.types import IntArray, Mask
@@ -32,7 +32,6 @@ END_OF_TIME_NS = np.iinfo(np.int64).max
 """Later than every instant of a run."""
 REALTIME_GUARD_NS = 50_000_000
 """In real time nobody can say on which side of a fault's start or end a frame was that close to it."""
-ENDINGS = ("died", "crashed", "finished", "spun")
 
 
 @dataclass(frozen=True)
@@ -75,14 +74,14 @@ class RecordedRun(RecordedTables):
     @cached_property
     def closed_ns(self) -> int:
         """Instant at which emulated time ended."""
-        cut = [event.time_ns for event in self.event("interrupted", "stalled", "memory_exceeded")]
+        cut = [event.time_ns for event in self.event(*kinds_with(CUTS_RUN))]
         return min([self.scenario.duration_ns, *cut])
 
     @cached_property
     def deaths_ns(self) -> dict[int, int]:
         """Instants at which nodes ended by themselves, by their numbers: they stay down."""
         deaths: dict[int, int] = {}
-        for event in self.event(*ENDINGS):
+        for event in self.event(*kinds_with(ENDS_PROGRAM)):
             if event.node is not None:
                 number = self.number_of(event.node)
                 deaths[number] = min(deaths.get(number, event.time_ns), event.time_ns)
@@ -106,9 +105,9 @@ class RecordedRun(RecordedTables):
         if not self.moves or not self.node_ids:
             return
         since = dict.fromkeys(np.flatnonzero(~self.places.present()[0]).tolist(), 0)
-        for event in self.event("left", "entered"):
+        for event in self.event(EventKind.left, EventKind.entered):
             node = self.number_of(event.node)
-            if event.kind == "left":
+            if event.kind == EventKind.left:
                 since.setdefault(node, event.time_ns)
             elif node in since:
                 yield Span(node, since.pop(node), event.time_ns, True)
@@ -118,7 +117,11 @@ class RecordedRun(RecordedTables):
     def _back_ns(self, node: int, end_ns: int) -> int:
         """Instant at which a node was up again after a fault: its end, or in real time its process's return."""
         if self.scenario.run.pacing == "realtime":
-            there = (e.time_ns for e in self.event("restarted", "entered") if e.node == self.node_ids[node])
+            there = (
+                e.time_ns
+                for e in self.event(EventKind.restarted, EventKind.entered)
+                if e.node == self.node_ids[node]
+            )
             return min((time_ns for time_ns in there if time_ns >= end_ns), default=END_OF_TIME_NS)
         return end_ns if end_ns < self.closed_ns else END_OF_TIME_NS
 

@@ -18,10 +18,10 @@ from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.trace import LATE
 from emulator.records.busy import busy_windows
+from emulator.records.events import Event
 from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import numbers_of, value_columns
-from emulator.records.run_folder import Event
 from emulator.records.run_tables import VALUES_AS_LIST
 from emulator.records.verdicts import MOST_ROWS
 from emulator.scenario.scenario import Scenario

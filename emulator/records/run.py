@@ -13,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 import pyarrow as pa
 
+from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
 from emulator.scenario.scenario import Scenario

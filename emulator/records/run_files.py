@@ -5,7 +5,6 @@ Nothing else opens them. `recorded_run` makes arrays of them, and says what they
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, replace
@@ -23,6 +22,7 @@ from emulator.records.backbone_table import BACKBONE
 from emulator.records.background_table import BACKGROUND
 from emulator.records.busy import busy_table
 from emulator.records.driven_table import driven_table
+from emulator.records.events import Event, parse_events
 from emulator.records.metrics import METRICS
 from emulator.records.payloads import PAYLOADS, KeptPayloads
 from emulator.records.period_figures import PeriodFigures
@@ -42,7 +42,6 @@ from emulator.records.run_folder import (
     TRACE_FILE,
     VERDICT_FILE,
     WORLD_FILE,
-    Event,
 )
 from emulator.records.run_tables import StatesReader, TableFile, TraceReader, open_table
 from emulator.records.states import STATES
@@ -141,7 +140,7 @@ class RunFiles:
     def events(self) -> list[Event]:
         """The events, in the order in which they were written; a last line that was cut off is left out."""
         path = self.folder / EVENTS_FILE
-        return self._read(path, lambda: _parse_events(path, read_regular(path, LARGEST_EVENTS_BYTES)))
+        return self._read(path, lambda: parse_events(path, read_regular(path, LARGEST_EVENTS_BYTES)))
 
     @cached_property
     def world(self) -> RecordedWorld:
@@ -340,20 +339,3 @@ def not_finished(folder: Path, name: str) -> VnetError:
         return VnetError(text)
     again = f"vnet run {shlex.quote(str(scenario))}"
     return VnetError(f"{text}: it is on, or was killed, which leaves no tables; {again} makes the run again")
-
-
-def _parse_events(path: Path, content: bytes) -> list[Event]:
-    """The events of a file. Raises VnetError where a line is JSON, but no event."""
-    events = []
-    for line in content.decode("utf-8", "replace").splitlines():
-        try:
-            data = json.loads(line)
-        except (ValueError, RecursionError):
-            continue  # the last line of a run that was killed
-        if not isinstance(data, dict) or not data.keys() >= {"time_ns", "kind", "node"}:
-            continue
-        time_ns, kind, node = (data.pop(key) for key in ("time_ns", "kind", "node"))
-        if type(time_ns) is not int or not isinstance(kind, str) or not isinstance(node, (str, type(None))):
-            raise VnetError(f"{path}: not vnet's events: {printable(line, 100)}")
-        events.append(Event(time_ns, kind, node, data))
-    return events

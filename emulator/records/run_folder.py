@@ -11,13 +11,13 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.records.atomic import atomically, disk_errors
 from emulator.records.code_digest import code_digests, rule_digests
+from emulator.records.events import Event, EventKind
 from emulator.scenario.scenario import Scenario, dump_scenario, input_digests
 from vnet.errors import VnetError
 
@@ -50,27 +50,6 @@ VERDICT_ROOM_BYTES = 1 << 16
 """Size of most verdicts, with their manifests."""
 FORMAT = 3
 """Version of the folder's files; `verdict.json` holds it. docs/reference/files.md says what changed with each."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """One line of `events.jsonl`: something that happened to a node, or to the run where `node` is None."""
-
-    time_ns: int
-    kind: str
-    node: str | None
-    details: dict[str, Any]
-
-    @property
-    def name(self) -> str:
-        """Name that the program gave to an event of its own (`node.event`); else the kind."""
-        return str(self.details.get("name", "")) if self.kind == "event" else self.kind
-
-    @property
-    def values(self) -> dict[str, Any]:
-        """Details that the program gave to an event of its own; else those of the kind."""
-        values = self.details.get("details") if self.kind == "event" else self.details
-        return values if isinstance(values, dict) else {}
 
 
 class RunFolder:
@@ -138,7 +117,7 @@ class RunFolder:
             self._digests = self._digests or _digests(scenario)
             self.is_open = True
             self.put_scenario(scenario)
-            (self.path / EVENTS_FILE).write_text("".join(map(_line, self.events)))
+            (self.path / EVENTS_FILE).write_text("".join(event.line() for event in self.events))
             if self._has_own_number:
                 _point_latest_to(self.path)
 
@@ -180,14 +159,14 @@ class RunFolder:
 
         self.keep(name, lambda path: pq.write_table(table, path, compression="zstd"))
 
-    def event(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:
+    def event(self, time_ns: int, kind: EventKind, node: str | None = None, **details: Any) -> None:
         """Write down what happened at an emulated instant, after all that was foreseen for an earlier one."""
         self.reach(time_ns - 1)
-        self._write(Event(time_ns, kind, node, details))
+        self._write(Event(time_ns, kind.value, node, details))
 
-    def foresee(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:
+    def foresee(self, time_ns: int, kind: EventKind, node: str | None = None, **details: Any) -> None:
         """Write down what happens at an instant that others may not have come to, once they have."""
-        self._foreseen.append(Event(time_ns, kind, node, details))
+        self._foreseen.append(Event(time_ns, kind.value, node, details))
 
     def reach(self, time_ns: int) -> None:
         """Write what has been foreseen until `time_ns`."""
@@ -202,7 +181,7 @@ class RunFolder:
         if self.is_open and not self._lacks_events:
             try:
                 with (self.path / EVENTS_FILE).open("a") as file:
-                    file.write(_line(event))
+                    file.write(event.line())
             except OSError:  # the run goes on, and writes them all at its end
                 self._lacks_events = True
 
@@ -220,7 +199,7 @@ class RunFolder:
     def complete_events(self) -> None:
         """Write the events that the disk has refused while the run was on."""
         if self._lacks_events:
-            self.keep(EVENTS_FILE, lambda path: write_text(path, "".join(map(_line, self.events))))
+            self.keep(EVENTS_FILE, lambda path: write_text(path, "".join(event.line() for event in self.events)))
 
     def keep(self, name: str, write: Callable[[Path], None]) -> None:
         """Put a file of a run that is over; if the disk refuses, name it in `unkept`: the others are kept."""
@@ -241,12 +220,6 @@ class RunFolder:
 
 def _digests(scenario: Scenario) -> dict[str, dict[str, str]]:
     return {"inputs": input_digests(scenario), "code": code_digests(scenario)}
-
-
-def _line(event: Event) -> str:
-    """Return an event as a line of `events.jsonl`."""
-    named = {"time_ns": event.time_ns, "kind": event.kind, "node": event.node, **event.details}
-    return json.dumps(named) + "\n"
 
 
 def write_text(path: Path, text: str) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 
 from emulator.pages.canvas import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
 from emulator.records.driven_table import of_vehicles
+from emulator.records.events import EventKind
 from emulator.report.drawing import DASHES, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source
-from emulator.world.driven.vehicles import COLLISION
 
 MOST_LINES = 12
 """Vehicles that have a line each; of more, every so many has one."""
@@ -26,7 +26,7 @@ def speeds(source: Source) -> Drawing:
     styles = [(_COLOURS[i % len(_COLOURS)], DASHES[i // len(_COLOURS) % len(DASHES)]) for i in range(len(shown))]
     lines = [Line(nodes[n], time_s, speed[:, n], *style) for n, style in zip(shown, styles, strict=True)]
     made = time_figure(lines, "speed (m/s)", source.end_s, source.spans, linear=True)
-    collisions = source.recorded.event(COLLISION)
+    collisions = source.recorded.event(EventKind.collision)
     for event in collisions:
         made.axes.axvline(event.time_ns / 1e9, color=GREY, linewidth=0.8, zorder=0.8)
     some = f"{len(shown)} of {len(nodes)} vehicles" if len(shown) < len(nodes) else "All vehicles"

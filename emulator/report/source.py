@@ -12,13 +12,14 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.pages.canvas import Span
+from emulator.records.events import CUTS_RUN, Event, EventKind
 from emulator.records.hears_all import COLUMNS as BOUND_COLUMNS
 from emulator.records.hears_all import BoundSeries, bound_of
 from emulator.records.key_figures import SAME
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
-from emulator.records.run_folder import METRICS_FILE, STATES_FILE, TRACE_FILE, Event
+from emulator.records.run_folder import METRICS_FILE, STATES_FILE, TRACE_FILE
 from emulator.records.verdict_file import Record
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
@@ -40,8 +41,6 @@ COLUMNS = {
     ),
 }
 """The columns that reports need."""
-CUT = ("interrupted", "stalled", "memory_exceeded")
-"""Events that end a run before its time."""
 T = TypeVar("T")
 
 
@@ -179,16 +178,16 @@ class Source:
         spans = []
         for event in maybe(lambda: self.events) or ():
             label = printable(str(event.details.get("fault")))
-            if event.kind == "fault_started":
+            if event.kind == EventKind.fault_started:
                 started[label] = event.time_ns / 1e9
-            elif event.kind == "fault_ended" and label in started:
+            elif event.kind == EventKind.fault_ended and label in started:
                 spans.append(Span(label, started.pop(label), event.time_ns / 1e9))
         return spans + [Span(label, start_s, max(start_s, self.end_s)) for label, start_s in started.items()]
 
     @cached_property
     def cut(self) -> Event | None:
         """The event that ended the run before its time."""
-        return next((event for event in maybe(lambda: self.events) or () if event.kind in CUT), None)
+        return next((event for event in maybe(lambda: self.events) or () if event.has(CUTS_RUN)), None)
 
 
 def maybe(read: Callable[[], T]) -> T | None:

@@ -17,8 +17,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.radio.outcomes import Outcome, Stage
+from emulator.records.events import Event, EventKind, Level
 from emulator.records.recorded_run import END_OF_TIME_NS, OpenedRun, RecordedRun
-from emulator.records.run_folder import TRACE_FILE, Event
+from emulator.records.run_folder import TRACE_FILE
 from emulator.report.source import Source, maybe
 from vnet.errors import printable
 from vnet.types import IntArray, Mask
@@ -44,14 +45,8 @@ DELAYS_IN_VIEW = 60
 """Usual delays of frames in the first view: arrows are then some 20 pixels wide."""
 
 FAILURE, WARNING, EVENT, PROCESS = "failure", "warning", "event", "process"
-KINDS = {
-    **dict.fromkeys(("crashed", "died", "exception", "spun", "stalled", "memory_exceeded", "host_gone"), FAILURE),
-    **dict.fromkeys(("log", "refused", "left_out", "transport_gap", "late_deliveries"), WARNING),
-    **dict.fromkeys(("restarted", "entered", "left", "finished", "interrupted"), PROCESS),
-    **dict.fromkeys(("emulator_restarted", "router_restarted"), PROCESS),
-    "event": EVENT,
-}
-"""The kind of mark of each event that has one."""
+SIGNS = {Level.FAILURE: FAILURE, Level.WARNING: WARNING, Level.CHANGE: PROCESS, Level.TOLD: EVENT}
+"""The kind of mark of an event of a level that has one."""
 PRIORITY = (FAILURE, PROCESS, WARNING, EVENT)
 WEIGHTS = {FAILURE: 1, "fault": 4, PROCESS: 4, WARNING: 16, EVENT: 16}
 """Factors by which frames of large runs must be nearer to one of these than to a failure to be kept."""
@@ -62,8 +57,6 @@ LEGEND = {
     EVENT: ("◆", "blue", "events of programs"),
 }
 """Sign, colour and title of each kind of mark."""
-QUIET_LEVELS = ("debug", "info")
-"""Levels of log lines that have no mark."""
 
 
 @dataclass(frozen=True)
@@ -159,25 +152,24 @@ def marks_of(events: Iterable[Event], number: dict[str, int]) -> list[Mark]:
     """Return the marks of a run's events, in the order of time; log lines only from warnings on."""
     marks = []
     for event in events:
-        kind = KINDS.get(event.kind)
-        level = str(event.details.get("level", "")).lower()
-        if kind is None or (event.kind == "log" and level in QUIET_LEVELS):
+        kind = SIGNS.get(event.level)
+        if kind is None or (event.kind == EventKind.log and kind == EVENT):
             continue
         node = -1 if event.node is None else number.get(event.node, -1)
-        marks.append(Mark(event.time_ns // NS_PER_US, node, kind, printable(_text(event, level), LONGEST_TEXT)))
+        marks.append(Mark(event.time_ns // NS_PER_US, node, kind, printable(_text(event), LONGEST_TEXT)))
     return sorted(marks, key=lambda mark: mark.time_us)
 
 
-def _text(event: Event, level: str) -> str:
-    if event.kind == "log":
-        return f"{level}: {event.details.get('text', '')}"
-    if event.kind == "event":
+def _text(event: Event) -> str:
+    if event.kind == EventKind.log:
+        return f"{str(event.details.get('level', '')).lower()}: {event.details.get('text', '')}"
+    if event.kind == EventKind.event:
         details = event.details.get("details")
         told = ", ".join(f"{k} {v}" for k, v in details.items()) if isinstance(details, dict) else ""
         return f"event {event.details.get('name', '')}" + (f": {told}" if told else "")
     shown = {key: value for key, value in event.details.items() if key not in ("where", "log_tail")}
     told = ", ".join(f"{key} {value}" if key != "error" else str(value) for key, value in shown.items())
-    return f"{event.kind.replace('_', ' ')}" + (f": {told}" if told else "")
+    return event.words + (f": {told}" if told else "")
 
 
 def _first_marks(marks: Sequence[Mark]) -> list[Mark]:
@@ -199,9 +191,9 @@ def bars_of(events: Iterable[Event], number: dict[str, int], end_us: int) -> lis
 
     for event in events:
         label = str(event.details.get("fault"))
-        if event.kind == "fault_started":
+        if event.kind == EventKind.fault_started:
             begun[label] = event
-        elif event.kind == "fault_ended" and label in begun:
+        elif event.kind == EventKind.fault_ended and label in begun:
             close(begun.pop(label), event.time_ns // NS_PER_US)
     for event in begun.values():
         close(event, max(end_us, event.time_ns // NS_PER_US))

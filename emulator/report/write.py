@@ -16,8 +16,9 @@ from typing import Any
 from emulator.pages.page import Table, put_page, render, table
 from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS
+from emulator.records.events import SAID, SAMPLES, Event
 from emulator.records.key_figures import shown_figures
-from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE, Event
+from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Verdict
 from emulator.report.figures import draw
@@ -31,8 +32,6 @@ from vnet.errors import VnetError, first_names
 MOST_EVENTS = 200
 MOST_SAID = 2000
 """Lines of logs and events of programs that are shown."""
-SAID = ("log", "event")
-"""Events that programs tell of."""
 MOST_SCENARIO = 50_000
 """Characters of a scenario that are shown; one with a matrix of links may have millions."""
 MOST_ROWS = 50
@@ -41,8 +40,6 @@ MOST_TEXTS = 3
 """Texts of several lines, as tracebacks, that are shown of a check's rows."""
 SLOWEST = 10
 """Vehicles in the table of what a run cost."""
-SAMPLES = {"memory"}
-"""Events that are series of measurements, and would drown the others."""
 WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 
 
@@ -226,10 +223,9 @@ def _cost(record: Record) -> dict[str, Any] | None:
 def _events(source: Source) -> dict[str, Any] | str:
     """The number of events and the rows that are shown; or a sentence where there are none."""
     try:
-        events = [event for event in source.events if event.kind not in SAMPLES]
+        events = [event for event in source.events if not event.has(SAMPLES | SAID)]
     except VnetError as error:
         return str(error)
-    events = [event for event in events if event.kind not in SAID]
     if not events:
         return "None."
     half = MOST_EVENTS // 2
@@ -239,7 +235,7 @@ def _events(source: Source) -> dict[str, Any] | str:
 
 def _log(source: Source) -> dict[str, Any] | None:
     """The number of lines and events of programs, and the rows that are shown; None if there are none."""
-    said = [event for event in maybe(lambda: source.events) or () if event.kind in SAID]
+    said = [event for event in maybe(lambda: source.events) or () if event.has(SAID)]
     return {"count": len(said), "rows": table(list(map(_said, said[:MOST_SAID])))} if said else None
 
 

@@ -19,10 +19,10 @@ from emulator.radio.connectivity import component_links
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
 from emulator.records.beliefs import WEIGHT, Beliefs, collect, is_cloud
+from emulator.records.events import Event
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import MOST_DOTTED, figures_among, is_weight
-from emulator.records.run_folder import Event
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
 from vnet.reports import Report

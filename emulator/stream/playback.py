@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from emulator.records.background_table import positions_by_time
 from emulator.records.busy import busy_windows, mean_busy
+from emulator.records.events import Event
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_files import check_is_run
-from emulator.records.run_folder import STATES_FILE, Event
+from emulator.records.run_folder import STATES_FILE
 from emulator.records.run_tables import StatesReader, TraceReader
 from emulator.stream.messages import event_message, period_message, scene_message
 from vnet.errors import VnetError

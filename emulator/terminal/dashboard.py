@@ -20,8 +20,8 @@ from rich.style import Style
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN
+from emulator.records.events import Event, EventKind
 from emulator.records.failures import Kind
-from emulator.records.run_folder import Event
 from vnet.errors import printable
 
 Line = list[Segment]
@@ -33,8 +33,6 @@ OUTCOMES = {
     outcome.name: (Style(color=PALETTE[outcome.facts.colour].either), outcome.facts.sign) for outcome in DRAWN
 }
 """Style and sign of each outcome; signs tell them apart where there are no colours."""
-BAD_EVENTS = ("died", "crashed", "exception", "spun", "stalled", "rule_failed", "refused", "transport_gap",
-              "observer_ended", "host_gone", "memory_exceeded", "interrupted")  # fmt: skip
 HEIGHTS = "▁▂▃▄▅▆▇"  # and not the full block, which would run into the row above
 SMALLEST_FACTOR = 4.0
 """Between the foot and the top of a sparkline, so that what is steady does not look wild."""
@@ -300,36 +298,31 @@ class _Rows:
             label = "" if lines else "events"
             when = f"{event.time_ns / 1e9:>6.1f} s  "
             about = _cut(describe(event), max(1, self._width - self._label - len(when)))
-            style = BAD if is_bad(event) else PLAIN
+            style = BAD if event.is_bad else PLAIN
             lines.append([Segment(label.ljust(self._label), DIM), Segment(when, DIM), Segment(about, style)])
         if not lines:
             lines.append([Segment("events".ljust(self._label), DIM), Segment("none yet", DIM)])
         return lines
 
 
-def is_bad(event: Event) -> bool:
-    """True if something failed that no planned fault was to do."""
-    return event.kind in BAD_EVENTS
-
-
 def describe(event: Event) -> str:
     """An event in words, in one line: who, what, and the details that say why."""
-    if event.kind == "started":
+    if event.kind == EventKind.started:
         start_up_s = event.details.get("start_up_s") or 0.0
         return f"started: all have joined in {start_up_s:.1f} s" if start_up_s else "started"
-    if event.kind == "exception":
+    if event.kind == EventKind.exception:
         return printable(f"{event.node}: {Kind((event,)).why}", 300)
     details = dict(event.details)
     fault, nodes = details.pop("fault", None), details.pop("nodes", None)
     who = event.node or fault or ""
-    what = event.kind.removeprefix("fault_") if fault else event.kind
+    what = event.words.removeprefix("fault ") if fault else event.words
     for key in ("where", "log_tail", "key"):  # pages of text; they are in the run's folder
         details.pop(key, None)
     said = [str(details.pop(key)) for key in ("how", "error", "reason") if key in details]
     if isinstance(nodes, list) and nodes:
         said.append(_names(nodes, 40))
     said += [f"{key} {value}" for key, value in details.items() if isinstance(value, (str, int, float))]
-    text = f"{who} {what.replace('_', ' ')}".strip()
+    text = f"{who} {what}".strip()
     return printable(f"{text}: {', '.join(said)}" if said else text, 300)
 
 

@@ -16,10 +16,10 @@ from rich.console import Console
 
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.status import Course, Snapshot
-from emulator.records.failures import FAILURES, key_of, kinds_of
-from emulator.records.run_folder import Event
+from emulator.records.events import GROUPED, Event
+from emulator.records.failures import key_of, kinds_of
 from emulator.terminal.console import LogFormat
-from emulator.terminal.dashboard import Dashboard, describe, is_bad
+from emulator.terminal.dashboard import Dashboard, describe
 from emulator.terminal.painter import EVERY_S, Painter
 from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import first_names, printable
@@ -213,12 +213,12 @@ class PlainLines(_Lines):
         """A line for each event, and one for each kind of failure, however many vehicles it befalls."""
         news = self._course.news(self._told_events)
         self._told_events = len(self._emulation.folder.events)
-        for kind in kinds_of(event for event in news if event.kind in FAILURES):
+        for kind in kinds_of(event for event in news if event.has(GROUPED)):
             if (key := key_of(kind.first)) not in self._told_kinds:
                 self._told_kinds.add(key)
                 self._write(f"{kind.first.time_ns / 1e9:6.1f} s  {printable(kind.untimed, LONGEST_LINE)}")
         for event in news:
-            if is_bad(event) and event.kind not in FAILURES:
+            if event.is_bad and not event.has(GROUPED):
                 self._write(f"{event.time_ns / 1e9:6.1f} s  {describe(event)}")
 
 

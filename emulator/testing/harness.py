@@ -28,9 +28,10 @@ from emulator.drivers.conclude import judge_further
 from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.faults.plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
+from emulator.records.events import Event
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.run import Run
-from emulator.records.run_folder import SCENARIO_FILE, Event
+from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.fault_families import LONGEST_S, Fault, OwnRule
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.modules import with_rules

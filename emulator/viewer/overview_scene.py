@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 
 from emulator.radio.outcomes import Outcome
+from emulator.records.events import WARNING, EventKind, level_of
 from emulator.records.paper_values import paper_rmse
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.recorded import parse_recorded_scenario
@@ -47,8 +48,6 @@ ELLIPSES_EVERY_S = 1.0
 CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
-WARNINGS = {"fault_started", "died", "crashed", "exception", "spun", "stalled", "rule_failed", "refused",
-            "interrupted", "observer_ended", "host_gone", "memory_exceeded"}  # fmt: skip
 LOG_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "critical": "CRITICAL"}
 """Rerun's names of the levels of a program's log."""
 LONGEST_DETAIL = 60
@@ -218,18 +217,19 @@ class OverviewScene:
         """Write down what happened, each event at its own time."""
         for event in events:
             self._canvas.at(event["time_ns"])
-            level = "WARN" if event["kind"] in WARNINGS else "INFO"
-            if event["kind"] == "log":
+            planned = event["kind"] == EventKind.fault_started
+            level = "WARN" if level_of(event["kind"], event["details"]) >= WARNING or planned else "INFO"
+            if event["kind"] == EventKind.log:
                 level = LOG_LEVELS.get(str(event["details"].get("level")), level)
             self._canvas.log("events", rr.TextLog(in_words(event), level=level))
 
 
 def in_words(event: Mapping[str, Any]) -> str:
     """An event in a line: `v03 died: how SIGKILL`, `v02 suspects: member v01`."""
-    if event["kind"] == "log":
+    if event["kind"] == EventKind.log:
         return drawable(f"{event['node']}: {event['details'].get('text', '')}")
     what, told = event["kind"].replace("_", " "), event["details"]
-    if event["kind"] == "event":  # of a program, which has named it
+    if event["kind"] == EventKind.event:  # of a program, which has named it
         what, told = _short(told.get("name", what)), _as_map(told.get("details"))
     details = [f"{key} {_short(value)}".rstrip() for key, value in told.items()]
     who = f"{event['node']} " if event["node"] else ""

@@ -1,6 +1,5 @@
 """The reference pages are what `make docs` makes of the code as it is, and leave nothing out."""
 
-import ast
 import json
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import Section
 from emulator.world.world import build_world
-from tests.support.paths import ROOT
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -73,24 +71,6 @@ class Example:
 def test_a_column_without_a_text_is_refused() -> None:
     with pytest.raises(LookupError, match="cloud_m"):
         files.columns(STATES, {name: text for name, text in files.STATE.items() if name != "cloud_m"})
-
-
-def event_kinds() -> set[str]:
-    """The kinds of events that the emulator's code names; f-strings aside."""
-    found = set()
-    for path in [path for package in ("drivers", "cli") for path in (ROOT / "emulator" / package).rglob("*.py")]:
-        for node in ast.walk(ast.parse(path.read_text())):
-            match node:
-                case ast.Call(func=ast.Attribute(attr="event"), args=[_, ast.Constant(value=str(kind)), *_]):
-                    found.add(kind)
-    return found
-
-
-def test_every_event_is_there() -> None:
-    named_by_variables = {"finished", "crashed", "spun", "died", "entered", "restarted"}
-    named_by_variables |= {"emulator_restarted", "router_restarted"}
-    named_by_variables |= {"drive_limited", "collision", "lane_ended"}
-    assert event_kinds() | named_by_variables == set(files.EVENTS)
 
 
 def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:

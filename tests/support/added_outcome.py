@@ -30,15 +30,15 @@ MEMBER = """
 BEFORE = "    @property\n    def title"
 
 
-def add_to_the_table() -> None:
-    """Import the table of outcomes with one member more."""
-    spec = find_spec("emulator.radio.outcomes")
+def add_to(name: str, before: str, added: str) -> None:
+    """Import a module as if `added` stood in it `before` a line."""
+    spec = find_spec(name)
     assert spec is not None and spec.origin is not None
     source = Path(spec.origin).read_text()
-    assert source.count(BEFORE) == 1
+    assert source.count(before) == 1
     module = ModuleType(spec.name)
     sys.modules[spec.name] = module
-    exec(compile(source.replace(BEFORE, MEMBER + BEFORE), spec.origin, "exec"), module.__dict__)
+    exec(compile(source.replace(before, added + before), spec.origin, "exec"), module.__dict__)
 
 
 def jam_every_second_frame() -> None:
@@ -101,6 +101,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    add_to_the_table()
+    add_to("emulator.radio.outcomes", BEFORE, MEMBER)
     jam_every_second_frame()
     main(Path(sys.argv[1]))

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from emulator.drivers.hosts.messages import PART_BYTES, Item, LeftOut, Part
 from emulator.drivers.protocol import ProtocolError
+from emulator.records.events import EventKind
 from emulator.records.node_files import DEEPEST, MOST_FILES, collect
 from emulator.records.run_folder import FILES, RunFolder
 from vnet.errors import printable
@@ -88,10 +89,10 @@ class Retrieval:
         """Write an event about what a host could not hand in. Raises ProtocolError for another's."""
         self._check_owner(left_out.kind, left_out.owner)
         if left_out.kind == "log":
-            self._folder.event(time_ns, "log_left_out", left_out.owner, bytes=left_out.count)
+            self._folder.event(time_ns, EventKind.log_left_out, left_out.owner, bytes=left_out.count)
         else:
             which = [printable(each, 300) for each in left_out.which[:3]]
-            self._folder.event(time_ns, "files_left_out", left_out.owner, count=left_out.count, which=which)
+            self._folder.event(time_ns, EventKind.files_left_out, left_out.owner, count=left_out.count, which=which)
 
     def _check_owner(self, kind: str, owner: str) -> None:
         if owner not in (self._logs if kind == "log" else self._nodes):

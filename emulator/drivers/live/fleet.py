@@ -23,6 +23,7 @@ from emulator.drivers.live.supervisor import DEATH_GRACE_S
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.drivers.protocol import ProtocolError
 from emulator.records.code_digest import entries_of, vnet_digest
+from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, WireError, printable
@@ -220,7 +221,7 @@ class Fleet:
     def _refuse(self, name: str, reason: str) -> None:
         key = keys.host_tx(self._access.run, name)
         if key not in self._refused:
-            self._folder.event(self._time_ns(), "refused", None, key=key, reason=reason)
+            self._folder.event(self._time_ns(), EventKind.refused, None, key=key, reason=reason)
         self._refused[key] += 1
 
     def _take_hello(self, host: _Host, hello: HostHello) -> None:
@@ -310,7 +311,9 @@ class Fleet:
             self.cpu_ns[process_id] = figure
         for process_id, time_s, size_kb in memory:
             self._check_node(host, process_id)
-            self._folder.event(self._time_ns(), "memory", process_id, time_s=list(time_s), private_kb=list(size_kb))
+            self._folder.event(
+                self._time_ns(), EventKind.memory, process_id, time_s=list(time_s), private_kb=list(size_kb)
+            )
 
     def take_token(self, name: str, alive: bool) -> None:
         """Take note that the connection of a host has appeared or is gone."""
@@ -324,7 +327,7 @@ class Fleet:
             return
         host.is_gone = True
         self._failure = VnetError(f"host {host.name} ({host.where}): its connection closed before the start")
-        self._folder.event(self._time_ns(), "host_gone", None, host=host.name, where=host.where)
+        self._folder.event(self._time_ns(), EventKind.host_gone, None, host=host.name, where=host.where)
         self._lose(host, [nodes[0] for nodes in host.processes if nodes[0] in self._serials])
 
     def _lose(self, host: _Host, process_ids: Sequence[str]) -> None:
@@ -354,9 +357,9 @@ class Fleet:
             at_least = time.monotonic() + patience_s + HAND_IN_PATIENCE_S
             silent_at |= {host.name: at_least for host in left if host.is_handing_in}
         for host in left:
-            self._folder.event(self._time_ns(), "host_silent", None, host=host.name, where=host.where)
+            self._folder.event(self._time_ns(), EventKind.host_silent, None, host=host.name, where=host.where)
         for host in self._hosts.values():
             self._order(host, messages.Leave())
         self.flush()
         for key, count in self._refused.items():
-            self._folder.event(self._time_ns(), "refused_total", key=key, count=count)
+            self._folder.event(self._time_ns(), EventKind.refused_total, key=key, count=count)

@@ -16,6 +16,7 @@ import zenoh
 from emulator.drivers.join import Membership
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.drivers.protocol import ProtocolError
+from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.errors import WireError
 from vnet.transport import keys, wire
@@ -39,13 +40,13 @@ class Refusals:
         """Count a refused message of `node`, on its `tx` or that of its backbone."""
         key = keys.backbone_tx(self._run, node) if on_backbone else keys.node_tx(self._run, node)
         if key not in self._counts:
-            self._folder.event(self._time_ns(), "refused", node, key=key, reason=reason)
+            self._folder.event(self._time_ns(), EventKind.refused, node, key=key, reason=reason)
         self._counts[key] += 1
 
     def write_totals(self) -> None:
         """Log how many messages were refused, by key."""
         for key, count in self._counts.items():
-            self._folder.event(self._time_ns(), "refused_total", key=key, count=count)
+            self._folder.event(self._time_ns(), EventKind.refused_total, key=key, count=count)
 
 
 class Inbox:

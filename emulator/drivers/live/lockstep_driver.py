@@ -14,6 +14,7 @@ from emulator.drivers.live.driver import Driver, Parts
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ProcessState
 from emulator.drivers.live.waiting import Stalled
 from emulator.drivers.lockstep import Lockstep
+from emulator.records.events import EventKind
 from vnet.counted import counted
 from vnet.transport import wire
 from vnet.transport.backbone import SentMessage
@@ -163,7 +164,7 @@ class LockstepDriver(Driver):
         while late := self._supervisor.returning_nodes(process_ids):
             if not await self._changes.wait(deadline - time.monotonic()):
                 error = f"has not come back within {timeout_s:g} s"
-                self._emulation.folder.event(self.time_ns, "stalled", late[0], error=error)
+                self._emulation.folder.event(self.time_ns, EventKind.stalled, late[0], error=error)
                 raise Stalled
         self._supervisor.take_returned()
 
@@ -193,7 +194,7 @@ class LockstepDriver(Driver):
             refused = parts.inbox.refused.get(process_id)
             self._emulation.folder.event(
                 self.time_ns,
-                "stalled",
+                EventKind.stalled,
                 process_id,
                 error=f"{self._lacking(process_id)} within {timeout_s:g} s of wall clock; "
                 f"{parts.members.describe(process_id)}",

@@ -14,6 +14,7 @@ from emulator.drivers.live.inbox import Inbox
 from emulator.drivers.live.supervisor import ProcessState, Supervisor
 from emulator.drivers.live.waiting import Stalled
 from emulator.drivers.router import ROUTER
+from emulator.records.events import KINDS, EventKind
 from emulator.scenario.fault_families import Infrastructure
 from emulator.scenario.faults import EmulatorRestart
 from vnet.transport import wire
@@ -64,7 +65,7 @@ class Reconnection:
         await self._restart(fault)
         await self._all_answer(process_ids, patience_s)
         self._supervisor.reconnecting = False
-        self._emulation.folder.event(self._time_ns(), f"{fault.kind}ed", None, down_s=fault.down_s)
+        self._emulation.folder.event(self._time_ns(), KINDS[f"{fault.kind}ed"], None, down_s=fault.down_s)
 
     def _connected_nodes(self) -> list[str]:
         """The nodes that are up and whose processes are there.
@@ -93,7 +94,7 @@ class Reconnection:
         while silent := [id_ for id_ in process_ids if id_ not in self._inbox.stacks and not self._is_dead(id_)]:
             if time.monotonic() > deadline:
                 error = f"has not found the emulator again within {patience_s:g} s"
-                self._emulation.folder.event(self._time_ns(), "stalled", silent[0], error=error)
+                self._emulation.folder.event(self._time_ns(), EventKind.stalled, silent[0], error=error)
                 raise Stalled
             for process_id in silent:
                 self._attachment.send(process_id, wire.StackRequest())

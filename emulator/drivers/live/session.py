@@ -39,6 +39,7 @@ from emulator.drivers.signals import cancelled_by_signals
 from emulator.drivers.status import Course
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Zygote
 from emulator.records.code_digest import entries_of
+from emulator.records.events import EventKind
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 from vnet.transport import wire
@@ -235,7 +236,7 @@ class LiveSession:
 
         try:
             processes = await self._joining.join(on_state, tell_missing)
-            folder.event(0, "started", start_up_s=round(time.monotonic() - started_s, 3))
+            folder.event(0, EventKind.started, start_up_s=round(time.monotonic() - started_s, 3))
             self._emulation.watch(self._feed.period)
             self._emulation.watch(self._look_at_processes)
             self._measure_cpu()
@@ -250,7 +251,7 @@ class LiveSession:
             self._emulation.finish(self._time_ns())
         except asyncio.CancelledError:
             interrupted = True
-            folder.event(self._time_ns(), "interrupted")
+            folder.event(self._time_ns(), EventKind.interrupted)
             self._emulation.finish(self._time_ns())
         finally:
             wall_s = time.monotonic() - started_s
@@ -331,7 +332,7 @@ class LiveSession:
         ends = self._launcher.stop(patience_s)
         for process_id, details in self._supervisor.take_last_deaths(ends).items() if completed else ():
             for node in self._members.nodes_with(process_id):
-                self._emulation.folder.event(self._emulation.duration_ns, "died", node, **details)
+                self._emulation.folder.event(self._emulation.duration_ns, EventKind.died, node, **details)
 
     def _time_ns(self) -> int:
         """Emulated time for events; 0 before the start."""

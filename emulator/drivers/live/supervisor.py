@@ -19,6 +19,7 @@ from emulator.drivers.join import Membership
 from emulator.drivers.launch import AgentProcesses, Exit, Launcher
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.drivers.signals import gets_signals, signals_handled
+from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.runtime.own_packages import foreign_on_path
@@ -271,7 +272,7 @@ class Supervisor:
         if not told_to_end:
             self._ends.pop(name, None)
         if not self._attachment.knows(name) and not is_host:
-            self._folder.event(self._time_ns(), "observer_ended", name, how=how.how)
+            self._folder.event(self._time_ns(), EventKind.observer_ended, name, how=how.how)
         elif not self._processes:
             last = (how.log_tail.splitlines() or ["its log is empty"])[-1]
             if "No module named" in last and (foreign := foreign_on_path("agents")):

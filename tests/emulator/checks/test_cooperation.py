@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict
-from emulator.records.run_folder import Event
+from emulator.records.events import Event
 from tests.emulator.checks.test_faults import not_valid, simulated
 from tests.emulator.checks.test_judge import checked, result, verdict
 from vnet.node import Node

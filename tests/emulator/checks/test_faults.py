@@ -13,7 +13,7 @@ import pytest
 
 from emulator.checks.fault_effects import _wrong_fixes
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
-from emulator.records.run_folder import Event
+from emulator.records.events import Event
 from emulator.records.states import STATES
 from emulator.scenario.faults import KINDS, DataReplay, parse_fault
 from emulator.scenario.scenario import Scenario

@@ -14,8 +14,9 @@ from emulator.checks.judge import CheckResult, NotExercised, Verdict, check_run,
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
+from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event, RunFolder
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import VnetError

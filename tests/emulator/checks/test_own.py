@@ -15,8 +15,8 @@ import emulator
 from emulator.checks.judge import judge
 from emulator.checks.own import own_findings
 from emulator.cli.commands import app
+from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
 from emulator.report.write import write_report
 from emulator.scenario.program import Program

@@ -11,8 +11,8 @@ import pytest
 
 from emulator.api import simulate
 from emulator.checks.properties import Moment, always, eventually, leads_to, moments, never
+from emulator.records.events import Event
 from emulator.records.run import Run
-from emulator.records.run_folder import Event
 from emulator.testing.harness import RunHarness
 from emulator.testing.scenarios import make_scenario
 from vnet import Node

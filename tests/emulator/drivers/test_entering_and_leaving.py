@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from emulator.checks.judge import NotExercised, RecordedRun, Verdict, judge
 from emulator.drivers.simulate import simulate
 from emulator.drivers.status import Course
-from emulator.records.run_folder import Event
+from emulator.records.events import Event
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.stream.messages import unpack
 from emulator.stream.playback import messages

@@ -13,6 +13,7 @@ import pytest
 from emulator.checks.run import check_agents_alive, check_no_exceptions
 from emulator.drivers.conclude import gather
 from emulator.drivers.emulation import Emulation
+from emulator.records.events import EventKind
 from emulator.records.verdicts import Verdict
 from tests.support.multi_loop_driver import run_forked, run_together, scenario_of
 from vnet.node import Node
@@ -122,7 +123,7 @@ def test_a_vehicle_that_ends_its_process_has_died_alone(program: Program, run: R
     recorded = gather(emulation, 1.0)
     assert recorded.trace.num_rows > 0
     assert not [event for event in emulation.folder.events if event.kind in ("crashed", "exception")]
-    emulation.folder.event(0, "started", start_up_s=0.0)
+    emulation.folder.event(0, EventKind.started, start_up_s=0.0)
     assert check_agents_alive(recorded).verdict is Verdict.INVALID  # type: ignore[union-attr]
 
 

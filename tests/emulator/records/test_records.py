@@ -15,9 +15,10 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.radio.trace import sha256_of_table
+from emulator.records.events import Event, EventKind
 from emulator.records.metrics import Metrics, summarize
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event, RunFolder
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, build_world
 from vnet.errors import VnetError
@@ -261,7 +262,7 @@ def test_a_run_folder_never_takes_anothers_place(tmp_path: Path, monkeypatch: py
 
 def test_events_are_on_disk_at_once_and_a_torn_line_is_no_harm(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", Scenario())
-    folder.event(5, "died", "v01", how="SIGKILL")
+    folder.event(5, EventKind.died, "v01", how="SIGKILL")
     with (folder.path / "events.jsonl").open("a") as file:
         file.write('{"time_ns": 6, "ki')
     assert RecordedRun.open(folder.path).events == [Event(5, "died", "v01", {"how": "SIGKILL"})]

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emulator.records.events import KINDS, Event, EventKind
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event, RunFolder
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, load_scenario
 from vnet.errors import VnetError
 
@@ -51,7 +52,7 @@ def test_each_run_gets_a_folder_of_its_own_and_latest_is_the_last(
     monkeypatch.chdir(tmp_path)
     scenario = Scenario.model_validate({"run": {"name": "night", "seed": 7}})
     first = RunFolder.create(None, scenario)
-    first.event(1, "started")
+    first.event(1, EventKind.started)
     before = {path: path.read_bytes() for path in first.path.rglob("*") if path.is_file()}
     second, third = RunFolder.create(None, scenario), RunFolder.create(None, scenario)
     assert [folder.path.name for folder in (first, second, third)] == ["night-7", "night-7-2", "night-7-3"]
@@ -102,7 +103,7 @@ def test_a_place_below_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_a_folder_that_goes_away_during_the_run_is_one_line(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", Scenario())
     folder.path.rename(tmp_path / "elsewhere")
-    folder.event(1, "died", "v01")  # is written at the end, if it can be
+    folder.event(1, EventKind.died, "v01")  # is written at the end, if it can be
     writers: list[Callable[[], object]] = [lambda: folder.put_json("verdict.json", {})]
     for write in writers:
         with pytest.raises(VnetError, match="cannot write") as refused:
@@ -132,7 +133,7 @@ def test_events_up_to_the_cut_survive_a_cut_anywhere(
 ) -> None:
     folder = RunFolder.create(tmp_path_factory.mktemp("events") / "run", Scenario())
     for time_ns, kind, node, details in events:
-        folder.event(time_ns, kind, node, **details)
+        folder.event(time_ns, KINDS[kind], node, **details)
     assert RecordedRun.open(folder.path).events == folder.events == [Event(*event) for event in events]
     path = folder.path / "events.jsonl"
     whole = path.read_bytes()

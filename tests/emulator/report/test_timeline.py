@@ -10,7 +10,7 @@ import pytest
 
 from emulator.api import simulate_into
 from emulator.pages.page import render
-from emulator.records.run_folder import Event
+from emulator.records.events import Event
 from emulator.report import timeline as module
 from emulator.report.source import Source
 from emulator.report.timeline import (
@@ -168,7 +168,7 @@ def test_a_fault_that_does_not_end_lasts_until_the_end_and_unknown_nodes_are_lef
     assert bars_of(events, {"v01": 0}, 20_000) == [Bar("loss-0", 5_000, 20_000, (0,))]
     crash, interrupted = marks_of(events, {"v01": 0})
     assert (crash.node, crash.text) == (-1, "crashed: <b>\\x1b")
-    assert (interrupted.node, interrupted.kind, interrupted.text) == (-1, "process", "interrupted")
+    assert (interrupted.node, interrupted.kind, interrupted.text) == (-1, "warning", "interrupted")
 
 
 def test_of_many_vehicles_those_with_failures_marks_and_faults_have_lanes_first(

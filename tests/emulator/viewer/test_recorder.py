@@ -12,8 +12,9 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
+from emulator.records.events import Event
 from emulator.records.paper_values import paper_rmse
-from emulator.records.run_folder import Event, RunFolder
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import event_message, unpack
 from emulator.viewer.drawing import (

@@ -1,0 +1,252 @@
+"""The events of a run: a closed set of kinds, each declared once, and one line of `events.jsonl` for each event.
+
+`EventKind` is the only place that states a kind: its name, whom it concerns, its details, what has happened, its
+level and its part in what readers conclude. Writers name its members; terminal, report, timeline, Rerun, checks,
+cells and the reference page draw from it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Flag, IntEnum, StrEnum, auto
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vnet.errors import VnetError, printable
+
+if TYPE_CHECKING:
+    from typing import Self
+
+Details = Mapping[str, Any]
+
+
+class Level(IntEnum):
+    """Weight of an event, in ascending order."""
+
+    NOTE = 0
+    TOLD = 1
+    """A program tells it."""
+    CHANGE = 2
+    """A program or the run starts or ends, as it should."""
+    WARNING = 3
+    FAILURE = 4
+    """A program, a process or a rule failed."""
+
+
+class Part(Flag):
+    """Parts that a kind of event has in what readers conclude from it."""
+
+    NONE = 0
+    SAMPLES = auto()
+    """A series of measurements, too long for tables of events."""
+    MEASURED = auto()
+    """A measurement for the checks, and no news while the run is on."""
+    SAID = auto()
+    """A program's own words, and no news of vnet's."""
+    GROUPED = auto()
+    """Told once for all vehicles that fail in the same line."""
+    ENDS_PROGRAM = auto()
+    """The node stays down from then on."""
+    CUTS_RUN = auto()
+    """Emulated time ends before its due end."""
+
+
+NOTE, TOLD, CHANGE, WARNING, FAILURE = Level
+SAMPLES, MEASURED, SAID, GROUPED, ENDS_PROGRAM, CUTS_RUN = Part
+QUIET_LEVELS = ("debug", "info")
+"""Levels of log lines that are no warnings."""
+
+
+def _of_line(details: Details) -> Level:
+    return TOLD if str(details.get("level", "")).lower() in QUIET_LEVELS else WARNING
+
+
+def _if_any(details: Details) -> Level:
+    return WARNING if details.get("count") else NOTE
+
+
+class EventKind(StrEnum):
+    """A kind of event. Its value is the `kind` of a line of `events.jsonl`.
+
+    `node` says what the line's `node` is ("" for none), `details` names what else the line has, `meaning` says what
+    has happened, for the reference page; `level` is a level, or a function of the details; `part` is its `Part`s.
+    """
+
+    node_is: str
+    details: tuple[str, ...]
+    meaning: str
+    level: Level | Callable[[Details], Level]
+    part: Part
+
+    def __new__(
+        cls,
+        value: str,
+        node_is: str,
+        details: str,
+        meaning: str,
+        level: Level | Callable[[Details], Level] = NOTE,
+        part: Part = Part.NONE,
+    ) -> Self:
+        """Make a member that is its name, and carries its facts."""
+        kind = str.__new__(cls, value)
+        kind._value_ = value
+        kind.node_is, kind.details, kind.meaning = node_is, tuple(details.split()), meaning
+        kind.level, kind.part = level, part
+        return kind
+
+    # fmt: off
+    note = "note", "", "what", "oddities of the input: vehicles left out, ids escaped, ways clipped"
+    code_changed = (
+        "code_changed", "", "what", "program or vnet have changed since the run whose scenario this one repeats")
+    started = "started", "", "start_up_s", "all have joined; time 0"
+    ended = "ended", "", "wall_s", "the run is over"
+    interrupted = "interrupted", "", "", "Ctrl-C or SIGTERM", WARNING, CUTS_RUN
+    finished = "finished", "vehicle", "", "its program returned", CHANGE, ENDS_PROGRAM
+    crashed = (
+        "crashed", "vehicle", "error place where", "its program raised; where, and the traceback",
+        FAILURE, GROUPED | ENDS_PROGRAM)
+    exception = (
+        "exception", "vehicle", "error place where", "its program raised and nobody handled it: at that instant, "
+        "so that the line may come after later ones; where, and the traceback", FAILURE, GROUPED)
+    log = (
+        "log", "vehicle", "level text", "a line of `node.log`, or of the standard `logging` of its program",
+        _of_line, SAID)
+    event = "event", "vehicle", "name details", "an event of its program: `node.event`", TOLD, SAID
+    left_out = (
+        "left_out", "vehicle", "what count", "how many events of this kind are not here: there were too many",
+        WARNING)
+    files_left_out = (
+        "files_left_out", "vehicle", "count which",
+        "how many files of its disk are not in `files/`, and of the first three the name and the reason")
+    spun = (
+        "spun", "vehicle", "error place where",
+        "its program did not let time advance (busy loop); where its tasks stood", FAILURE, ENDS_PROGRAM)
+    died = (
+        "died", "vehicle", "how log_tail process place where",
+        "its process ended without being told to; its log, or the process that it shares", FAILURE,
+        GROUPED | ENDS_PROGRAM)
+    stalled = (
+        "stalled", "vehicle", "error where refused", "its process did not yield, or did not come back, in time; "
+        "why its last message was refused, if it was", FAILURE, CUTS_RUN)
+    restarted = "restarted", "vehicle", "incarnation", "it is up again after a kill or restart", CHANGE
+    entered = "entered", "vehicle", "incarnation", "it is in the network, and its program starts", CHANGE
+    left = "left", "vehicle", "", "it is not in the network any more", CHANGE
+    drive_limited = (
+        "drive_limited", "vehicle", "acceleration_m_s2 limit_m_s2 lane reason",
+        "`node.drive` asked for an acceleration, or a lane, that the vehicle cannot have; of an acceleration "
+        "the first time in a row")
+    collision = (
+        "collision", "vehicle", "with closing_m_s",
+        "a driven vehicle has run into another, which was ahead, or crossed its way")
+    lane_ended = (
+        "lane_ended", "vehicle", "lane", "on a map: a driven vehicle's lane has ended, and it is in this one now")
+    rule_failed = (
+        "rule_failed", "", "fault rule sender error where", "a rule of your own raised, did not answer, or "
+        "answered nonsense: it lets everything pass from then on", FAILURE)
+    fault_started = "fault_started", "", "fault nodes", "a fault begins to act, and on whom"
+    fault_ended = "fault_ended", "", "fault", "it has healed"
+    judged_by_test = (
+        "judged_by_test", "", "checks", "which properties of a test have judged the run, beside its scenario")
+    emulator_restarted = "emulator_restarted", "", "down_s", "the emulator's connection is back", CHANGE
+    router_restarted = "router_restarted", "", "down_s", "the separate router is back", CHANGE
+    refused = "refused", "vehicle", "key reason", "the first message on this key that was not believed", WARNING
+    refused_total = "refused_total", "", "key count", "how many there were", NOTE, MEASURED
+    observer_ended = "observer_ended", "process", "how", "a recorder ended before the run did", WARNING
+    host_gone = (
+        "host_gone", "", "host where", "the connection of this host closed; its processes have `died` with it",
+        FAILURE)
+    host_silent = (
+        "host_silent", "", "host where", "this host did not hand in all logs and files of its vehicles at the end")
+    log_left_out = (
+        "log_left_out", "vehicle", "bytes", "how much of the beginning of its log is still on its host")
+    memory = (
+        "memory", "process", "time_s private_kb", "private memory in KiB, as two lists", NOTE, SAMPLES | MEASURED)
+    memory_exceeded = (
+        "memory_exceeded", "process", "nodes memory_mb limit_mb",
+        "its private memory exceeded `run.memory_limit_mb`, which ended the run", FAILURE, CUTS_RUN)
+    transport_gap = "transport_gap", "", "count", "real time: how often something went missing on the way", WARNING
+    late_deliveries = (
+        "late_deliveries", "", "total count p50_ms p99_ms max_ms worst worst_s", "real time: all deliveries, those "
+        "over 20 ms late, how late they were, the processes with most of them, and the seconds in which most were "
+        "told of", _if_any, MEASURED)
+    # fmt: on
+
+
+KINDS = {kind.value: kind for kind in EventKind}
+
+
+def level_of(kind: str, details: Details) -> Level:
+    """Return the weight of an event of this kind; a note where `EventKind` has no such kind."""
+    level = KINDS[kind].level if kind in KINDS else NOTE
+    return level if isinstance(level, Level) else level(details)
+
+
+def kinds_with(part: Part) -> tuple[EventKind, ...]:
+    """Return the kinds of event that have this part."""
+    return tuple(kind for kind in EventKind if kind.part & part)
+
+
+@dataclass(frozen=True)
+class Event:
+    """One line of `events.jsonl`: something that happened to a node, or to the run where `node` is None.
+
+    A folder of another version may have kinds that `EventKind` has not; they are notes.
+    """
+
+    time_ns: int
+    kind: str
+    node: str | None
+    details: dict[str, Any]
+
+    @property
+    def level(self) -> Level:
+        """Its weight."""
+        return level_of(self.kind, self.details)
+
+    @property
+    def is_bad(self) -> bool:
+        """True if something failed that no planned fault was to do."""
+        return self.level >= WARNING
+
+    def has(self, part: Part) -> bool:
+        """Return whether its kind has this part."""
+        return self.kind in KINDS and bool(KINDS[self.kind].part & part)
+
+    @property
+    def words(self) -> str:
+        """Its kind in words."""
+        return self.kind.replace("_", " ")
+
+    @property
+    def name(self) -> str:
+        """Name that the program gave to an event of its own (`node.event`); else the kind."""
+        return str(self.details.get("name", "")) if self.kind == EventKind.event else self.kind
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Details that the program gave to an event of its own; else those of the kind."""
+        values = self.details.get("details") if self.kind == EventKind.event else self.details
+        return values if isinstance(values, dict) else {}
+
+    def line(self) -> str:
+        """Return the event as a line of `events.jsonl`."""
+        return json.dumps({"time_ns": self.time_ns, "kind": self.kind, "node": self.node, **self.details}) + "\n"
+
+
+def parse_events(path: Path, content: bytes) -> list[Event]:
+    """Return the events of a file. Raises VnetError where a line is JSON, but no event."""
+    events = []
+    for line in content.decode("utf-8", "replace").splitlines():
+        try:
+            data = json.loads(line)
+        except (ValueError, RecursionError):
+            continue  # the last line of a run that was killed
+        if not isinstance(data, dict) or not data.keys() >= {"time_ns", "kind", "node"}:
+            continue
+        time_ns, kind, node = (data.pop(key) for key in ("time_ns", "kind", "node"))
+        if type(time_ns) is not int or not isinstance(kind, str) or not isinstance(node, (str, type(None))):
+            raise VnetError(f"{path}: not vnet's events: {printable(line, 100)}")
+        events.append(Event(time_ns, kind, node, data))
+    return events
