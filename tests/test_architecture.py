@@ -15,7 +15,7 @@ import pytest
 
 from tests.support.paths import ROOT
 
-PACKAGES = ("vnet", "agents", "emulator")
+PACKAGES = ("vnet", "agents", "emulator", "studies")
 LAYERS = (
     ("vnet",),
     ("emulator.scenario",),
@@ -28,10 +28,10 @@ LAYERS = (
     ("emulator.viewer", "emulator.report"),
     ("emulator.drivers",),
     ("emulator.cells",),
-    ("emulator.terminal", "emulator.testing", "emulator.learning", "emulator.api"),
-    ("emulator.experiments",),
+    ("emulator.terminal", "emulator.testing", "emulator.learning", "emulator.api", "emulator.analyze"),
     ("emulator.cli",),
     ("emulator.__main__",),
+    ("studies",),
 )
 """The lowest first: a module imports from its own package and from lower layers, never from a neighbour."""
 VNET_LAYERS = (
@@ -176,8 +176,11 @@ def test_the_mathematics_stands_on_roads_alone() -> None:
             assert [other for other in others if not other.startswith(may)] == [], module
 
 
-@pytest.mark.parametrize(("package", "forbidden"), [("agents", "emulator"), ("emulator", "agents")])
-def test_agents_and_emulator_never_import_each_other(package: str, forbidden: str) -> None:
+@pytest.mark.parametrize(
+    ("package", "forbidden"),
+    [("agents", "emulator"), ("emulator", "agents"), ("agents", "studies"), ("emulator", "studies")],
+)
+def test_agents_and_emulator_never_import_each_other_or_the_studies(package: str, forbidden: str) -> None:
     mine = {module: others for module, others in imports().items() if module.split(".")[0] == package}
     assert len(mine) > 3
     broken = {m: [o for o in others if o.split(".")[0] == forbidden] for m, others in mine.items()}

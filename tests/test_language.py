@@ -13,7 +13,7 @@ import pytest
 
 from tests.support.paths import ROOT
 
-CODE = ("vnet", "agents", "emulator", "docs", "benchmarks", "tests")
+CODE = ("vnet", "agents", "emulator", "studies", "docs", "benchmarks", "tests")
 FRAGMENT = re.compile(r"(who|whom|whose|what|when|where|which|whether|of|how)\b", re.IGNORECASE)
 
 REPLACED_NAMES = {

@@ -3,7 +3,7 @@
 import re
 import subprocess
 import tomllib
-from importlib.metadata import distributions
+from importlib.metadata import distributions, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
 
+from emulator.cli.table import REGISTRY
 from tests.docs import commands
 from tests.docs.pages import check_workflow
 from tests.support.paths import ROOT
@@ -129,3 +130,12 @@ def test_make_test_all_tests_each_python_that_is_installed(installed: list[str],
 def stand_in(path: Path, does: str) -> None:
     path.write_text(f"#!/bin/sh\n{does}\n")
     path.chmod(0o755)
+
+
+def test_make_setup_installs_the_studies_that_register_their_command() -> None:
+    (entry,) = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text())["project"]["entry-points"][
+        REGISTRY
+    ].items()
+    assert entry == ("experiment", "studies.commands:app")
+    assert any(line.endswith("-e ./studies") for line in recipe(r"\$\(READY\)"))
+    assert [found.value for found in entry_points(group=REGISTRY, name="experiment")] == [entry[1]], "make setup"

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.ns3.compare import Comparison
 from benchmarks.ns3.ground import BIN_M
-from emulator.experiments.style import BLUE, DPI, ORANGE, styled
+from studies.style import BLUE, DPI, ORANGE, styled
 
 
 @styled

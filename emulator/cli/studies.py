@@ -39,8 +39,8 @@ def analyze(
     overrides: SetOption = None,
 ) -> None:
     """Analyze the network without a run: components, degrees, convergence of each rule of weights."""
-    from emulator.experiments.analyze import analysis_table
-    from emulator.experiments.analyze import analyze as analyze_scenario
+    from emulator.analyze import analysis_table
+    from emulator.analyze import analyze as analyze_scenario
 
     with one_line_errors():
         SafeConsole().print(analysis_table(analyze_scenario(load(scenario, overrides), run)))

@@ -8,6 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+REGISTRY = "vnet.commands"
+"""Group of the entry points by which another distribution brings a command of the table."""
+
 
 class Panel(StrEnum):
     """The headings under which `vnet --help` lists the commands, in this order."""
@@ -23,7 +26,8 @@ class Panel(StrEnum):
 class Command:
     """A command or a group of commands.
 
-    `module` is a module of `emulator.cli`, and `attribute` the function or the group in it.
+    `module` is a module of `emulator.cli`, and `attribute` the function or the group in it; both are empty for a
+    command from elsewhere.
     """
 
     name: str
@@ -34,6 +38,8 @@ class Command:
     """One line of `vnet --help` at 80 columns; the command's own docstring says more."""
     runs_programs: bool = False
     """It runs programs in this process, which therefore needs a fixed hash seed."""
+    elsewhere: str = ""
+    """Set for a command that another distribution registers in `REGISTRY`: the line for a user who lacks it."""
 
     @property
     def needed_mb(self) -> int:
@@ -95,10 +101,11 @@ COMMANDS = (
     Command(
         "experiment",
         Panel.STUDY,
-        "experiment",
-        "app",
-        "Run the paper's experiments, and vnet's own.",
+        "",
+        "",
+        "Run the paper's experiments, in a clone of vnet.",
         runs_programs=True,
+        elsewhere="the studies are not in the package but in a clone of vnet: `pip install -e ./studies` there",
     ),
     Command(
         "export", Panel.FILES, "export", "export", "Write a run for Wireshark (pcapng), Foxglove (mcap), or as CSV."

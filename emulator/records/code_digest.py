@@ -24,8 +24,6 @@ if TYPE_CHECKING:  # slow to import, and hosts need no scenario
 
 OWN = ("vnet", "emulator")
 """The packages that are vnet itself."""
-LEFT_OUT = "experiments"
-"""The part of vnet on which no run depends."""
 _SITE = ("purelib", "platlib", "stdlib", "platstdlib")
 _SITE_NAMES = frozenset({"site-packages", "dist-packages"})
 
@@ -101,16 +99,15 @@ def program_digest(entries: Iterable[str], folders: Iterable[Path] = ()) -> str 
 
 @cache
 def vnet_digest() -> str:
-    """One digest of vnet's own sources, but for `LEFT_OUT`."""
+    """One digest of vnet's own sources."""
     digest = hashlib.sha256()
     for package in OWN:
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or []) if spec else []:
             for path in sorted(Path(folder).rglob("*.py")):
                 name = path.relative_to(folder)
-                if LEFT_OUT not in name.parts:
-                    digest.update(f"{package}/{name.as_posix()}\0".encode())
-                    digest.update(hashlib.sha256(path.read_bytes()).digest())
+                digest.update(f"{package}/{name.as_posix()}\0".encode())
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 
 

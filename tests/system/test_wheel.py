@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    for name in ("vnet", "agents", "emulator", "scenarios"):
+    for name in ("vnet", "agents", "emulator", "scenarios", "studies"):
         shutil.copytree(ROOT / name, source / name, symlinks=True)  # a build leaves files beside its source
     run_pip("wheel", "--no-deps", "--no-build-isolation", "-w", folder, source)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)
@@ -87,3 +88,16 @@ def test_a_new_project_runs_and_its_tests_pass(command: Command) -> None:
     command("vnet", "new", "mynet")
     assert "verdict: valid" in command("vnet", "simulate", "mynet.toml", "--quiet", folder="mynet")
     assert "2 passed" in command("python", "-m", "pytest", "-p", "no:cacheprovider", folder="mynet")
+
+
+def test_the_wheel_has_no_studies_and_says_in_one_line_where_they_are(environment: Path, tmp_path: Path) -> None:
+    """The entry point of the clone's installation is in sight here, as after a clone was removed."""
+    with zipfile.ZipFile(next(environment.parents[1].glob("*.whl"))) as wheel:
+        packages = {name.split("/")[0] for name in wheel.namelist()}
+    assert sorted(name for name in packages if not name.endswith(".dist-info")) == ["agents", "emulator", "vnet"]
+    for arguments in (["table1", "--seeds", "1"], ["--help"], []):
+        words = [str(environment / "vnet"), "experiment", *arguments]
+        done = subprocess.run(words, cwd=tmp_path, env=clean_environment(), capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (2, "")
+        (line,) = done.stderr.splitlines()
+        assert "`pip install -e ./studies`" in line

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.experiments.paper import ALPHAS
-from emulator.experiments.tables import (
+from emulator.records.metrics import anees_band
+from emulator.records.paper_values import PAPER_RMSE_M
+from studies.paper import ALPHAS
+from studies.tables import (
     in_seeds,
     markdown_table,
     mean_and_error,
@@ -16,8 +18,6 @@ from emulator.experiments.tables import (
     paired_ratio,
     with_error,
 )
-from emulator.records.metrics import anees_band
-from emulator.records.paper_values import PAPER_RMSE_M
 
 Result = Mapping[str, Any]
 BOUND_RATIO = 1.35

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from emulator.cells.cells import compute
-from emulator.experiments.attackers import ATTACKS, HONEST, attack_cells, report
 from emulator.scenario.scenario import Scenario
+from studies.attackers import ATTACKS, HONEST, attack_cells, report
 
 TINY = {"n1": {"kind": "generated", "vehicles": 6}}
 

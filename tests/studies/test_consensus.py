@@ -6,10 +6,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from emulator.analyze import FASTEST, is_connected, mutual
 from emulator.cells.cells import Cell, compute, keep
-from emulator.experiments import consensus as subject
-from emulator.experiments.analyze import FASTEST, is_connected, mutual
-from emulator.experiments.consensus import (
+from studies import consensus as subject
+from studies.consensus import (
     LATENCIES_MS,
     LOSSES,
     RULES,

@@ -10,7 +10,7 @@ import pytest
 
 from emulator.cells.cells import compute, keep, read_result, read_series
 from emulator.cells.measure import BOUND, BOUND_POSITION
-from emulator.experiments.comparisons import (
+from studies.comparisons import (
     STUDIES,
     _with_bound,
     comparison_cells,

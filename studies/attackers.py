@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 
 from emulator.cells.cells import Cell
-from emulator.experiments.comparisons import COOPERATIVE
-from emulator.experiments.paper import Labels
-from emulator.experiments.reports import Result, column, select, unique
-from emulator.experiments.statistics import shown_interval
-from emulator.experiments.tables import MISSING, markdown_table, paired_ratio, with_error
 from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import links_within
 from emulator.world.world import build_world
+from studies.comparisons import COOPERATIVE
+from studies.paper import Labels
+from studies.reports import Result, column, select, unique
+from studies.statistics import shown_interval
+from studies.tables import MISSING, markdown_table, paired_ratio, with_error
 from vnet.counted import counted
 
 ATTACKER = "agents.cooperative.attacker:main"

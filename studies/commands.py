@@ -1,4 +1,7 @@
-"""`vnet experiment`: the paper's tables and figures, and vnet's own, with one command each."""
+"""`vnet experiment`: the paper's tables and figures, and vnet's own, with one command each.
+
+`pyproject.toml` beside this file registers it as an entry point of the group `vnet.commands`.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,13 @@ from rich.markdown import Markdown
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.cli.help import group
 from emulator.cli.options import pair
-from emulator.experiments import paper
 from emulator.records.paper_values import PAPER_RMSE_M
 from emulator.scenario.limits import DAY_S
 from emulator.terminal.console import one_line_errors, tell
+from studies import paper
 from vnet.errors import VnetError
 
-app = group("Run the paper's experiments, and vnet's own.")
+app = group("Run the paper's experiments, and vnet's own: in a clone of vnet, no part of the wheel.")
 FOLDER = Path("runs/experiments")
 
 NetworksOption = Annotated[
@@ -49,7 +52,7 @@ def table1(
     seeds: SeedsOption = 20, out: OutOption = None, only: OnlyOption = None, live: LiveOption = False
 ) -> None:
     """Table I: four vehicles on a directed ring, constant α against optimized weights."""
-    from emulator.experiments import reports, result_figures
+    from studies import reports, result_figures
 
     with one_line_errors():
         folder = _folder(out, "table1")
@@ -70,7 +73,7 @@ def table2(
     live: LiveOption = False,
 ) -> None:
     """Table II: the paper's profile on N1, N2 and N3, lanes bounded on one side and on two."""
-    from emulator.experiments import reports
+    from studies import reports
 
     with one_line_errors():
         folder = _folder(out, "table2")
@@ -90,7 +93,7 @@ def default(
     live: LiveOption = False,
 ) -> None:
     """vnet's own profile on the same networks, against the hears-all bound. Takes hours for all."""
-    from emulator.experiments import reports, result_figures
+    from studies import reports, result_figures
 
     with one_line_errors():
         folder = _folder(out, "default")
@@ -106,7 +109,7 @@ def tempering(
     networks: NetworksOption = None, seeds: SeedsOption = 10, out: OutOption = None, only: OnlyOption = None
 ) -> None:
     """Consistency (ANEES) and error of the hears-all bound against lateral_tau_s, on N3 of the default too."""
-    from emulator.experiments import tempering as study
+    from studies import tempering as study
 
     with one_line_errors():
         folder = _folder(out, "tempering")
@@ -127,7 +130,7 @@ def divergence(
     only: OnlyOption = None,
 ) -> None:
     """Does the default profile ever diverge? Many seeds on each network, and the worst of them."""
-    from emulator.experiments import divergence as study
+    from studies import divergence as study
 
     with one_line_errors():
         folder = _folder(out, "divergence")
@@ -145,7 +148,7 @@ def attackers(
     only: OnlyOption = None,
 ) -> None:
     """Attackers: the error that each kind of false frames costs the other vehicles, on the same seeds."""
-    from emulator.experiments import attackers as study
+    from studies import attackers as study
 
     with one_line_errors():
         folder = _folder(out, "attackers")
@@ -180,7 +183,7 @@ def compare(
     only: OnlyOption = None,
 ) -> None:
     """Compare the cooperative program with parts removed, with textbook baselines, or in other worlds."""
-    from emulator.experiments import comparisons
+    from studies import comparisons
 
     with one_line_errors():
         folder = _folder(out, study.value)
@@ -222,7 +225,7 @@ def city(
     live: LiveOption = False,
 ) -> None:
     """Vehicles that drive: every mechanism on the same trips and roads, raw fixes beside. Takes hours for all."""
-    from emulator.experiments import city as study
+    from studies import city as study
 
     with one_line_errors():
         folder = _folder(out, "city")
@@ -251,7 +254,7 @@ def draw_figures(
     / "table2",
 ) -> None:
     """The paper's pictures: degrees, road angles, graphs; RMSE and deviation against time on N2 and N3."""
-    from emulator.experiments import network_figures
+    from studies import network_figures
 
     with one_line_errors():
         folder = _folder(out, "figures")
@@ -271,7 +274,7 @@ def draw_figures(
 @app.command()
 def consensus(networks: NetworksOption = None, seeds: SeedsOption = 3, out: OutOption = None) -> None:
     """Consensus alone: against rounds, loss, delay, one-way links and churn, beside the linear model."""
-    from emulator.experiments.consensus import run_consensus
+    from studies.consensus import run_consensus
 
     with one_line_errors():
         path = run_consensus(networks, range(1, seeds + 1), _folder(out, "consensus"))
@@ -286,7 +289,7 @@ def capacity(
     out: OutOption = None,
 ) -> None:
     """Capacity of an 802.11p channel: packet delivery ratio against the number of senders in range."""
-    from emulator.experiments.capacity import run_capacity
+    from studies.capacity import run_capacity
 
     with one_line_errors():
         path = run_capacity(seconds, range(1, seeds + 1), _folder(out, "capacity"))
@@ -331,7 +334,7 @@ def _select(cells: Sequence[Cell], only: Sequence[str]) -> list[Cell]:
 
 
 def _draw_against_time(cells: Sequence[Cell], cells_from: Path, folder: Path) -> None:
-    from emulator.experiments import result_figures
+    from studies import result_figures
 
     for network in ("n2", "n3"):
         title = f"{network.upper()}, the paper's profile, lanes bounded on one side"

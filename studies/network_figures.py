@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from emulator.experiments.style import BLUE, COMPONENT_LOOKS, GREY, RED, counted, save, shown, styled
 from emulator.world.networks import REFERENCE_RANGE_M
 from emulator.world.world import components
+from studies.style import BLUE, COMPONENT_LOOKS, GREY, RED, counted, save, shown, styled
 from vnet.types import Array
 
 Networks = Mapping[str, tuple[Array, Array]]

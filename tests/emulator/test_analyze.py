@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from emulator.experiments import analyze as subject
-from emulator.experiments.analyze import FASTEST, analysis_table, analyze, analyze_graph
+from emulator import analyze as subject
+from emulator.analyze import FASTEST, analysis_table, analyze, analyze_graph
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 

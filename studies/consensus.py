@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.cells.cells import Cell, read_series, run_cells, write_results
-from emulator.experiments.analyze import (
+from emulator.analyze import (
     FASTEST,
     NO_CVXPY,
     Links,
@@ -28,11 +27,12 @@ from emulator.experiments.analyze import (
     mutual,
     ratio_matrix,
 )
-from emulator.experiments.paper import network_sections
+from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.pages.palette import PALETTE
 from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
+from studies.paper import network_sections
 from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
 from vnet.types import Array

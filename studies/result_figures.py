@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from emulator.experiments.style import (
+from studies.style import (
     BLACK,
     BLUE,
     GREY,
@@ -29,7 +29,7 @@ from emulator.experiments.style import (
     shown,
     styled,
 )
-from emulator.experiments.tables import mean_and_standard_error, paired_ratio
+from studies.tables import mean_and_standard_error, paired_ratio
 from vnet.types import Array
 
 RATIO_LINES = {1.0: "the bound", 1.05: "1.05", 1.35: "1.35"}

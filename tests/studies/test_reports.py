@@ -6,10 +6,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator.experiments import network_figures, reports, result_figures
-from emulator.experiments.paper import ALPHAS, load_positions
-from emulator.experiments.tables import with_error
 from emulator.records.paper_values import PAPER_VEHICLES
+from studies import network_figures, reports, result_figures
+from studies.paper import ALPHAS, load_positions
+from studies.tables import with_error
 
 pytestmark = pytest.mark.slow
 

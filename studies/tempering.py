@@ -18,11 +18,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from emulator.cells.cells import Cell
-from emulator.experiments.paper import DEFAULT_S, Labels, bound_scenario, counted_from, default_scenario
-from emulator.experiments.reports import Result, column, select, unique
-from emulator.experiments.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
-from emulator.experiments.tables import in_seeds, markdown_table, mean_and_error, mean_and_standard_error
 from emulator.records.metrics import anees_band
+from studies.paper import DEFAULT_S, Labels, bound_scenario, counted_from, default_scenario
+from studies.reports import Result, column, select, unique
+from studies.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
+from studies.tables import in_seeds, markdown_table, mean_and_error, mean_and_standard_error
 
 TAUS_S = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
 WORLD_TAU_S = 20.0

@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from emulator.cells.cells import run_cells
-from emulator.experiments import paper
+from studies import paper
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_cell_run_over_zenoh_has_the_numbers_of_its_simulation(tmp_path: Path) -> None:

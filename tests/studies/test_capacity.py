@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from emulator.experiments import capacity
-from emulator.experiments.capacity import HOPELESS, RATE_HZ, VARIANTS, Point, measure, onset, reach_m, report
 from emulator.radio.dot11p import airtime_ns
 from emulator.radio.engine import Engine
 from emulator.radio.frames import Frame
+from studies import capacity
+from studies.capacity import HOPELESS, RATE_HZ, VARIANTS, Point, measure, onset, reach_m, report
 
 HERE, ROAD, ETSI, _ = VARIANTS
 

@@ -17,15 +17,15 @@ import pyarrow as pa
 
 from emulator.cells.cells import Cell, has_result, read_series
 from emulator.cells.measure import BOUND, BOUND_POSITION
-from emulator.experiments.paper import Labels, counted_from
-from emulator.experiments.reports import Result, column, select, unique
-from emulator.experiments.result_figures import against_time
-from emulator.experiments.statistics import paired_tests, shown_interval
-from emulator.experiments.tables import MISSING, markdown_table, paired_ratio
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
 from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.source import scenario_of
+from studies.paper import Labels, counted_from
+from studies.reports import Result, column, select, unique
+from studies.result_figures import against_time
+from studies.statistics import paired_tests, shown_interval
+from studies.tables import MISSING, markdown_table, paired_ratio
 from vnet.counted import counted
 from vnet.errors import VnetError
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from emulator.cells.cells import Cell
-from emulator.experiments.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
-from emulator.experiments.reports import Result, column, select, unique
-from emulator.experiments.tables import MISSING, markdown_table
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
+from studies.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
+from studies.reports import Result, column, select, unique
+from studies.tables import MISSING, markdown_table
 
 LENGTH_S = 30.0
 """Length of a run: a vehicle that diverges does so at first, before any vehicle knows the common error."""

@@ -18,12 +18,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from emulator.experiments.style import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
 from emulator.radio.dot11p import airtime_ns
 from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.radio import LogDistance, Receiver
 from emulator.scenario.scenario import Radio
+from studies.style import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
 
 PAPER_PEERS = 30
 SIGNIFICANT = 0.9

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.experiments.tables import MISSING, Values, as_floats, with_error
+from studies.tables import MISSING, Values, as_floats, with_error
 
 CONFIDENCE = 0.95
 """Confidence of all intervals."""

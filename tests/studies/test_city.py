@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cli.commands import app
-from emulator.experiments import city
+from studies import city
 from tests.emulator.world.maps.test_city_map import driving
 from tests.support.cells import compute_here
 

@@ -1,1 +1,0 @@
-"""Experiments: many runs of one question, their tables and their pictures."""
