@@ -28,12 +28,12 @@ from emulator.experiments.analyze import (
     mutual,
     ratio_matrix,
 )
+from emulator.experiments.linear_model import convergence_factor
 from emulator.experiments.paper import network_sections
 from emulator.pages.palette import PALETTE
 from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
 from vnet.types import Array
 

@@ -25,8 +25,8 @@ from emulator.experiments.consensus import (
     silent_vehicles,
     study_network,
 )
+from emulator.experiments.linear_model import convergence_factor
 from tests.support.cells import compute_here
-from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
