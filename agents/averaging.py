@@ -15,11 +15,13 @@ import msgspec
 from msgspec import Meta
 
 from agents import options as parsing
+from agents.cooperative.cmm.consensus import AveragingConsensus, AveragingRule, Consensus, RatioConsensus, Share
 from agents.cooperative.frame import short_name
 from vnet import Node, Packet
-from vnet.cmm.consensus import AveragingConsensus, AveragingRule, Consensus, RatioConsensus, Share
 from vnet.types import Array
 from vnet.units import NS_PER_S
+
+DECLARES = "agents.cooperative.declared"
 
 
 class AveragingFrame(msgspec.Struct, array_like=True):

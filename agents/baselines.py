@@ -22,17 +22,18 @@ import numpy as np
 from msgspec import Meta
 
 from agents import options as parsing
+from agents.cooperative.cmm.information import Five, Information, inverse
+from agents.cooperative.cmm.map_matching import candidate_lanes
+from agents.cooperative.cmm.own_vehicle import OwnConfig, own_vehicle
+from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
 from agents.cooperative.estimator import usable
 from vnet import Fix, Node
-from vnet.cmm.information import Five, Information, inverse
-from vnet.cmm.map_matching import candidate_lanes
-from vnet.cmm.own_vehicle import OwnConfig, own_vehicle
-from vnet.cmm.rbpf import Observation, RbpfConfig
 from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
+DECLARES = "agents.cooperative.declared"
 COMPUTING_SHARE = 0.8
 """Share of the period at which vehicles compute: all frames have come by then."""
 REACH_M = 15.0

@@ -14,11 +14,12 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
+from agents.cooperative.cmm.rbpf import Observation, Rbpf
 from agents.cooperative.options import Options
 from vnet import Fix, Node
-from vnet.cmm.rbpf import Observation, Rbpf
 from vnet.units import NS_PER_S
 
+DECLARES = "agents.cooperative.declared"
 COMPUTING_SHARE = 0.8
 """Share of the period at which the filtering vehicles compute: all fixes have come by then."""
 REPORTING_SHARE = 0.95

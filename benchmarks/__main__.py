@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
+from agents.cooperative.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 

@@ -32,9 +32,9 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
-from vnet.cmm.common_error import systematic
-from vnet.cmm.map_matching import candidate_lanes, log_on_lane
-from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig
+from agents.cooperative.cmm.common_error import systematic
+from agents.cooperative.cmm.map_matching import candidate_lanes, log_on_lane
+from agents.cooperative.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 
@@ -53,7 +53,7 @@ NEVER_ALL_ZERO = 1e-300
 
 
 class PerParticle:
-    """The model of `vnet.cmm.rbpf` with means (K, M, 4) and covariances (K, M, 4, 4): a Kalman filter a particle.
+    """The model of `cmm.rbpf` with means (K, M, 4) and covariances (K, M, 4, 4): a Kalman filter a particle.
 
     Vectorized over particles and vehicles; no loop in Python but over vehicles with several candidate lanes. In its
     favour it does without what ours also has: the outlier gate, old fixes, vehicles that come and go.
@@ -282,7 +282,7 @@ class FilterpyBias:
 
 
 class OwnBias:
-    """The same with what `vnet.cmm` brings: map matching in the log domain, and its resampling."""
+    """The same with what `agents.cooperative.cmm` brings: map matching in the log domain, and its resampling."""
 
     def __init__(self, roads: Roads, rng: np.random.Generator, every_step: bool) -> None:
         self._roads, self._rng, self._every_step = roads, rng, every_step

@@ -23,7 +23,7 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.session import Session
 from emulator.records.run_folder import RECORDING
 from emulator.scenario.scenario import Scenario
-from emulator.viewer.bound import HearsAllBound
+from emulator.viewer.reference import DrawnReference
 from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, Access
 from vnet.transport.session import open_router, router_endpoint
@@ -120,7 +120,7 @@ def _cpu_s(pid: int) -> float:
 
 def _limit_share(told: list[tuple[str, dict[str, Any]]]) -> float:
     """Share of it that the line of the bound takes, at 10 Hz."""
-    bound = HearsAllBound(told[0][1])
+    bound = DrawnReference(told[0][1])
     bound.step(told[1][1])
     periods = [message for stream, message in told[2:] if stream == "period"]
     started = time.thread_time()

@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
+from emulator.linear_model import convergence_factor, deviation_covariance
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.topology import Topology
 from emulator.records.recorded_run import RecordedRun
@@ -27,8 +28,6 @@ from emulator.records.run_folder import METRICS_FILE
 from emulator.scenario.lookahead import lookahead_ns
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
-from vnet.cmm.linear_model import convergence_factor, deviation_covariance
-from vnet.cmm.weights import max_degree_weights, metropolis_weights
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array
 from vnet.units import NS_PER_MS
@@ -160,21 +159,20 @@ def weight_rules() -> dict[str, Callable[[Links], Array]]:
 
 def constant_matrix(linked: Links) -> Array:
     """1/(d_max + 1) on each link, with the largest degree of the whole network."""
-    largest = int(linked.sum(axis=1).max())
-    return _assemble(linked, lambda _, peers: max_degree_weights(1 + len(peers), largest))
+    return _completed(linked, 1 / (1 + linked.sum(axis=1).max()))
 
 
 def max_degree_matrix(linked: Links) -> Array:
     """1/(d_max + 1) on each link, with the largest degree of the component: as far as word of it comes."""
     degree, label = linked.sum(axis=1), _labels(linked)
-    largest = [int(degree[label == label[i]].max()) for i in range(len(linked))]
-    return _assemble(linked, lambda i, peers: max_degree_weights(1 + len(peers), largest[i]))
+    largest = np.array([degree[label == each].max() for each in label])
+    return _completed(linked, 1 / (1 + largest[:, None]))
 
 
 def metropolis_matrix(linked: Links) -> Array:
     """1/(1 + max(d_i, d_j)) on each link."""
     degree = linked.sum(axis=1)
-    return _assemble(linked, lambda _, peers: metropolis_weights(len(peers), degree[peers].tolist()))
+    return _completed(linked, 1 / (1 + np.maximum.outer(degree, degree)))
 
 
 def ratio_matrix(linked: Links) -> Array:
@@ -182,11 +180,10 @@ def ratio_matrix(linked: Links) -> Array:
     return np.asarray((linked + np.eye(len(linked))) / (linked.sum(axis=0) + 1))
 
 
-def _assemble(linked: Links, weigh: Callable[[int, NDArray[np.intp]], Array]) -> Array:
-    weights = np.zeros(linked.shape)
-    for i, row in enumerate(linked):
-        peers = np.flatnonzero(row)
-        weights[i, [i, *peers]] = weigh(i, peers)
+def _completed(linked: Links, weight: Array) -> Array:
+    """Return the weights of the links, with the rest of each row for the vehicle itself."""
+    weights = np.where(linked, weight, 0.0)
+    np.fill_diagonal(weights, 1 - weights.sum(axis=1))
     return weights
 
 

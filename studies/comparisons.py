@@ -16,12 +16,11 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.cells.cells import Cell, has_result, read_series
-from emulator.cells.measure import BOUND, BOUND_POSITION
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
 from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.source import scenario_of
-from studies.paper import Labels, counted_from
+from studies.paper import BOUND, BOUND_POSITION, Labels, counted_from
 from studies.reports import Result, column, select, unique
 from studies.result_figures import against_time
 from studies.statistics import paired_tests, shown_interval
@@ -262,17 +261,17 @@ def _bound_rows(results: Sequence[Result]) -> Iterator[list[str]]:
     """Yield a row of the bound, if it is the same for all variants."""
     seeds: dict[int, set[float | None]] = {}
     for row in results:
-        seeds.setdefault(row["seed"], set()).add(row.get("bound_common_rmse_m"))
+        seeds.setdefault(row["seed"], set()).add(row.get("reference_common_error_rmse_m"))
     if any(len(found) > 1 or None in found for found in seeds.values()):
         return
     rows = select(results, mechanism=unique(results, "mechanism")[0])
-    common, position = (column(rows, f"bound_{name}_rmse_m") for name in ("common", "position"))
-    anees = shown_interval(column(rows, "bound_common_anees"), 2)
+    common, position = (column(rows, f"reference_{name}_rmse_m") for name in ("common_error", "position"))
+    anees = shown_interval(column(rows, "reference_common_error_anees"), 2)
     yield ["bound", shown_interval(common), "1", shown_interval(position), anees, *[MISSING] * 5]
 
 
 def _ratio(rows: Sequence[Result]) -> str:
-    bounds = [row.get("bound_common_rmse_m") for row in rows]
+    bounds = [row.get("reference_common_error_rmse_m") for row in rows]
     ratio, _ = paired_ratio(column(rows, "rmse_m"), bounds)
     return MISSING if np.isnan(ratio) else f"{ratio:.2f}"
 

@@ -28,12 +28,12 @@ from emulator.analyze import (
     ratio_matrix,
 )
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
+from emulator.linear_model import convergence_factor
 from emulator.pages.palette import PALETTE
 from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.paper import network_sections
-from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
 from vnet.types import Array
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from emulator.cells.cells import Cell
+from emulator.cells.measure import REFERENCE
 from emulator.records.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
 from emulator.scenario.scenario import Scenario
 from emulator.world.networks import generate_network, load_network
@@ -21,6 +22,8 @@ from emulator.world.world import build_world, components
 from vnet.errors import VnetError
 
 Labels = dict[str, str | int | float]
+BOUND, BOUND_POSITION = f"{REFERENCE}common_error_rmse_m", f"{REFERENCE}position_rmse_m"
+"""Columns of a cell's metrics with the hears-all bound's errors."""
 PAPER_S = 10.0
 DEFAULT_S, SETTLED_S = 100.0, 20.0
 CENTRALIZED_PARTICLES = 2000
@@ -87,16 +90,16 @@ def with_bound(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the results with a row of the bound for each network and seed, from a run of the same world."""
     bounds: dict[tuple[Any, Any], dict[str, Any]] = {}
     for row in results:
-        if row.get("bound_common_rmse_m") is not None:
+        if row.get("reference_common_error_rmse_m") is not None:
             bounds[row["network"], row["seed"]] = {
                 **dict.fromkeys(row),
                 **{name: row[name] for name in ("network", "seed", "fix_rmse_m")},
                 "mechanism": "bound",
-                "rmse_m": row["bound_common_rmse_m"],
-                "component_rmse_m": row["bound_component_rmse_m"],
-                "deviation_m": 0.0 if len(row["bound_component_rmse_m"]) == 1 else None,
-                "position_rmse_m": row["bound_position_rmse_m"],
-                "common_error_anees": row["bound_common_anees"],
+                "rmse_m": row["reference_common_error_rmse_m"],
+                "component_rmse_m": row["reference_component_rmse_m"],
+                "deviation_m": 0.0 if len(row["reference_component_rmse_m"]) == 1 else None,
+                "position_rmse_m": row["reference_position_rmse_m"],
+                "common_error_anees": row["reference_common_error_anees"],
                 "divergent": 0,
             }
     return [*bounds.values(), *results]

@@ -1,4 +1,4 @@
-"""Tempering of the map's evidence: the filters' consistency against `lateral_tau_s` (MODEL 2, `vnet/cmm/rbpf.py`).
+"""Tempering of the map's evidence: the filters' consistency against `lateral_tau_s` (MODEL 2, `cmm/rbpf.py`).
 
 A filter that takes its vehicles to change their offsets in the lane sooner than they do counts old evidence as new
 and is too sure of itself (ANEES over 1); one that takes them to keep them longer is less sure than it could be. So

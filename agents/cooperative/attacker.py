@@ -18,6 +18,7 @@ from agents.cooperative.program import cooperate
 from vnet import Fix, Node
 from vnet.units import NS_PER_S
 
+DECLARES = "agents.cooperative.declared"
 _ABSURD = ((1e30, 1.0, 0), (0.0, -1.0, 0), (0.0, 1e30, 0), (0.0, 1.0, 2_000_000_000))
 """Absurd frames, in turns: estimate in metres, variance in m², and position of the fix in centimetres."""
 

@@ -1,7 +1,7 @@
 """The estimator of one vehicle: filter, consensus and fusion, fed with frames and fixes, and the frame it composes.
 
 It has neither input nor output of its own: `program` brings the packets and the time. The mathematics is
-`vnet.cmm`'s; here is what a vehicle does with it, and with what others send.
+`agents.cooperative.cmm`'s; here is what a vehicle does with it, and with what others send.
 """
 
 from __future__ import annotations
@@ -13,6 +13,17 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from agents.cooperative.admission import Admission
+from agents.cooperative.cmm.consensus import (
+    AveragingConsensus,
+    Consensus,
+    ConsensusConfig,
+    DirectMean,
+    RatioConsensus,
+    Share,
+)
+from agents.cooperative.cmm.fusion import Cloud, fuse, shift
+from agents.cooperative.cmm.rbpf import Observation, Rbpf
+from agents.cooperative.cmm.robust import near_the_median
 from agents.cooperative.fix_table import FixTable
 from agents.cooperative.frame import (
     MAX_DEGREE,
@@ -31,17 +42,6 @@ from agents.cooperative.frame import (
 from agents.cooperative.fusion_rule import FusionRule
 from agents.cooperative.options import Options
 from vnet import Fix, Packet
-from vnet.cmm.consensus import (
-    AveragingConsensus,
-    Consensus,
-    ConsensusConfig,
-    DirectMean,
-    RatioConsensus,
-    Share,
-)
-from vnet.cmm.fusion import Cloud, fuse, shift
-from vnet.cmm.rbpf import Observation, Rbpf
-from vnet.cmm.robust import near_the_median
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array

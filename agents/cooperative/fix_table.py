@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.admission import MAX_SENDERS
+from agents.cooperative.cmm.rbpf import Observation
 from agents.cooperative.frame import RELAYED, CooperativeFrame, heading_of_code, name_of_code
-from vnet.cmm.rbpf import Observation
 from vnet.types import Array
 from vnet.units import NS_PER_S
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agents.cooperative.options import Options
-from vnet.cmm.weights import (
+from agents.cooperative.cmm.weights import (
     ActiveSetWeights,
     OptimizedWeights,
     constant_weights,
@@ -16,6 +15,7 @@ from vnet.cmm.weights import (
     no_fusion_weights,
     random_weights,
 )
+from agents.cooperative.options import Options
 from vnet.types import Array
 
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from agents.cooperative.attack import EPOCH_LEAP, NOT_FINITE, Attack, shifted_sum
+from agents.cooperative.cmm.information import Five, Information
+from agents.cooperative.cmm.plausibility import MEMORY_S, PRIOR_GATE, SUM_GATE, moved, scaled_by
 from agents.cooperative.information_estimator import InformationEstimator
 from agents.cooperative.information_frame import InformationFrame, encode
 from vnet import Fix
-from vnet.cmm.information import Five, Information
-from vnet.cmm.plausibility import MEMORY_S, PRIOR_GATE, SUM_GATE, moved, scaled_by
 from vnet.types import Array
 from vnet.units import NS_PER_S
 

@@ -18,6 +18,25 @@ from types import MappingProxyType
 import numpy as np
 
 from agents.cooperative.admission import Admission
+from agents.cooperative.cmm.consensus import Share, tracked_mean
+from agents.cooperative.cmm.information import Five, Information, plain_moments
+from agents.cooperative.cmm.own_vehicle import own_vehicle
+from agents.cooperative.cmm.plausibility import (
+    INCREMENT_FACTOR,
+    PRIOR_FACTOR,
+    SELF_SHARE,
+    SPREAD_GATE,
+    Origins,
+    cut_to,
+    median_belief,
+    moved,
+    prior_shares,
+    scaled_by,
+    scaled_down,
+    spread_limit_m,
+    unless_most_disagree,
+)
+from agents.cooperative.cmm.rbpf import Observation
 from agents.cooperative.estimator import mean_consensus, usable
 from agents.cooperative.frame import MAX_DEGREE, short_name
 from agents.cooperative.fusion_rule import FusionRule
@@ -35,25 +54,6 @@ from agents.cooperative.options import Options
 from agents.cooperative.passing import Passing
 from agents.cooperative.vehicle_cache import VehicleCache
 from vnet import Fix, Packet
-from vnet.cmm.consensus import Share, tracked_mean
-from vnet.cmm.information import Five, Information, plain_moments
-from vnet.cmm.own_vehicle import own_vehicle
-from vnet.cmm.plausibility import (
-    INCREMENT_FACTOR,
-    PRIOR_FACTOR,
-    SELF_SHARE,
-    SPREAD_GATE,
-    Origins,
-    cut_to,
-    median_belief,
-    moved,
-    prior_shares,
-    scaled_by,
-    scaled_down,
-    spread_limit_m,
-    unless_most_disagree,
-)
-from vnet.cmm.rbpf import Observation
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array

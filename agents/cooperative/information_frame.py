@@ -20,10 +20,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.cooperative.cmm.consensus import Share
+from agents.cooperative.cmm.information import Five, plain_moments
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
 from agents.cooperative.vehicle_cache import VehicleCache
-from vnet.cmm.consensus import Share
-from vnet.cmm.information import Five, plain_moments
 from vnet.types import Array
 
 VERSION = 4

@@ -10,11 +10,11 @@ import msgspec
 from msgspec import Meta
 
 from agents import options as parsing
+from agents.cooperative.cmm.consensus import AveragingRule
+from agents.cooperative.cmm.map_matching import MIN_MAP_LOG_LIKELIHOOD
+from agents.cooperative.cmm.own_vehicle import OwnConfig
+from agents.cooperative.cmm.rbpf import RbpfConfig
 from agents.cooperative.frame import COMMON_LIMIT_M
-from vnet.cmm.consensus import AveragingRule
-from vnet.cmm.map_matching import MIN_MAP_LOG_LIKELIHOOD
-from vnet.cmm.own_vehicle import OwnConfig
-from vnet.cmm.rbpf import RbpfConfig
 
 Share = Annotated[float, Meta(ge=0, le=1)]
 Deviation = Annotated[float, Meta(ge=0, le=COMMON_LIMIT_M)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vnet.cmm import Observation, OptimizedWeights, RatioConsensus, Rbpf, RbpfConfig, Share
+from agents.cooperative.cmm import Observation, OptimizedWeights, RatioConsensus, Rbpf, RbpfConfig, Share
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 

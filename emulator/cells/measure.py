@@ -13,9 +13,9 @@ from emulator.cells.consistency import consistency_figures, others_figures
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
-from emulator.records.hears_all import BoundSeries, bound_of
 from emulator.records.recorded_tables import RecordedTables
 from emulator.records.recorded_world import RecordedWorld
+from emulator.records.reference import after, reference_series
 from emulator.records.reported import reported_figures
 from vnet.errors import VnetError
 from vnet.types import Array
@@ -57,8 +57,8 @@ def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
     return row
 
 
-BOUND, BOUND_POSITION = "bound_rmse_m", "bound_position_rmse_m"
-"""Columns of a cell's metrics: the hears-all bound's RMSE of common error and position, where the run has one."""
+REFERENCE = "reference_"
+"""Prefix of the figures of a run's reference, and of the columns of a cell's metrics with those of each period."""
 
 
 def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Table]:
@@ -66,8 +66,8 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
 
     Of the common error at the end of the period (`rmse_m`, `deviation_m`, by component), right after stacking
     (`stacked_…`), of positions; means of the consistency figures; `divergent` vehicles (MODEL 6); bytes a period;
-    what `consistency_figures`, `others_figures` and, as `bound_…`, the hears-all bound have. Returned beside is the
-    table of metrics, with the bound's errors in each period as further columns.
+    what `consistency_figures`, `others_figures` and, as `reference_…`, the run's reference have. Returned beside is
+    the table of metrics, with the reference's figures of each period as further columns.
     """
     rows = [row for row in emulation.metrics.rows if row.time_ns >= from_s * 1e9]
 
@@ -81,7 +81,7 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
 
     states = emulation.metrics.states_table()
     recorded = _recorded(emulation, states)
-    bound, metrics = _bound(recorded), emulation.metrics.metrics_table()
+    reference, metrics = _reference(recorded), emulation.metrics.metrics_table()
     figures = {
         "rmse_m": rms("common_error_rmse_m"),
         "deviation_m": rms("deviation_m"),
@@ -101,11 +101,11 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
         **consistency_figures(recorded, from_s),
         **others_figures(recorded, from_s),
     }
-    if bound is not None:
-        found = bound.after(math.ceil(from_s * NS_PER_S / emulation.world.period_ns))
-        figures |= {f"bound_{name}": value for name, value in found.items()}
-        for name, series in ((BOUND, bound.common_rmse_m), (BOUND_POSITION, bound.position_rmse_m)):
-            metrics = metrics.append_column(name, pa.array(series, from_pandas=True))
+    settled = after(reference, math.ceil(from_s * NS_PER_S / emulation.world.period_ns))
+    figures |= {REFERENCE + name: value for name, value in settled.items()}
+    for name, series in reference.items():
+        if series.ndim == 1:
+            metrics = metrics.append_column(REFERENCE + name, pa.array(series, from_pandas=True))
     return figures, metrics
 
 
@@ -115,12 +115,12 @@ def _recorded(emulation: Emulation, states: pa.Table) -> RecordedTables:
     return RecordedTables(emulation.scenario, nothing, states, nothing, (), world=world)
 
 
-def _bound(recorded: RecordedTables) -> BoundSeries | None:
-    """Return the errors of the hears-all bound; None if the run has no such bound."""
+def _reference(recorded: RecordedTables) -> dict[str, Array]:
+    """Return the figures of a run's reference in each period; none if it has no reference."""
     try:
-        return bound_of(recorded)
+        return reference_series(recorded)
     except VnetError:
-        return None
+        return {}
 
 
 def _rms_columns(rows: list[list[float | None]]) -> list[float]:

@@ -89,7 +89,11 @@ def simulate(
         if interrupted:
             emulation.folder.event(simulation.now_ns, EventKind.interrupted)
         emulation.finish(simulation.now_ns)
-    if apart is not None and not interrupted and not any(each.kind == EventKind.died for each in emulation.folder.events):
+    if (
+        apart is not None
+        and not interrupted
+        and not any(each.kind == EventKind.died for each in emulation.folder.events)
+    ):
         if not apart:
             raise VnetError("a process of programs ended, and none did when each vehicle had one of its own")
         how = "ended the process of all vehicles, and not one of its own"

@@ -319,6 +319,13 @@ class RecordedTables:
         spread[period[there], node[there]] = flat.reshape(-1, size)
         return spread
 
+    def by_period(self, name: str) -> Array:
+        """A column of the states, (periods, N) or (periods, N, size); NaN where there is none."""
+        kind = self.states.schema.field(name).type
+        if not pa.types.is_fixed_size_list(kind):
+            return self.scalars(name)
+        return self._spread(self.states[name].combine_chunks(), kind.list_size)
+
     def scalars(self, name: str) -> Array:
         """A column of numbers of the states (periods, N); NaN where there is none."""
         spread = np.full((self.periods, len(self.node_ids)), np.nan)

@@ -9,7 +9,6 @@ from emulator.records.metrics import anees_band
 from emulator.report.drawing import DASHES, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source, maybe
 from vnet.errors import VnetError
-from vnet.types import Array
 
 
 def _lines(source: Source, names: dict[str, str]) -> list[Line]:
@@ -33,23 +32,25 @@ def common_error(source: Source) -> Drawing:
     """Draw the errors of the estimates of the common error."""
     lines = _lines(source, {"RMSE": "common_error_rmse_m", "deviation": "deviation_m"})
     text = "Distance of the vehicles' estimates from the true common error (RMSE) and from their mean (deviation)."
-    if bound := maybe(lambda: source.bound):
-        lines.append(_bound_line(source, bound.common_rmse_m))
-        text += _bound_note(lines[0], bound.common_rmse_m)
+    text += _add_reference(source, "common_error_rmse_m", lines)
     made = time_figure(lines, "common error (m)", source.end_s, source.spans)
     return Drawing(made, text + faults_note(made, source))
 
 
-def _bound_line(source: Source, rmse_m: Array) -> Line:
-    return Line("bound", source.time_s, rmse_m[: len(source.time_s)], GREEN, DASHES[2])
+def _add_reference(source: Source, name: str, lines: list[Line]) -> str:
+    """Add a line of the reference's figure of this name, if there is one; returns the caption's sentence on it.
 
-
-def _bound_note(line: Line, bound_m: Array) -> str:
-    """Return the caption's sentences on the bound; the mean errors are those after the first fifth of the run."""
-    settled = slice(len(line.value) // 5, len(line.value))
-    mean_m, least_m = (float(np.sqrt(np.nanmean(each[settled] ** 2))) for each in (line.value, bound_m))
-    ratio = f": {mean_m / least_m:.2f} times the bound after the first fifth of the run" if least_m > 0 else ""
-    return f" Bound: a Kalman filter that hears every fix of its component{ratio}."
+    It compares the means after the first fifth of the run with those of the first line.
+    """
+    series = maybe(lambda: source.reference_series) or {}
+    if name not in series:
+        return ""
+    label, value = source.reference.NAME, series[name][: len(source.time_s)]
+    settled = slice(len(value) // 5, len(value))
+    mean_m, least_m = (float(np.sqrt(np.nanmean(each[settled] ** 2))) for each in (lines[0].value, value))
+    ratio = f": {mean_m / least_m:.2f} times the {label} after the first fifth of the run" if least_m > 0 else ""
+    lines.append(Line(label, source.time_s, value, GREEN, DASHES[2]))
+    return f" {label.capitalize()}: {source.reference.TEXT}{ratio}."
 
 
 def position(source: Source) -> Drawing:
@@ -57,10 +58,9 @@ def position(source: Source) -> Drawing:
     if not source.estimates_positions:
         raise NothingToShow("no program estimated its position")
     lines = _lines(source, {"estimates": "position_rmse_m", "raw fixes": "fix_rmse_m"})
-    if bound := maybe(lambda: source.bound):
-        lines.append(_bound_line(source, bound.position_rmse_m))
-    made = time_figure(lines, "RMSE of position (m)", source.end_s, source.spans)
     text = "Distance of the vehicles' estimates, and of their receivers' raw fixes, from the true positions."
+    text += _add_reference(source, "position_rmse_m", lines)
+    made = time_figure(lines, "RMSE of position (m)", source.end_s, source.spans)
     return Drawing(made, text + faults_note(made, source))
 
 

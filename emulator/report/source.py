@@ -13,11 +13,10 @@ import pyarrow as pa
 
 from emulator.pages.canvas import Span
 from emulator.records.events import CUTS_RUN, Event, EventKind
-from emulator.records.hears_all import COLUMNS as BOUND_COLUMNS
-from emulator.records.hears_all import BoundSeries, bound_of
 from emulator.records.key_figures import SAME
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.reference import Reference, reference_of, reference_series
 from emulator.records.reported import reported_figures
 from emulator.records.run_folder import METRICS_FILE, STATES_FILE, TRACE_FILE
 from emulator.records.verdict_file import Record
@@ -99,10 +98,16 @@ class Source:
         has_busy = maybe(lambda: self.recorded.busy_ratio) is not None
         return radio_metrics(self.recorded, has_busy=has_busy)
 
+    @property
+    def reference(self) -> type[Reference]:
+        """The reference that the program declares. Raises VnetError if it declares none."""
+        return reference_of(self.scenario)
+
     @cached_property
-    def bound(self) -> BoundSeries:
-        """The hears-all bound. Raises VnetError if the run has none."""
-        return bound_of(RecordedRun.open(self.folder, {STATES_FILE: BOUND_COLUMNS}))
+    def reference_series(self) -> dict[str, Array]:
+        """The figures of the reference, (periods,) by name. Raises VnetError if the run has none."""
+        columns = ("period", "node", *self.reference.COLUMNS)
+        return reference_series(RecordedRun.open(self.folder, {STATES_FILE: columns}))
 
     # What programs report by names of their own.
 

@@ -17,7 +17,6 @@ from emulator.records.paper_values import paper_rmse
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
-from emulator.viewer.bound import HearsAllBound
 from emulator.viewer.drawing import (
     BLUE,
     COMMON_RINGS_M,
@@ -41,6 +40,7 @@ from emulator.viewer.drawing import (
     outcome_colours,
 )
 from emulator.viewer.radio_scene import next_charts_s
+from emulator.viewer.reference import DrawnReference
 from vnet.errors import VnetError, first_names
 
 LANE_HALF_LENGTH_M = 250.0
@@ -65,9 +65,9 @@ class OverviewScene:
         self._canvas = canvas
         self._node_ids: list[str] = scene["node_ids"]
         try:
-            self._bound: HearsAllBound | None = HearsAllBound(scene)
+            self._reference: DrawnReference | None = DrawnReference(scene)
         except VnetError:
-            self._bound = None
+            self._reference = None
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
@@ -106,8 +106,8 @@ class OverviewScene:
         canvas.rings("common", COMMON_RINGS_M)
         canvas.rings("position", POSITION_RINGS_M)
         common = [("RMSE", RED, 2.0), ("deviation between vehicles", SKY, 2.0)]
-        if self._bound is not None:
-            common.append(("bound: a Kalman filter that hears all", GREEN, 1.5))
+        if self._reference is not None:
+            common.append((self._reference.label, GREEN, 1.5))
         if self._paper is not None:
             common.append((self._paper[0], GREY, 1.5))
         canvas.series("figures/common", common)
@@ -173,9 +173,8 @@ class OverviewScene:
     def _figures(self, period: Period) -> None:
         plot, figure = self._canvas.plot, period.figure
         common = [figure("common_error_rmse_m"), figure("deviation_m")]
-        if self._bound is not None:
-            bound_m = self._bound.step(period.message)
-            common.append(float("nan") if bound_m is None else bound_m)
+        if self._reference is not None:
+            common.append(self._reference.step(period.message).get("common_error_rmse_m", float("nan")))
         if self._paper is not None:
             common.append(self._paper[1])
         plot("figures/common", *common)

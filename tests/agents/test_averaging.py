@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.averaging import Averager, Options, decode, encode
+from agents.cooperative.cmm.consensus import Share
 from agents.cooperative.frame import short_name
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
@@ -15,7 +16,6 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet import Packet
-from vnet.cmm.consensus import Share
 from vnet.errors import ProgramError
 
 PERIOD_NS = 100_000_000

@@ -9,7 +9,6 @@ import pyarrow as pa
 import pytest
 
 from emulator.cells.cells import compute, keep, read_result, read_series
-from emulator.cells.measure import BOUND, BOUND_POSITION
 from studies.comparisons import (
     STUDIES,
     _with_bound,
@@ -19,6 +18,7 @@ from studies.comparisons import (
     recorded_common,
     report,
 )
+from studies.paper import BOUND, BOUND_POSITION
 from vnet.errors import VnetError
 
 TINY = {"n1": {"kind": "generated", "vehicles": 5}}
@@ -76,9 +76,9 @@ def row(mechanism: str, seed: int, rmse_m: float, **more: Any) -> dict[str, Any]
         "bytes": 120.0,
         "divergent": 0,
         "divergent_sigmas": 1,
-        "bound_common_rmse_m": 0.2,
-        "bound_position_rmse_m": 0.4,
-        "bound_common_anees": 1.0,
+        "reference_common_error_rmse_m": 0.2,
+        "reference_position_rmse_m": 0.4,
+        "reference_common_error_anees": 1.0,
         **more,
     }
 
@@ -95,9 +95,9 @@ def test_a_report_has_ratios_tests_and_their_number() -> None:
 
 
 def test_without_one_bound_for_all_there_is_no_row_of_it() -> None:
-    rows = [row("reference", 1, 0.24), row("multipath", 1, 0.3, bound_common_rmse_m=0.25)]
+    rows = [row("reference", 1, 0.24), row("multipath", 1, 0.3, reference_common_error_rmse_m=0.25)]
     assert "| bound " not in report("receivers", rows, 100.0)
-    rows = [row("reference", 1, 0.24, bound_common_rmse_m=None)]
+    rows = [row("reference", 1, 0.24, reference_common_error_rmse_m=None)]
     assert "| bound " not in report("receivers", rows, 100.0)
 
 

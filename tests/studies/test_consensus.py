@@ -8,6 +8,7 @@ import pytest
 
 from emulator.analyze import FASTEST, is_connected, mutual
 from emulator.cells.cells import Cell, compute, keep
+from emulator.linear_model import convergence_factor
 from studies import consensus as subject
 from studies.consensus import (
     LATENCIES_MS,
@@ -26,7 +27,6 @@ from studies.consensus import (
     study_network,
 )
 from tests.support.cells import compute_here
-from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow

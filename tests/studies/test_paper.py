@@ -105,14 +105,15 @@ def test_the_default_experiment_has_one_row_of_one_hop() -> None:
     cells = paper.default_cells({"n1": TINY}, [1, 2])
     mechanisms = [cell.labels["mechanism"] for cell in cells if cell.labels["seed"] == 2]
     assert mechanisms == ["optimized", "random", "none", "optimized, one hop"]
-    bound = {"bound_common_rmse_m": 0.2, "bound_component_rmse_m": [0.2], "bound_position_rmse_m": 0.4}
+    errors_m = {"common_error_rmse_m": 0.2, "component_rmse_m": [0.2], "position_rmse_m": 0.4}
+    bound = {f"reference_{name}": error_m for name, error_m in errors_m.items()}
     row = {
         "network": "n1",
         "mechanism": "none",
         "seed": 2,
         "rmse_m": 0.3,
         "fix_rmse_m": 3.0,
-        "bound_common_anees": 1.0,
+        "reference_common_error_anees": 1.0,
     }
     added = paper.with_bound([{**row, **bound}, {**row, "seed": 3}])
     assert [(each["mechanism"], each["seed"], each["rmse_m"]) for each in added] == [

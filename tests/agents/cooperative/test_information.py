@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.cooperative.attack import Attack, Lie
+from agents.cooperative.cmm.information import Five, Information
 from agents.cooperative.frame import FrameError, name_of_code, short_name
 from agents.cooperative.information_attacker import InformationAttacker
 from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator
 from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
 from agents.cooperative.options import Options
 from vnet import Fix, Packet
-from vnet.cmm.information import Five, Information
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from emulator.api import simulate_into
-from emulator.records.hears_all import bound_of
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.reference import reference_series
 from emulator.report.network_figures import degrees
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
@@ -20,6 +20,9 @@ from vnet.node import Node
 
 NAMES = ["v01", "v02", "v03"]
 FAULT = {"kind": "loss", "at_s": 0.5, "duration_s": 0.4, "probability": 1.0, "senders": {"degree": [2, 2]}}
+
+
+DECLARES = "agents.cooperative.declared"
 
 
 async def disagree(node: Node) -> None:
@@ -56,7 +59,7 @@ def test_figures_by_component_are_those_of_the_period_s_links(run: Path) -> None
 
 def test_the_bound_and_the_scene_have_those_in_one_component_that_ever_are_linked(run: Path) -> None:
     recorded = RecordedRun.open(run)
-    assert bound_of(recorded).component_rmse_m.shape == (15, 1)
+    assert reference_series(recorded)["component_rmse_m"].shape == (15, 1)
     scene = scene_message(recorded.world, recorded.scenario, recorded.scenario_text)
     assert np.frombuffer(scene["component"], "<i2").tolist() == [0, 0, 0]
     assert "one component" in degrees(Source(run)).caption

@@ -184,7 +184,7 @@ def test_lines_have_the_figures_of_the_messages(
 
 def test_the_limit_is_drawn_and_beats_raw_fixes_by_far(told: Told, entities: dict[str, Entity]) -> None:
     common = entities["/figures/common"]
-    assert common.static["SeriesLines:names"][2] == "bound: a Kalman filter that hears all"
+    assert common.static["SeriesLines:names"][2] == "bound: a Kalman filter that hears every fix of its component"
     late = [common.array("Scalars:scalars", period.time_s)[2] for period in periods(told)][-5:]
     assert 0 < np.mean(late) < np.mean([period.figure("fix_rmse_m") for period in periods(told)])
 

@@ -1,0 +1,254 @@
+"""The Rao-Blackwellized particle filter of one vehicle that tracks itself alone, while lanes compete (MODEL 10).
+
+Particle k is a hypothesis c^k of the common error. Given it, all else is analytic: which of the candidate lanes the
+vehicle is on, and on lane h its own state (l, s, v), the offset to the right of the centre line, position and speed
+along it, with a Kalman filter whose covariance V_h does not depend on k. The offset is a state, so that a lane is
+evidence once and not ten times a second. To others the filter says what it knew before its fix (`belief`), and what
+the fix says about c alone, the increment (`take`); from them it takes the same (`absorb`). Once one lane is left,
+all is Gaussian, and `own_kalman` goes on.
+
+Sums of products are written out: those of BLAS differ in their last bits from one processor to another.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.cooperative.cmm.common_error import systematic
+from agents.cooperative.cmm.information import Five, Information, inverse, square_root
+from agents.cooperative.cmm.kalman_bound import LaneModel, lane_axes
+from agents.cooperative.cmm.own_kalman import LEAST_VARIANCE_M2, OwnKalman
+from agents.cooperative.cmm.sample_size import sample_size
+from vnet.types import Array
+
+DECIDED = 1e-4
+"""Probability below which a lane is out of question."""
+COMPETING_FACTOR = 4
+"""So many times the particles of the options: as lanes compete they are weighed, and not moved."""
+SIZE_STEP = 1.5
+"""Ratio by which the number of particles that is wanted must differ before it changes: each change resamples."""
+_IDENTITY = np.eye(2)
+
+
+class OwnRbpf:
+    """The filter of a vehicle on one of the lanes through `point_m` (H, 2) with directions `heading_rad` (H,).
+
+    common_m: (2, K), the hypotheses of the common error, and weight: (K,), their normalized weights.
+    estimate_m, estimate_covariance_m2: mean (2,) and covariance (2, 2) of the common error.
+    """
+
+    def __init__(
+        self,
+        lanes: tuple[Array, Array],
+        model: LaneModel,
+        particles: int,
+        rng: np.random.Generator,
+        belief: tuple[Array, Array] | None = None,
+        least_particles: int = 0,
+    ) -> None:
+        """Draw the first particles from `belief`, mean (2,) and covariance (2, 2), by default the model's of c.
+
+        With `least_particles` their number goes down to that as their spread does.
+        """
+        point_m, heading_rad = lanes
+        self._most = COMPETING_FACTOR * particles
+        self._least = min(least_particles or self._most, self._most)
+        self._rng = rng
+        self._model = model
+        self._point_m, self._heading_rad = np.array(point_m, dtype=float), np.array(heading_rad, dtype=float)
+        self._axes = lane_axes(self._heading_rad)
+        mean_m, covariance_m2 = belief or (np.zeros(2), model.common_sigma_m**2 * np.eye(2))
+        count, most = len(self._axes), self._most
+        self.common_m = mean_m[:, None] + _product(square_root(covariance_m2), rng.standard_normal((2, most)))
+        self._own = np.zeros((count, 3, most))
+        self._own_covariance = np.tile(model.own_covariance(), (count, 1, 1))
+        self._lane_log = np.full((count, most), -np.log(count))
+        self._log_weight = np.zeros(most)
+        self._normalize()
+        self._collapse()
+
+    @property
+    def _wanted(self) -> int:
+        """Number of particles to go on with: for the spread, unless that is near the present one."""
+        if self._least == self._most:
+            return self._most
+        count = len(self.weight)
+        wanted = sample_size(self.estimate_covariance_m2, self._least, self._most)
+        return count if count / SIZE_STEP < wanted < count * SIZE_STEP else wanted
+
+    # The belief.
+
+    def _normalize(self) -> None:
+        weight = np.exp(self._log_weight - self._log_weight.max())
+        self.weight = weight / weight.sum()
+
+    def _collapse(self) -> None:
+        weight = np.exp(self._lane_log) * self.weight
+        place = self._point_m[:, :, None] + _product(self._axes.transpose(0, 2, 1), self._own[:, :2])
+        self.estimate_m = (self.common_m * self.weight).sum(axis=1)
+        spread = self.common_m - self.estimate_m[:, None]
+        self.estimate_covariance_m2 = _weighted(spread, spread, self.weight) + LEAST_VARIANCE_M2 * _IDENTITY
+        place_m = (place * weight[:, None]).sum(axis=(0, 2))
+        off = place - place_m[:, None]
+        cross = _weighted(off, spread, weight).sum(axis=0)
+        within = _product(_product(self._axes.transpose(0, 2, 1), self._own_covariance[:, :2, :2]), self._axes)
+        total = _weighted(off, off, weight).sum(axis=0) + (weight.sum(axis=1)[:, None, None] * within).sum(axis=0)
+        slope = _product(cross, inverse(self.estimate_covariance_m2))
+        self._place = place_m, slope, total - _product(slope, cross.T)
+
+    @property
+    def lane_probability(self) -> Array:
+        """Probabilities (H,) of the lanes that are left."""
+        return np.asarray((np.exp(self._lane_log) * self.weight).sum(axis=1))
+
+    @property
+    def belief(self) -> Information:
+        """The belief about c."""
+        return Information.of(self.estimate_m, self.estimate_covariance_m2)
+
+    @property
+    def plain_moments(self) -> Five:
+        """Mean (x, y) and covariance (xx, xy, yy) of c."""
+        (x, y), ((p, q), (_, r)) = self.estimate_m.tolist(), self.estimate_covariance_m2.tolist()
+        return x, y, p, q, r
+
+    def position_m(self) -> tuple[Array, Array]:
+        """Return the position (2,) of the vehicle and its covariance (2, 2)."""
+        place_m, slope, given_m2 = self._place
+        return place_m, given_m2 + _product(_product(slope, self.estimate_covariance_m2), slope.T)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw `count` equally likely hypotheses (count, 2) of c."""
+        return np.asarray(self.common_m[:, systematic(self.weight, count, rng)].T)
+
+    def decided(self) -> OwnKalman | None:
+        """Return the filter to go on with if one lane is left: what is known is Gaussian from then on."""
+        if len(self._axes) > 1:
+            return None
+        cloud = np.concatenate([self.common_m, self._own[0]])
+        mean = (cloud * self.weight).sum(axis=1)
+        spread = cloud - mean[:, None]
+        covariance = _weighted(spread, spread, self.weight)
+        covariance[2:, 2:] += self._own_covariance[0]
+        return OwnKalman(self._point_m[0], float(self._heading_rad[0]), self._model, (mean, covariance))
+
+    # A period.
+
+    def predict(self, dt_s: float) -> None:
+        """Advance by `dt_s`."""
+        keep, variance_m2 = self._model.common_step(dt_s)
+        moves, noise = self._model.transition(dt_s), self._model.process_noise(dt_s)
+        noise_m = math.sqrt(variance_m2) * self._rng.standard_normal((2, len(self.weight)))
+        self.common_m = keep * self.common_m + noise_m
+        self._own = _product(moves, self._own)
+        self._own_covariance = _product(_product(moves, self._own_covariance), moves.T) + noise
+        self._collapse()
+
+    def take(self, fix_m: Array, noise_m2: Array, gate: float = math.inf) -> Information | None:
+        """Take the vehicle's own fix (2,) with noise covariance (2, 2); return what it says about c: the increment.
+
+        A fix whose squared Mahalanobis distance from what is expected is above `gate` is not taken: None.
+        """
+        place_m, slope, given_m2 = self._place
+        off = fix_m - self.estimate_m - place_m
+        belief = self.estimate_m, self.estimate_covariance_m2
+        distance, increment = _innovation(off, slope + _IDENTITY, given_m2 + noise_m2, belief)
+        if distance > gate:
+            return None
+        self._update(fix_m, noise_m2)
+        return increment
+
+    def _update(self, fix_m: Array, noise_m2: Array) -> None:
+        axes, covariance = self._axes, self._own_covariance
+        noise_m2 = _product(_product(axes, noise_m2), axes.transpose(0, 2, 1))
+        total = covariance[:, :2, :2] + noise_m2
+        determinant = total[:, 0, 0] * total[:, 1, 1] - total[:, 0, 1] ** 2
+        adjugate = np.stack([total[:, 1, 1], -total[:, 0, 1], -total[:, 0, 1], total[:, 0, 0]], axis=1)
+        innovation = adjugate.reshape(-1, 2, 2) / determinant[:, None, None]
+        gain = _product(covariance[:, :, :2], innovation)
+        seen_m = _product(axes, (fix_m - self._point_m)[:, :, None])
+        off = seen_m - _product(axes, self.common_m) - self._own[:, :2]
+        self._own = self._own + _product(gain, off)
+        self._own_covariance = covariance - _product(gain, covariance[:, :2])
+        squared = (_product(innovation, off) * off).sum(axis=1)
+        self._lane_log = self._lane_log - 0.5 * np.log(determinant)[:, None] - 0.5 * squared
+        self._sum_lanes()
+        self._settle()
+
+    def absorb(self, pooled: Information) -> None:
+        """Weigh the cloud by `pooled`, which is to replace the belief about c.
+
+        A cloud of several humps, one a lane, would be squeezed together if it were moved.
+        """
+        a, b, d, x, y = pooled.minus(self.belief).numbers
+        c_x, c_y = self.common_m
+        self._log_weight = self._log_weight + c_x * (x - 0.5 * (a * c_x) - b * c_y) + c_y * (y - 0.5 * (d * c_y))
+        self._settle()
+
+    def _settle(self) -> None:
+        """After the weights have changed: drop lanes, and resample if it is due."""
+        self._normalize()
+        self._drop_lanes()
+        self._collapse()
+        count = self._wanted
+        if count != len(self.weight) or 1 / (self.weight * self.weight).sum() < count / 2:
+            self._take(systematic(self.weight, count, self._rng))
+            self._collapse()
+
+    def _sum_lanes(self) -> None:
+        """Normalize the probabilities of the lanes given c; their sum goes into the weights."""
+        total = np.logaddexp.reduce(self._lane_log, axis=0)
+        self._lane_log = self._lane_log - total
+        self._log_weight = self._log_weight + total
+
+    def _drop_lanes(self) -> None:
+        kept = self.lane_probability > DECIDED
+        if kept.all():
+            return
+        self._point_m, self._heading_rad, self._axes = (
+            self._point_m[kept],
+            self._heading_rad[kept],
+            self._axes[kept],
+        )
+        self._own, self._own_covariance = self._own[kept], self._own_covariance[kept]
+        self._lane_log = self._lane_log[kept]
+        self._sum_lanes()
+        self._normalize()
+
+    def _take(self, index: NDArray[np.intp]) -> None:
+        """Go on with the particles `index` (n,), equally likely."""
+        self.common_m = self.common_m.take(index, axis=-1)
+        self._own = self._own.take(index, axis=-1)
+        self._lane_log = self._lane_log.take(index, axis=-1)
+        self._log_weight = np.zeros(len(index))
+        self.weight = np.full(len(index), 1 / len(index))
+
+
+def _product(left: Array, right: Array) -> Array:
+    """Return the products (…, n, k) of matrices (…, n, m) and (…, m, k), without BLAS."""
+    return np.asarray((left[..., :, :, None] * right[..., None, :, :]).sum(axis=-2))
+
+
+def _weighted(left: Array, right: Array, weight: Array) -> Array:
+    """Return the sums (…, n, m) over points (…, n, K) and (…, m, K) with weights (…, K)."""
+    return np.asarray(((left * weight[..., None, :])[..., :, None, :] * right[..., None, :, :]).sum(axis=-1))
+
+
+def _innovation(
+    off: Array, slope: Array, given_m2: Array, belief: tuple[Array, Array]
+) -> tuple[float, Information]:
+    """Return the squared Mahalanobis distance of a fix, and what it says about c ~ `belief`.
+
+    The fix is `off` (2,) from what is expected; given c, which moves it by `slope` (2, 2), its covariance is
+    `given_m2` (2, 2).
+    """
+    mean_m, covariance_m2 = belief
+    total = inverse(given_m2 + _product(_product(slope, covariance_m2), slope.T))
+    distance = float((total * np.outer(off, off)).sum())
+    whitened = _product(slope.T, inverse(given_m2))
+    matrix = _product(whitened, slope)
+    vector = (whitened * off).sum(axis=1) + (matrix * mean_m).sum(axis=1)
+    return distance, Information.from_arrays(matrix, vector)

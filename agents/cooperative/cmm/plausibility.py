@@ -1,0 +1,269 @@
+"""Plausibility of what others say about the common error: whether it is believed, and how much it may weigh.
+
+A liar's increment or prior is bounded by what the vehicle itself knows, and compared with what it believes. One
+period's lie may be small; so the deviations of each origin are summed up as well, and decay over seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from agents.cooperative.cmm.information import Five, Information, Three, plain_moments
+
+INCREMENT_FACTOR = 1.5
+"""Largest trace of an increment, relative to one's own: what it says more is scaled down."""
+PRIOR_FACTOR = 2.0
+"""Largest trace of a prior's matrix, relative to one's own."""
+INCREMENT_GATE = 16.0
+"""Largest squared deviation of an increment from what is believed."""
+SUM_GATE = 4.0
+"""Largest squared deviation of an origin's sum of many increments: the errors of what was believed partly cancel,
+and one honest sum in ten thousand deviates by 3.5 (N2) to 4.5 (N1)."""
+PRIOR_GATE = 4.0
+"""Largest squared deviation of a prior's mean from one's own."""
+SPREAD_GATE = 3.5
+"""Largest distance of a prior's mean from the median of all, in deviations of their spread."""
+MANY = 90.0
+"""Number of increments in a sum, less what has decayed, from which on `SUM_GATE` applies; for one it is
+`INCREMENT_GATE`."""
+LEAN_LIMIT = 0.1
+"""Largest mean distance of an origin's priors from the median of all, in deviations that both claim: in honest runs
+one in a hundred has 0.07 (N1), 0.10 (N2), 0.18 (N3), where a few pass on what the others cannot know."""
+SELF_SHARE = 0.3
+"""Weight that a vehicle gives to its own prior before the others': what draws all along draws more slowly."""
+SPREAD_FLOOR_M = 0.05
+"""Distance (m) from the median that is always allowed."""
+MAJORITY = 4
+"""Least number of priors or increments of which a majority can be told."""
+MEMORY_S = 10.0
+"""Time (s) in which an origin's sums decay."""
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a normal vector in the plane, in deviations an axis."""
+MAX_ORIGINS = 1024
+"""Number of origins whose sums are kept: names cost an attacker nothing."""
+
+
+Belief = tuple[Sequence[float], Three]
+"""Mean (x, y) in m and covariance (xx, xy, yy) in m² of what is believed about c."""
+
+Ten = tuple[float, float, float, float, float, float, float, float, float, float]
+"""Sums of an origin's increments: Λ C (xx, xy, yx, yy) with P = C Cᵀ, r = η − Λ x, Λ (xx, xy, yy), their number."""
+_TINY = 1e-300
+"""Least squared deviation: that of an increment which says nothing is 0."""
+_NO_SUMS: Ten = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+# For the few dozens of a period plain numbers take less time than arrays, and are the same on each processor.
+
+
+def scaled_down(information: Sequence[Five], largest_trace: float) -> list[Five]:
+    """Return pieces of information with traces of at most `largest_trace`; means stay."""
+    scaled = []
+    for numbers in information:
+        trace = numbers[0] + numbers[2]
+        scaled.append(numbers if trace <= largest_trace else scaled_by(numbers, largest_trace / trace))
+    return scaled
+
+
+def scaled_by(information: Five, factor: float) -> Five:
+    """Return what says `factor` times as much."""
+    a, b, d, x, y = information
+    return factor * a, factor * b, factor * d, factor * x, factor * y
+
+
+def moved(information: Five, x_m: float, y_m: float) -> Five:
+    """Return a belief whose mean is off by (`x_m`, `y_m`)."""
+    a, b, d, x, y = information
+    return a, b, d, x + a * x_m + b * y_m, y + b * x_m + d * y_m
+
+
+def rooted_triangle(xx: float, xy: float, yy: float) -> Three:
+    """Return C (xx, yx, yy), lower triangular, with C Cᵀ a positive definite matrix (xx, xy, yy)."""
+    root_xx = math.sqrt(xx)
+    root_yx = xy / root_xx
+    return root_xx, root_yx, math.sqrt(max(yy - root_yx * root_yx, 0.0))
+
+
+def deviation(information: Five, belief: Belief) -> float:
+    """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for what is said about c ~ N(x, P)."""
+    (mean_x, mean_y), covariance_m2 = belief
+    c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
+    a, b, d, x, y = information
+    x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
+    return _squared(a * c_xx + b * c_yx, b * c_yy, b * c_xx + d * c_yx, d * c_yy, x, y, a, b, d)
+
+
+def _squared(
+    m_xx: float, m_xy: float, m_yx: float, m_yy: float, x: float, y: float, a: float, b: float, d: float
+) -> float:
+    """Return rᵀ S⁻¹ r with S = Λ + (Λ C)(Λ C)ᵀ.
+
+    A lane says nothing along itself: a ten thousandth of the trace is added to S, so that rounding there is not
+    counted.
+    """
+    a += m_xx * m_xx + m_xy * m_xy
+    b += m_xx * m_yx + m_xy * m_yy
+    d += m_yx * m_yx + m_yy * m_yy
+    more = 1e-4 * (a + d) + 1e-9
+    a += more
+    d += more
+    return (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
+
+
+def prior_shares(priors: Sequence[Five], own: Five) -> list[float]:
+    """Return the share (n,) of its weight that each prior has: 1 within `PRIOR_GATE`, beyond it gate : rᵀ S⁻¹ r.
+
+    r is the difference of the means, S the sum of both covariances. Each prior, and one's `own`, is the mean (x, y)
+    and the covariance (xx, xy, yy). Were a prior dropped, a vehicle that sees along one lane only, and begins two
+    deviations off, would never believe those who are right.
+    """
+    own_x, own_y, own_xx, own_xy, own_yy = own
+    shares = []
+    for mean_x, mean_y, xx, xy, yy in priors:
+        x, y = mean_x - own_x, mean_y - own_y
+        a, b, d = xx + own_xx, xy + own_xy, yy + own_yy
+        squared, gate = d * x * x - 2 * b * x * y + a * y * y, PRIOR_GATE * (a * d - b * b)
+        shares.append(1.0 if squared < gate else gate / max(squared, _TINY))
+    return shares
+
+
+def spread_limit_m(priors: Sequence[Five]) -> tuple[tuple[float, float], float]:
+    """Return the median (x, y) of the means, and the distance from it within which they are taken as they are.
+
+    Estimates that are pooled in each period differ by less than each is uncertain, because they err together: who
+    stays within its uncertainty, but always on one side, would draw all others along.
+    """
+    x, y = _median([prior[0] for prior in priors]), _median([prior[1] for prior in priors])
+    if len(priors) < MAJORITY:
+        return (x, y), math.inf
+    distance_m = _median([math.hypot(prior[0] - x, prior[1] - y) for prior in priors])
+    return (x, y), SPREAD_FLOOR_M + SPREAD_GATE * distance_m / RAYLEIGH_MEDIAN
+
+
+def _median(values: list[float]) -> float:
+    values.sort()
+    return (values[(len(values) - 1) // 2] + values[len(values) // 2]) / 2
+
+
+def cut_to(off_m: list[tuple[float, float]], limit_m: float) -> list[tuple[float, float]]:
+    """Return offsets (x, y) with lengths of at most `limit_m`."""
+    length_m = [math.hypot(x, y) for x, y in off_m]
+    if max(length_m) <= limit_m:
+        return off_m
+    share = [min(1.0, limit_m / max(length, 1e-300)) for length in length_m]
+    return [(x * part, y * part) for (x, y), part in zip(off_m, share, strict=True)]
+
+
+def unless_most_disagree(shares: list[float]) -> list[float]:
+    """Return 1 for all where most are less: then it is what is believed that is wrong, and not they."""
+    if len(shares) >= MAJORITY - 1 and 2 * shares.count(1.0) < len(shares):
+        return [1.0] * len(shares)
+    return shares
+
+
+def _sum_gate(count: float) -> float:
+    """Return the largest squared deviation of a sum of so many increments."""
+    return INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * min(1.0, count / MANY)
+
+
+class Origins:
+    """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
+
+    def __init__(self) -> None:
+        self._sums: dict[int, tuple[float, Ten]] = {}  # their time, and what they were then
+        self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
+
+    def __len__(self) -> int:
+        """Number of origins whose increments are summed up."""
+        return len(self._sums)
+
+    def shares(self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, now_s: float) -> list[float]:
+        """Return the share (n,) of each increment (n,) of the origins `codes` that is used.
+
+        It is 1 within the gates, for the increment by itself and for the origin's sum, and beyond them the gate
+        relative to the squared deviation: an M-estimator whose influence descends. To drop it would err where few
+        contradict each other for long and are right: three vehicles on nearly parallel lanes, or on a map.
+        What is beyond is summed up all the same: who has lied is believed again when it has decayed. Each is
+        compared with the belief (x, P) when it came: c itself moves by half a metre in the sum's memory.
+        """
+        sums = self._sums
+        if len(sums) + len(codes) > MAX_ORIGINS:
+            sums = self._sums = _newest(sums, now_s)
+        (mean_x, mean_y), covariance_m2 = belief
+        c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
+        then_s, keep, keep_2 = now_s, 1.0, 1.0
+        shares = []
+        for code, (a, b, d, x, y) in zip(codes, increments, strict=True):
+            # The terms of the deviation, which may be summed up; Λ is the covariance of r given c.
+            m_xx, m_xy, m_yx, m_yy = a * c_xx + b * c_yx, b * c_yy, b * c_xx + d * c_yx, d * c_yy
+            x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
+            since_s, (n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count) = sums.get(code, (now_s, _NO_SUMS))
+            if since_s != then_s:  # for most the same
+                then_s, keep = since_s, math.exp((since_s - now_s) / MEMORY_S)
+                keep_2 = keep * keep  # covariances of sums whose parts have decayed
+            n_xx, n_xy, n_yx, n_yy = m_xx + keep * n_xx, m_xy + keep * n_xy, m_yx + keep * n_yx, m_yy + keep * n_yy
+            n_x, n_y, count = x + keep * n_x, y + keep * n_y, 1.0 + keep * count
+            n_a, n_b, n_d = a + keep_2 * n_a, b + keep_2 * n_b, d + keep_2 * n_d
+            sums[code] = now_s, (n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count)
+            in_sum = _squared(n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d)
+            alone = _squared(m_xx, m_xy, m_yx, m_yy, x, y, a, b, d)
+            share = 1.0
+            if not (alone < INCREMENT_GATE and (in_sum < SUM_GATE or in_sum < _sum_gate(count))):
+                share = min(INCREMENT_GATE / max(alone, _TINY), _sum_gate(count) / max(in_sum, _TINY))
+            shares.append(share)
+        return shares
+
+    def without_lean(
+        self, codes: Sequence[int], priors: Sequence[Five], own: Five, middle_m: tuple[float, float], now_s: float
+    ) -> tuple[list[tuple[float, float]], list[bool] | None]:
+        """Return by how much the means of `priors` of `codes` are off `middle_m`, less what is always to one side.
+
+        The second value tells which priors lean so, None if none does. Each is a mean (x, y) and a covariance (xx,
+        xy, yy), and may be off by as much as it and one's `own` claim. Deviations of the honest change sides in a
+        second; a mean of more than `LEAN_LIMIT` deviations is taken off.
+        """
+        if len(self._leans) + len(codes) > MAX_ORIGINS:
+            self._leans = _newest(self._leans, now_s)
+        off_m: list[tuple[float, float]] = []
+        leans: list[bool] = []
+        then_s, keep = now_s, 1.0
+        for code, (mean_x, mean_y, xx, xy, yy) in zip(codes, priors, strict=True):
+            # The deviation in terms of what is claimed: C⁻¹ off with C Cᵀ the sum of both covariances.
+            root_xx = math.sqrt(xx + own[2])
+            root_yx = (xy + own[3]) / root_xx
+            root_yy = math.sqrt(yy + own[4] - root_yx * root_yx)
+            off_x, off_y = mean_x - middle_m[0], mean_y - middle_m[1]
+            x = off_x / root_xx
+            y = (off_y - root_yx * x) / root_yy
+            since_s, lean_x, lean_y = self._leans.get(code, (now_s, 0.0, 0.0))
+            if since_s != then_s:  # for most the same
+                then_s, keep = since_s, math.exp((since_s - now_s) / MEMORY_S)
+            lean_x, lean_y = x + keep * (lean_x - x), y + keep * (lean_y - y)
+            self._leans[code] = now_s, lean_x, lean_y
+            squared = lean_x * lean_x + lean_y * lean_y
+            is_leaning = squared > LEAN_LIMIT**2
+            if is_leaning:
+                less = 1 - LEAN_LIMIT / math.sqrt(squared)
+                off_x -= less * root_xx * lean_x
+                off_y -= less * (root_yx * lean_x + root_yy * lean_y)
+            off_m.append((off_x, off_y))
+            leans.append(is_leaning)
+        return off_m, leans if True in leans else None
+
+
+T = TypeVar("T", bound=tuple[Any, ...])
+
+
+def _newest(of_origins: dict[int, T], now_s: float) -> dict[int, T]:
+    """Return what is known of the latest origins; it begins with its time."""
+    kept = [code for code, known in of_origins.items() if now_s - known[0] < MEMORY_S]
+    return {code: of_origins[code] for code in kept[-(MAX_ORIGINS // 2) :]}
+
+
+def median_belief(priors: Sequence[Five]) -> Information:
+    """Return a belief at the coordinate-wise median of the means of `priors`, as wide as the widest."""
+    moments = [plain_moments(*prior) for prior in priors]
+    x, y = _median([mean_x for mean_x, *_ in moments]), _median([mean_y for _, mean_y, *_ in moments])
+    precision = 1 / max(xx + yy for _, _, xx, _, yy in moments)
+    return Information((precision, 0.0, precision, precision * x, precision * y))

@@ -1,0 +1,45 @@
+"""The reference of a run that is drawn: fed with its messages, period by period."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from emulator.records.reference import Setting, reference_of
+from emulator.records.states import STATES
+from emulator.scenario.recorded import parse_recorded_scenario
+from emulator.stream.messages import unpack
+from vnet.types import Array
+
+
+class DrawnReference:
+    """Takes the messages of a run; see `emulator.records.reference`. Raises VnetError if it has no reference."""
+
+    def __init__(self, scene: Mapping[str, Any]) -> None:
+        scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
+        kind = reference_of(scenario)
+        self.label, self._columns, self._count = f"{kind.NAME}: {kind.TEXT}", kind.COLUMNS, len(scene["node_ids"])
+        point_m = unpack(scene["lane_point_m"], 2).astype(float)
+        heading_rad = unpack(scene["lane_heading_rad"])[:, 0].astype(float)
+        component = np.frombuffer(scene["component"], dtype="<i2")
+        self._reference = kind(Setting(scenario, component, point_m, heading_rad))
+
+    def step(self, period: Mapping[str, Any]) -> dict[str, float]:
+        """Take a period; returns its figures of the whole network by name. Periods may be left out."""
+        states = {name: self._column(name, period[name]) for name in self._columns}
+        up = np.frombuffer(period["up"], dtype=np.uint8).astype(bool)
+        states["fix_m"] = np.where(up[:, None], states["fix_m"], np.nan)
+        figures = self._reference.step(int(period["time_ns"]), states)
+        return {name: figure for name, figure in figures.items() if not isinstance(figure, list)}
+
+    def _column(self, name: str, data: bytes) -> Array:
+        """Return a column of the states, with a row for each vehicle."""
+        kind = STATES.field(name).type
+        if not pa.types.is_fixed_size_list(kind):
+            return unpack(data)[:, 0].astype(float)
+        rows = unpack(data, kind.list_size).astype(float)
+        return np.broadcast_to(rows, (self._count, kind.list_size))

@@ -1,0 +1,48 @@
+"""A vehicle whose receiver is wrong for seconds never states a position that may be anywhere."""
+
+import numpy as np
+import pytest
+
+from agents.cooperative.cmm.information import Information
+from agents.cooperative.cmm.own_vehicle import OwnConfig, OwnVehicle
+from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
+from vnet.roads.lanes import LaneMap
+
+COMMON_M = np.array([2.0, 1.5])
+FAULT_M = np.array([33.0, 60.0])
+NOISE_M2 = np.eye(2)
+LARGEST_M2 = 1000.0
+
+
+def vehicle() -> OwnVehicle:
+    """Return a vehicle on one of two lanes that cross at the origin."""
+    lanes = LaneMap(np.zeros((2, 2)), np.array([0.0, np.pi / 2]), 0.85)
+    return OwnVehicle(OwnConfig(RbpfConfig(particles=300)), lanes, np.random.default_rng(1))
+
+
+def fix(rng: np.random.Generator, fault_m: np.ndarray) -> Observation:
+    return Observation(COMMON_M + fault_m + rng.normal(0, 1, 2), NOISE_M2, 0.0)
+
+
+@pytest.mark.parametrize("wrong_periods", [10, 25, 60])
+def test_a_wrong_receiver_leaves_bounded_positions(wrong_periods: int) -> None:
+    own, rng = vehicle(), np.random.default_rng(2)
+    own.restart(Information.of(COMMON_M, 0.05 * np.eye(2)))  # as others know it
+    error_m = np.inf
+    for period in range(140):
+        wrong = 30 <= period < 30 + wrong_periods
+        own.step(0.1, fix(rng, FAULT_M if wrong else np.zeros(2)))
+        position = own.position_m()
+        assert position is not None
+        assert np.abs(position[1]).max() < LARGEST_M2, period
+        error_m = float(np.linalg.norm(position[0]))
+    assert error_m < 3.0
+
+
+def test_a_vehicle_that_begins_again_knows_no_position_before_it_has_taken_a_fix() -> None:
+    own, rng = vehicle(), np.random.default_rng(3)
+    own.restart(Information.of(COMMON_M, 0.01 * np.eye(2)))
+    assert own.position_m() is None
+    own.step(0.1, fix(rng, np.zeros(2)))
+    position = own.position_m()
+    assert position is not None and np.abs(position[1]).max() < LARGEST_M2

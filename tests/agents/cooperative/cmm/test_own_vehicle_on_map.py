@@ -1,0 +1,153 @@
+"""The filter of a vehicle that drives on the map of a city: what lanes say of the common error, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from agents.cooperative.cmm.information import NOTHING, Information
+from agents.cooperative.cmm.own_vehicle_on_map import OwnVehicleOnMap
+from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
+from agents.cooperative.cmm.road_hypotheses import OFF_ROAD
+from vnet.roads.road_map import RoadMap
+from vnet.types import Array
+
+EAST, NORTH = 0.0, np.pi / 2
+COMMON_M = np.array([2.0, -1.5])
+STEADY = RbpfConfig(common_tau_s=1e9, off_road=0.001)
+"""Constants of a common error that stays, and of vehicles that are on the road."""
+
+
+def roads(*lanes: tuple[float, float, float], sigma_m: float = 1.0, half_width_m: float = 0.85) -> RoadMap:
+    """A map of lanes of 2 km that begin at (x, y) in metres, with a heading."""
+    count = len(lanes)
+    x_m, y_m, heading_rad = np.array(lanes).T
+    return RoadMap(
+        point_m=np.column_stack([x_m, y_m]),
+        heading_rad=heading_rad,
+        length_m=np.full(count, 2000.0),
+        half_width_m=np.full(count, half_width_m),
+        kind=np.zeros(count, dtype=np.uint8),
+        one_way=np.ones(count, dtype=np.bool_),
+        road=np.arange(count, dtype=np.int32),
+        lane=np.arange(count, dtype=np.int32),
+        classes=("road",),
+        sigma_m=sigma_m,
+    )
+
+
+def fixes(position_m: Iterable[Array], heading_rad: float, seed: int = 1) -> list[Observation]:
+    rng = np.random.default_rng(seed)
+    return [Observation(p + COMMON_M + rng.standard_normal(2), np.eye(2), heading_rad) for p in position_m]
+
+
+def standing(seconds: float, at_m: tuple[float, float] = (500.0, 0.0)) -> list[Array]:
+    return [np.array(at_m)] * round(10 * seconds)
+
+
+def driving(seconds: float, at_m: tuple[float, float], heading_rad: float) -> list[Array]:
+    ahead = np.array([np.cos(heading_rad), np.sin(heading_rad)])
+    return [np.array(at_m) + 1.2 * k * ahead for k in range(round(10 * seconds))]
+
+
+def run(vehicle: OwnVehicleOnMap, seen: Iterable[Observation]) -> Information:
+    """Take all fixes; returns the sum of the increments."""
+    total = NOTHING
+    for fix in seen:
+        total = total.plus(vehicle.step(0.1, fix))
+    return total
+
+
+def vehicle_on(lanes: RoadMap, config: RbpfConfig = STEADY) -> OwnVehicleOnMap:
+    return OwnVehicleOnMap(config, lanes, np.random.default_rng(3))
+
+
+def test_a_lane_counts_once_for_a_vehicle_that_stands() -> None:
+    """However long it stands, it knows of c across the lane what one lane with its deviation says."""
+    sigma_m2 = 1.0**2 + 0.85**2 / 3
+    vehicle = vehicle_on(roads((0, 0, EAST)))
+    run(vehicle, fixes(standing(3), EAST))
+    early = vehicle.estimate_covariance_m2[1, 1]
+    run(vehicle, fixes(standing(60), EAST, seed=2))
+    late = vehicle.estimate_covariance_m2[1, 1]
+    expected = 1 / (1 / 9 + 1 / sigma_m2)
+    assert early > late, "its fixes tell where the receiver sees it"
+    assert late == pytest.approx(expected, rel=0.2)
+    assert vehicle.estimate_covariance_m2[0, 0] == pytest.approx(9, rel=0.1), "along the lane nothing is known"
+
+
+def test_a_way_renews_the_offset() -> None:
+    """A long way along one lane says more of c than a short one."""
+    variance_m2 = []
+    for lateral_m in (1e9, 100.0):
+        vehicle = vehicle_on(roads((0, 0, EAST)), RbpfConfig(common_tau_s=1e9, lateral_m=lateral_m))
+        run(vehicle, fixes(driving(40, (100, 0), EAST), EAST))
+        variance_m2.append(vehicle.estimate_covariance_m2[1, 1])
+    assert variance_m2[1] < 0.7 * variance_m2[0]
+
+
+def test_a_vehicle_that_has_turned_knows_both_components_of_c() -> None:
+    vehicle = vehicle_on(roads((0, 0, EAST), (300, 0, NORTH), sigma_m=0.3))
+    run(vehicle, fixes(driving(15, (120, 0), EAST), EAST))
+    assert vehicle.estimate_covariance_m2[0, 0] > 5
+    run(vehicle, fixes(driving(15, (300, 5), NORTH), NORTH, seed=2))
+    assert np.diag(vehicle.estimate_covariance_m2).max() < 1
+    assert np.linalg.norm(vehicle.estimate_m - COMMON_M) < 1.5
+
+
+def test_increments_add_up_to_what_is_known() -> None:
+    """Also where lanes compete and less is known than before: that is owed, and taken from what is said later."""
+    vehicle = vehicle_on(roads((0, 0, EAST), (0, 7, EAST), (300, 0, NORTH), (310, 0, NORTH)))
+    before = vehicle.prior
+    total = run(vehicle, fixes(driving(15, (120, 0), EAST), EAST))
+    total = total.plus(run(vehicle, fixes(driving(20, (300, 5), NORTH), NORTH, seed=2)))
+    known = Information.of(*vehicle.belief)
+    sum_of_all = before.plus(total).plus(vehicle.owed)
+    assert_allclose(sum_of_all.matrix, known.matrix, atol=1e-6)
+    assert_allclose(sum_of_all.vector, known.vector, atol=1e-6)
+    assert np.linalg.eigvalsh(vehicle.owed.matrix).max() < 1e-9, "more has been said than is known, and not less"
+
+
+def test_lanes_compete_until_others_tell_the_common_error() -> None:
+    """A vehicle alone cannot tell which of three lanes it is on; what others know of c decides."""
+    vehicle = vehicle_on(roads((0, -6, EAST), (0, 0, EAST), (0, 6, EAST), sigma_m=0.5))
+    run(vehicle, fixes(driving(10, (100, 0), EAST), EAST))
+    assert len(vehicle.lanes) >= 3
+    vehicle.absorb(Information.of(COMMON_M, 0.25 * np.eye(2)))
+    lanes = vehicle.lanes
+    assert max(lanes, key=lambda lane: lanes[lane]) == 1 and lanes[1] > 0.95
+    assert_allclose(vehicle.estimate_m, COMMON_M, atol=0.5)
+
+
+def test_a_vehicle_far_from_all_roads_says_nothing_of_c() -> None:
+    vehicle = vehicle_on(roads((0, 0, EAST)))
+    total = run(vehicle, fixes(driving(10, (100, 300), EAST), EAST))
+    assert_allclose(total.matrix, 0, atol=1e-6)
+    assert vehicle.lanes == {OFF_ROAD: 1.0}
+    position = vehicle.position_m()
+    assert position is not None
+    assert_allclose(vehicle.estimate_covariance_m2, 9 * np.eye(2), rtol=0.01)
+
+
+def test_a_vehicle_that_is_lost_begins_again_where_its_fixes_are() -> None:
+    vehicle = vehicle_on(roads((0, 0, EAST)))
+    run(vehicle, fixes(standing(3), EAST))
+    far = fixes(standing(4, (1500.0, 0.0)), EAST)
+    assert not vehicle.step(0.1, far[0]).matrix.any(), "an outlier says nothing"
+    run(vehicle, far[1:])
+    position = vehicle.position_m()
+    assert position is not None and abs(position[0][0] - 1500.0) < 10
+
+
+def test_a_belief_from_outside_replaces_its_own() -> None:
+    vehicle = vehicle_on(roads((0, 0, EAST)))
+    run(vehicle, fixes(standing(3), EAST))
+    vehicle.restart(Information.of(np.array([50.0, 0.0]), np.eye(2)))
+    assert_allclose(vehicle.estimate_m, [50.0, 0.0])
+    assert vehicle.position_m() is None
+    vehicle.absorb(Information.of(COMMON_M, 0.1 * np.eye(2)))
+    assert_allclose(vehicle.sample(2000).mean(axis=0), COMMON_M, atol=0.05)
+    assert vehicle.step(0.1, None).matrix.any() == np.False_
