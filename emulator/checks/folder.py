@@ -65,9 +65,10 @@ def check_files(recorded: OpenedRun) -> Finding:
         if recorded.record.format < FIRST_WITH_MANIFEST:
             return NotExercised(FILES, f"a folder of format {recorded.record.format} has no manifest")
         return CheckResult(FILES, Verdict.INVALID, f"there is no {MANIFEST_FILE}")
-    if unkept := [check for check in recorded.record.checks if check.name == FILES and check.figures.get("unkept")]:
-        return unkept[0]
     differing = differing_files(recorded.folder, digests)
+    for check in recorded.record.checks if not differing else ():
+        if check.name == FILES and check.figures.get("unkept"):
+            return unknown(FILES, check.text, **check.figures)  # whatever verdict the file gives itself
     first = next((f"{name} {what}" for name, what in differing.items()), "")
     rows = [{"file": name, "what": what} for name, what in differing.items()]
     text = f"{counted(len(digests), 'file')} as they were written"

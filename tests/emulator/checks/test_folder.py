@@ -158,3 +158,14 @@ def test_a_file_that_the_manifest_lacks_is_told(copy: Path) -> None:
     assert broken(check_run(copy)) == {"files"}
     write_manifest(RunFolder(copy))
     assert check_run(copy).verdict is Verdict.VALID
+
+
+def test_no_verdict_of_the_file_itself_excuses_its_files(copy: Path) -> None:
+    verdict = json.loads((copy / "verdict.json").read_text())
+    left = {"name": "files", "verdict": "valid", "text": "all kept", "figures": {"unkept": ["x"]}}
+    verdict["checks"].append(left)
+    (copy / "verdict.json").write_text(json.dumps(verdict))
+    assert "files" in broken(check_run(copy))
+    write_manifest(RunFolder(copy))
+    files = next(check for check in check_run(copy).checks if check.name == "files")
+    assert files.verdict is Verdict.UNKNOWN
