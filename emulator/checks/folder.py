@@ -28,9 +28,19 @@ from emulator.records.period_figures import PeriodFigures
 from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
-from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
-from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict, result, unknown
-from emulator.scenario.fault_families import SenderFault
+from emulator.records.run_folder import MANIFEST_FILE, PAYLOADS_FILE, VERDICT_FILE
+from emulator.records.verdicts import (
+    MOST_ROWS,
+    CheckResult,
+    Finding,
+    Judgement,
+    NotExercised,
+    Verdict,
+    result,
+    unknown,
+)
+from emulator.scenario.fault_families import OwnRule, SenderFault
+from emulator.scenario.faults import Corrupt
 from emulator.scenario.toml import parse_toml
 from vnet.counted import counted
 
@@ -51,6 +61,10 @@ class FolderCheck:
     claims: str
     invalid: str
     not_applicable: str = ""
+
+
+ROUNDED_S = 0.001
+"""Digits that verdict.json keeps of the run's wall-clock time."""
 
 
 def kept(unkept: Sequence[str]) -> list[Finding]:
@@ -92,6 +106,25 @@ def verdict_figures(recorded: RecordedRun, rows: Sequence[PeriodFigures]) -> dic
     }
 
 
+def check_payloads(recorded: OpenedRun) -> Finding:
+    """Check that the payload of each frame is the one whose digest the trace has."""
+    name = "payloads"
+    if not recorded.scenario.run.keep_payloads:
+        return NotExercised(name, "run.keep_payloads is false")
+    if any(isinstance(planned.fault, (SenderFault, Corrupt, OwnRule)) for planned in recorded.plan):
+        return NotExercised(name, "faults change what is sent or received")
+    kept, first = recorded.payloads, _sent_frames(recorded)
+    digests, node_ids = recorded.digest, recorded.node_ids
+    frames = [(node_ids[recorded.sender[row]], int(recorded.seq[row]), int(digests[row])) for row in first.tolist()]
+    wrong = [
+        {"sender": sender, "seq": seq}
+        for sender, seq, digest in frames
+        if kept is None or kept.of(sender, seq, (digest,)) is None
+    ]
+    text = f"payloads of {counted(len(frames), 'frame')} as they were sent"
+    return result(name, len(wrong), text, f"{counted(len(wrong), 'frame')} with another payload", wrong[:MOST_ROWS])
+
+
 def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
     """Check that verdict.json has the figures that the other files give, and the verdict that its checks give."""
     name = "verdict_file"
@@ -122,6 +155,11 @@ def _of_the_course(recorded: OpenedRun) -> Iterator[tuple[str, Any]]:
     start_up_s = [event.details.get("start_up_s") for event in recorded.event(EventKind.started)]
     yield "wall_s", wall_s[-1] if wall_s else None
     yield "start_up_s", start_up_s[0] if start_up_s else None
+    seconds, told = recorded.record.wall_s, recorded.record.real_time_factor
+    if seconds > 0:
+        factor = recorded.record.emulated_s / seconds
+        rounding = ROUNDED_S * factor / seconds + ROUNDED_S
+        yield "real_time_factor", told if told is not None and abs(told - factor) <= rounding else round(factor, 3)
 
 
 def _wrong_counts(recorded: OpenedRun) -> list[dict[str, Any]]:
@@ -252,6 +290,13 @@ FOLDER_CHECKS = (
         "the scenario and its seed give, to 1e-6 m.",
         "another position, heading, common error or fix",
         "the world comes from files, from a function of yours, or from programs that drive",
+    ),
+    FolderCheck(
+        "payloads",
+        check_payloads,
+        f"`{PAYLOADS_FILE}` has the payload of each frame of the trace, by its digest.",
+        "another payload, or none",
+        "a run without `run.keep_payloads`, or with faults that change what is sent or received",
     ),
     FolderCheck(
         "metrics",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 
-from emulator.records.events import EventKind
+from emulator.records.events import Event, EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import is_text
 from emulator.records.run_tables import VALUES_AS_LIST
@@ -20,6 +20,7 @@ from vnet.errors import printable
 from vnet.reports import COVARIANCE_TOLERANCE, LONGEST_TEXT, check_name
 from vnet.types import Mask
 
+KINDS = {str(kind): kind for kind in EventKind}
 COVARIANCES = ("covariance_m2", "common_error_covariance_m2")
 """Columns of the states that hold covariance matrices."""
 KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
@@ -27,7 +28,7 @@ KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
 
 
 def check_row_order(recorded: RecordedRun) -> Finding:
-    """Check that the rows of trace, states and metrics are in their order, and have their times."""
+    """Check that the rows of trace, states and metrics are in order, and that each event can be of the run."""
     name = "row_order"
     count, period_ns = len(recorded.node_ids), recorded.scenario.period_ns
     states, metrics = recorded.states, recorded.metrics
@@ -41,6 +42,7 @@ def check_row_order(recorded: RecordedRun) -> Finding:
         "time_ns of the metrics": np.asarray(metrics["time_ns"].to_numpy()) != np.arange(len(metrics)) * period_ns,
         "trace": _disordered(recorded),
     }
+    columns["events"] = np.array([_is_nobodys(event, recorded) for event in recorded.events], dtype=bool)
     wrong = {what: np.flatnonzero(mask) for what, mask in columns.items() if mask.any()}
     rows = [{"table": what, "row": int(where[0]), "count": len(where)} for what, where in wrong.items()]
     total = sum(map(len, wrong.values()))
@@ -50,6 +52,16 @@ def check_row_order(recorded: RecordedRun) -> Finding:
     return result(
         name, total, text, f"{counted(total, 'row')} out of order, first in the {next(iter(wrong), '')}", rows
     )
+
+
+def _is_nobodys(event: Event, recorded: RecordedRun) -> bool:
+    """Return whether an event is of no kind, of no node of the run, or of no time in it."""
+    if event.kind not in KINDS or event.time_ns < 0:
+        return True
+    of_vehicle = KINDS[event.kind].node_is == "vehicle"
+    if event.node is not None and of_vehicle and event.node not in recorded.number:
+        return bool(recorded.number)
+    return recorded.scenario.run.pacing == "lockstep" and event.time_ns > recorded.scenario.duration_ns
 
 
 def _nodes(recorded: RecordedRun) -> Any:

@@ -51,6 +51,8 @@ EVIDENCE = (
     VERDICT_FILE,
 )
 """Files by which a run is judged; those that are there stand in the manifest."""
+CHECKS_LOG = "logs/checks.log"
+"""What checks of the user's own print, also when they judge a folder again."""
 _MANIFEST = TypeAdapter(dict[str, str])
 
 
@@ -76,7 +78,8 @@ def read_manifest(folder: Path) -> dict[str, str] | None:
 def differing_files(folder: Path, digests: dict[str, str]) -> dict[str, str]:
     """Return the files that are not those of the manifest, each with what is wrong with it."""
     found = {}
-    for name in sorted({*digests, *(each for each in EVIDENCE if (folder / each).exists())}):
+    added = (name for name in _names(folder) if name != CHECKS_LOG)
+    for name in sorted({*digests, *added}):
         if name not in digests:
             found[name] = "is not in the manifest"
         elif Path(name).is_absolute() or ".." in Path(name).parts:

@@ -5,6 +5,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from emulator.checks.judge import Judgement, Verdict, check_run
@@ -158,6 +160,43 @@ def test_a_file_that_the_manifest_lacks_is_told(copy: Path) -> None:
     assert broken(check_run(copy)) == {"files"}
     write_manifest(RunFolder(copy))
     assert check_run(copy).verdict is Verdict.VALID
+
+
+def test_payloads_are_those_of_the_trace(tmp_path: Path) -> None:
+    run = {"duration_s": 1.0, "keep_payloads": True}
+    folder = simulated(tmp_path / "run", run=run, fault=[], program={"entry": "agents.beacon:main"})
+    path = folder / "payloads.parquet"
+    assert "payloads" in {check.name for check in check_run(folder).checks}
+    table = pq.read_table(path)
+    changed = [b"another", *table["payload"].to_pylist()[1:]]
+    for edited in (table.slice(1), table.set_column(3, "payload", pa.array(changed, pa.large_binary()))):
+        pq.write_table(edited, path)
+        forge(folder)
+        assert "payloads" in broken(check_run(folder))
+    path.unlink()
+    write_manifest(RunFolder(folder))
+    assert "payloads" in broken(check_run(folder))
+
+
+EVENTS = [
+    {"kind": "collapsed", "node": "v01", "time_ns": 1},
+    {"kind": "log", "node": "v99", "time_ns": 1, "level": "info", "text": "here"},
+    {"kind": "note", "node": None, "time_ns": -5},
+    {"kind": "note", "node": None, "time_ns": 10**30},
+]
+
+
+@pytest.mark.parametrize("event", EVENTS, ids=["kind", "node", "before", "after"])
+def test_an_event_that_cannot_be_is_told(copy: Path, event: dict[str, object]) -> None:
+    with (copy / "events.jsonl").open("a") as file:
+        file.write(json.dumps(event) + "\n")
+    forge(copy)
+    assert "row_order" in broken(check_run(copy))
+
+
+def test_a_log_that_the_manifest_lacks_is_told(copy: Path) -> None:
+    (copy / "logs" / "v77.log").write_text("made up\n")
+    assert broken(check_run(copy)) == {"files"}
 
 
 def test_no_verdict_of_the_file_itself_excuses_its_files(copy: Path) -> None:
