@@ -32,7 +32,7 @@ def main() -> None:
     if command is not None and command.runs_programs:
         fix_hash_seed("emulator.cli")  # before any import that takes long, because it starts this process again
     from emulator.cli.application import build_app
-    from emulator.cli.own_child import this_process_is_a_command
+    from emulator.cli.own_child import leave, this_process_is_a_command
     from emulator.terminal import console, standard_streams
 
     standard_streams.tolerate_failures()
@@ -41,7 +41,7 @@ def main() -> None:
     interrupts.finish(status)
     if failure := standard_streams.failure():
         status = console.say_output_failed(failure, arguments)
-    sys.exit(status)
+    leave(status)
 
 
 def _refuse(problem: str) -> int:

@@ -8,7 +8,9 @@ import shutil
 import signal
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
+from typing import NoReturn
 
 from vnet.runtime import interrupts, running_node
 from vnet.runtime.die_with_parent import signal_at_parent_death
@@ -16,8 +18,6 @@ from vnet.runtime.die_with_parent import signal_at_parent_death
 LONGEST_PATH = 4096
 """Bytes of the path of a run's folder."""
 FORWARDED = (signal.SIGINT, signal.SIGTERM)
-FAULTS = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
-"""Signals of code that fails: a vehicle's death also where none was seen running, as in a thread of its own."""
 FROM_TERMINAL = 0x80
 """`si_code` of a signal that the kernel sends, as Ctrl-C does to all of the terminal's foreground (SI_KERNEL)."""
 
@@ -29,8 +29,8 @@ class OwnChild:
         self._folder = mmap.mmap(-1, LONGEST_PATH)
 
     def told(self, folder: Path) -> None:
-        """Take note of the folder that the run has made."""
-        self._folder[:] = os.fsencode(folder.absolute()).ljust(LONGEST_PATH, b"\0")
+        """Take note of the folder that the run has made; of none, that all is done."""
+        self._folder[:] = os.fsencode(folder.absolute() if folder.name else "").ljust(LONGEST_PATH, b"\0")
 
     def fork(self) -> str | None:
         """Return None in the child, and in the parent the vehicle that has ended it, "" if unknown.
@@ -48,20 +48,23 @@ class OwnChild:
             if not in_foreground:  # what is sent to the parent's group would reach it twice
                 os.setpgid(0, 0)
             signal_at_parent_death(signal.SIGKILL)
+            _leaving.append(self)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return None
         forwarded: set[int] = set()
         while not (waited := os.waitpid(child, os.WNOHANG))[0]:
             told = signal.sigwaitinfo(handled)
             if told.si_signo in FORWARDED:
+                if told.si_signo == signal.SIGTERM and signal.SIGTERM in forwarded:
+                    os.kill(child, signal.SIGKILL)  # it does not end, as where its main thread has
                 forwarded.add(told.si_signo)
                 if not in_foreground or told.si_code != FROM_TERMINAL:
                     os.kill(child, told.si_signo)
         forwarded |= signal.sigpending() & set(FORWARDED)
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
         ended = os.waitstatus_to_exitcode(waited[1])
-        died = (vehicle and ended != -signal.SIGKILL) or (folder and -ended in FAULTS)  # KILL: memory is short
-        if died and not forwarded:
+        # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short.
+        if (vehicle or folder) and ended != -signal.SIGKILL and not forwarded:
             running_node.running.show("")
             shutil.rmtree(folder, ignore_errors=True)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -72,6 +75,21 @@ class OwnChild:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {-ended})
             os.kill(os.getpid(), -ended)
         return interrupts.exit_now(ended)
+
+
+_leaving: list[OwnChild] = []
+"""What stands for this process in its parent, if it is such a child."""
+
+
+def leave(status: int) -> NoReturn:
+    """End this process. A child of a command ends at once: `atexit` and threads of programs are not waited for."""
+    if not _leaving:
+        sys.exit(status)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    _leaving[0].told(Path())
+    interrupts.exit_now(status)
 
 
 def _is_in_foreground() -> bool:

@@ -55,6 +55,38 @@ def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end:
     assert "v02" in done.stdout
 
 
+LATER = """
+import atexit, ctypes, os, pathlib, threading
+def end():
+    while not pathlib.Path("run/states.parquet").exists():
+        pass
+    END
+async def main(node):
+    if node.id == "v02":
+        BEGIN
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x")
+"""
+
+
+def later(folder: Path, begin: str, end: str) -> subprocess.CompletedProcess[str]:
+    words = command(folder, "")
+    (folder / "deadly.py").write_text(LATER.replace("BEGIN", begin).replace("END", end))
+    return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=TIMEOUT_S)
+
+
+@pytest.mark.parametrize("end", ["os._exit(0)", "ctypes.CDLL(None)._exit(0)"])
+def test_a_thread_that_ends_the_process_before_the_command_has_ended_is_no_pass(tmp_path: Path, end: str) -> None:
+    assert later(tmp_path, "threading.Thread(target=end, daemon=True).start()", end).returncode in (1, 2)
+
+
+@pytest.mark.parametrize("end", ["while True: pass", "ctypes.string_at(0)", "os._exit(1)"])
+def test_what_a_program_registers_with_atexit_does_not_run(tmp_path: Path, end: str) -> None:
+    done = later(tmp_path, "atexit.register(end)", end)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "run" / "verdict.json").read_text())["verdict"] == "valid"
+
+
 def died(folder: Path) -> set[str]:
     events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     return {event["node"] for event in events if event["kind"] == "died"}
