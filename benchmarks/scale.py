@@ -129,7 +129,7 @@ def awaiting(runs: int) -> str:
 
 def cooperative(runs: int) -> str:
     """Real-time factors of 50 cooperative vehicles, live and simulated in turns: their ratio, and live."""
-    options = [*_vehicles(50), "--duration", "20", "--option", "exchange=estimates"]
+    options = [*_vehicles(50), "--duration", "20"]
     pairs = [[_factor(command, COOPERATIVE, *options) for command in ("run", "simulate")] for _ in range(runs)]
     ratio = statistics.median(live / simulated for live, simulated in pairs)
     return f"{ratio:.2g}; {statistics.median(live for live, _ in pairs):.2g}"

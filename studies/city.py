@@ -33,15 +33,13 @@ from vnet.types import Array
 LOSS = 0.1
 CENTRALIZED_PARTICLES = 4000
 """Particles of the filter that hears all: fewer are sure of what they cannot know."""
-ESTIMATES = {"exchange": "estimates"}
 MECHANISMS: dict[str, dict[str, Any]] = {
-    "information": {"exchange": "information", "particles": 1000},
-    "optimized": {"fusion": "optimized"} | ESTIMATES,
-    "random": {"fusion": "random"} | ESTIMATES,
-    "max-degree": {"fusion": "max-degree"} | ESTIMATES,
-    "metropolis": {"fusion": "metropolis"} | ESTIMATES,
-    "constant 0.5": {"fusion": "constant", "alpha": 0.5} | ESTIMATES,
-    "none": {"fusion": "none"} | ESTIMATES,
+    "optimized": {"fusion": "optimized"},
+    "random": {"fusion": "random"},
+    "max-degree": {"fusion": "max-degree"},
+    "metropolis": {"fusion": "metropolis"},
+    "constant 0.5": {"fusion": "constant", "alpha": 0.5},
+    "none": {"fusion": "none"},
 }
 """Options of each mechanism that is not centralized."""
 KEPT = "optimized"

@@ -82,7 +82,7 @@ ABLATION: dict[str, Variant] = {
     "2000 particles": _with(particles=2000),
     "no heading": _in_world(heading=False),
     "no defence": _with(defence=False),
-    "every fix passed on": Variant({"exchange": "estimates", "particles": 200}),
+    "every fix passed on": Variant({"exchange": "particles", "particles": 200}),
     "particles, one hop": Variant({"exchange": "particles", "particles": 200, "relay": False}),
 }
 """The reference, and what becomes of it without each of its parts."""
@@ -106,7 +106,7 @@ RECEIVERS: dict[str, Variant] = {
 CHURN: dict[str, Variant] = {"reference": _with(), "priors not pooled": _with(fusion="none")}
 """Runs of 15 minutes in which vehicles leave and come back."""
 FACTORS: dict[str, dict[str, Variant]] = {
-    "exchange": {"information": _with(), "estimates": Variant({"exchange": "estimates"})},
+    "exchange": {"information": _with(), "particles": Variant({"exchange": "particles"})},
     "relay": {"": Variant(), "no relay": Variant({"relay_increments": 0, "relay": False})},
     "particles": {str(count): Variant({"particles": count}) for count in (200, 1000)},
     "heading": {"": Variant(), "no heading": Variant({}, {"world.gnss.heading": False})},

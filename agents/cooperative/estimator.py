@@ -21,7 +21,7 @@ from agents.cooperative.cmm.consensus import (
     RatioConsensus,
     Share,
 )
-from agents.cooperative.cmm.fusion import Cloud, fuse, shift
+from agents.cooperative.cmm.fusion import Cloud, fuse
 from agents.cooperative.cmm.rbpf import Observation, Rbpf
 from agents.cooperative.cmm.robust import near_the_median
 from agents.cooperative.fix_table import FixTable
@@ -184,20 +184,13 @@ class Estimator:
         return True
 
     def _fuse(self, frames: Mapping[str, CooperativeFrame]) -> Array:
-        """Fuse with the neighbours; returns the estimate (2,) right afterwards.
-
-        Their estimates are a period old, and are compared with this vehicle's own of the same time.
-        """
+        """Mix the neighbours' particles; returns the estimate (2,) right afterwards."""
         weights = self._fusion_weights(frames)
         ids = [self._node_id, *(self._admission.ids[sender] for sender in frames)]
         self.weights = dict(zip(ids, weights.tolist(), strict=True))
-        if self._options.exchange == "particles":
-            clouds = [Cloud(frame.cloud_m, _known(sender, frame)) for sender, frame in frames.items()]
-            fused_m, self.imported = fuse(self.rbpf, clouds, weights, self._rng)
-            return fused_m
-        offset = np.array([frame.estimate_m for frame in frames.values()]) - self._sent[0]
-        shift(self.rbpf, weights[1:] @ offset)
-        return self.rbpf.estimate_m
+        clouds = [Cloud(frame.cloud_m, _known(sender, frame)) for sender, frame in frames.items()]
+        fused_m, self.imported = fuse(self.rbpf, clouds, weights, self._rng)
+        return fused_m
 
     def _fusion_weights(self, frames: Mapping[str, CooperativeFrame]) -> Array:
         """Fusion weights (1 + n,) of this vehicle and its neighbours, by the rule of the options."""
@@ -229,7 +222,7 @@ class Estimator:
         self._sent = self._estimate()
         heard = {name: name in share.out_neighbours for name in sorted(share.heard)[:MAX_HEARD]}
         left = room(len(heard), max_payload)
-        mixes = self._options.exchange == "particles" and self._options.fusion != "none"
+        mixes = self._options.fusion != "none"
         particles = min(self.rbpf.config.particles, left // PARTICLE_BYTES) if mixes else 0
         relays = min(RELAY_LIMIT, (left - PARTICLE_BYTES * particles) // RELAYED.itemsize)
         return CooperativeFrame(

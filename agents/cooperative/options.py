@@ -58,10 +58,10 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """`paper` gives many other keys the paper's values as defaults; keys that are set besides still count."""
     fusion: Literal["optimized", "random", "metropolis", "max-degree", "constant", "none"] = "optimized"
     """Rule of the fusion weights; `none` fuses nothing."""
-    exchange: Literal["information", "estimates", "particles"] = "information"
+    exchange: Literal["information", "particles"] = "information"
     """With `information` a vehicle filters itself alone and exchanges what it knows of the common error, not fixes.
-    Else it filters all fixes that it hears of, and fusion moves the cloud towards the neighbours' `estimates`, or
-    mixes `particles`, as in the paper."""
+    With `particles` it filters all fixes that it hears of, and fusion mixes the neighbours' particles, as in the
+    paper."""
     relay: bool = True
     """If true, a frame relays the newest fixes of others; not with `exchange = "information"`."""
     relay_increments: Annotated[int, Meta(ge=0, le=255)] = 30

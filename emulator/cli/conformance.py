@@ -40,7 +40,7 @@ def conformance(
         float, typer.Option(min=0.1, metavar="SECONDS", help="How long the agent may take for an answer.")
     ] = PATIENCE_S,
 ) -> None:
-    """Play the emulator against an agent, scene by scene, and check each of its answers."""
+    """Play the emulator against an agent, scene by scene, and check each of its answers (experimental)."""
     with one_line_errors():
         loaded = Scenario() if scenario is None else load_scenario(scenario)
         found = Conformance(command, loaded, scene or list(SCENES), listen, patience).play(_announce)

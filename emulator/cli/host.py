@@ -41,7 +41,7 @@ def host(
         ),
     ] = None,
 ) -> None:
-    """Start the vehicles of one host, and speak for them, until the run ends."""
+    """Start the vehicles of one host, and speak for them, until the run ends (experimental)."""
     with one_line_errors():
         from emulator.drivers.hosts.host import run_host
         from vnet.transport.access import host_user

@@ -196,7 +196,8 @@ ReportOption = Annotated[
 HostsOption = Annotated[
     str | None,
     typer.Option(
-        metavar="NAMES", help="Hosts of the vehicles, in equal parts: a,b,c. On each: vnet host --name NAME."
+        metavar="NAMES",
+        help="Hosts of the vehicles, in equal parts (experimental): a,b,c. On each: vnet host --name NAME.",
     ),
 ]
 RunArgument = Annotated[Path, typer.Argument(parser=path_of, metavar="RUN", help="A run's folder.")]

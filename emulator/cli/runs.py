@@ -85,7 +85,9 @@ def run(
     ] = RouterKind.EMBEDDED,
     hosts: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Start the vehicles from N hosts (vnet host) on this machine."),
+        typer.Option(
+            metavar="N", min=1, help="Start the vehicles from N hosts (vnet host) on this machine (experimental)."
+        ),
     ] = None,
     debug: DebugOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,

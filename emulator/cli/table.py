@@ -62,7 +62,7 @@ COMMANDS = (
     Command(
         "emulator", Panel.RUN, "runs", "emulator", "Run it for agents that are started by hand, here or elsewhere."
     ),
-    Command("host", Panel.RUN, "host", "host", "Start the vehicles of one host of a run on several."),
+    Command("host", Panel.RUN, "host", "host", "Start the vehicles of one of several hosts (experimental)."),
     Command("access", Panel.RUN, "access", "access", "Write the users and rules of a separate router (zenohd)."),
     Command("status", Panel.LOOK, "fault", "status", "Show how a run that is on is getting on."),
     Command("check", Panel.LOOK, "check", "check", "Judge a finished run again."),
@@ -86,9 +86,7 @@ COMMANDS = (
         "Run it many times under random faults, and shrink failures.",
         runs_programs=True,
     ),
-    Command(
-        "conformance", Panel.BREAK, "conformance", "conformance", "Check an agent of your own against the protocol."
-    ),
+    Command("conformance", Panel.BREAK, "conformance", "conformance", "Check an agent of your own (experimental)."),
     Command(
         "sweep",
         Panel.STUDY,

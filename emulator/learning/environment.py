@@ -28,7 +28,7 @@ def environment(
     set: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
 ) -> ParallelEnv[str, Any, Any]:
-    """Return a scenario as a `pettingzoo.ParallelEnv`: a step is a period, an agent a vehicle.
+    """Return a scenario as a `pettingzoo.ParallelEnv` (experimental): a step is a period, an agent a vehicle.
 
     Each vehicle but those of `[[program.exceptions]]` runs a program that gives each fix, and the packets received
     since the one before, to `observe(node, fix, packets)`, awaits its agent's action, and hands that to

@@ -1,17 +1,15 @@
-"""Bounds on a call into code of the user's own: a rule that loops, or waits, forever is interrupted.
+"""Bounds on a call into code of the user's own: a rule that loops, or waits, forever is stopped.
 
-A thread looks at the processor time of the calling thread now and then, and raises an exception in it once the
-call has had its time. So a slow machine, or one that is stopped, interrupts nothing.
+A thread looks at the processor time of the calling thread now and then. So a slow machine, or one that is stopped,
+stops nothing.
 
-A call that waits (sleeps, reads from a socket, acquires a lock) sees no such exception. In the main thread, to
-which Python gives signals, it is interrupted by a signal whose handler raises; the handler is set for the call
-alone. From any other thread the function is called on a thread of its own, which is left behind if it waits for too
-long. In a single long call into a library nothing is interrupted before it returns.
+In the main thread, to which Python gives signals, a call that has had its time is interrupted by a signal whose
+handler raises; the handler is set for the call alone. From any other thread the function is called on a thread of
+its own, which is left behind. In a single long call into a library nothing is interrupted before it returns.
 """
 
 from __future__ import annotations
 
-import ctypes
 import signal
 import sys
 import threading
@@ -59,87 +57,68 @@ class _Call:
     """A call that is on: its thread, the clock of that thread, and its time by that clock at the start, in ns.
 
     `looked_ns` is that time when the watch last looked, and `waited_s` how long it has seen the call wait.
-    `takes_signals` says that the handler of `WAKE_UP` is that of this call, in place of `handler_before`.
-    `leave`, if given, is called in place of a signal once the call has waited for too long.
+    `due` is the exception that the handler of `WAKE_UP` is to raise. `leave`, if given, is called with it instead.
     """
 
-    leave: Callable[[_Call], None] | None = None
+    leave: Callable[[_Call, NoAnswerError], None] | None = None
 
     thread: int = field(default_factory=threading.get_ident)
     clock: int | None = field(default_factory=lambda: _own_clock())
     start_ns: int = 0
     looked_ns: int = 0
     waited_s: float = 0.0
-    is_interrupted: bool = False
     is_on: bool = True
-    takes_signals: bool = False
-    is_awaited: bool = False
     is_signalled: bool = False
+    due: NoAnswerError | None = None
     handler_before: Any = None
 
     def __post_init__(self) -> None:
         self.start_ns = self.looked_ns = self.cpu_ns()
 
     def take_signals(self) -> None:
-        """Set the handler of `WAKE_UP` to that of this call, where Python allows it."""
-        self.handler_before = signal.getsignal(WAKE_UP)
-        # None: a handler that Python has not set, and cannot set again.
-        if threading.current_thread() is threading.main_thread() and self.handler_before is not None:
-            self.takes_signals = True
-            signal.signal(WAKE_UP, self._wake_up)
+        """Set the handler of `WAKE_UP` to that of this call."""
+        self.handler_before = signal.signal(WAKE_UP, self._wake_up)
 
     def cpu_ns(self) -> int:
         """Return the time of the clock; of the whole process where threads have no clocks."""
         return time.process_time_ns() if self.clock is None else time.clock_gettime_ns(self.clock)
 
-    def interrupt(self) -> None:
-        """Raise NoAnswerError in the thread at its next step."""
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self.thread), ctypes.py_object(NoAnswerError))
-
-    def take_back(self) -> None:
-        """Catch an exception that has perhaps not been raised yet; in the thread itself.
-
-        It is raised here. If it were withdrawn, Python 3.11 would look for it for ever, and hang as soon as a
-        debugger traces a coroutine.
-        """
-        try:
-            self.interrupt()
-            while True:
-                pass
-        except NoAnswerError:
-            pass
-
     def look(self) -> None:
-        """Interrupt the call if it has had its time: again and again, if it goes on."""
+        """Stop the call if it has had its time: again and again, if it goes on."""
         cpu_ns = self.cpu_ns()
         self.waited_s += LOOK_EVERY_S if cpu_ns - self.looked_ns < BUSY_SHARE * LOOK_EVERY_S * 1e9 else 0.0
         self.looked_ns = cpu_ns
         if cpu_ns - self.start_ns > LIMIT_S * 1e9:
-            self.is_interrupted, self.start_ns = True, cpu_ns
-            self.interrupt()
-        if self.leave is not None and self.waited_s > WAIT_LIMIT_S:
-            leave, self.leave = self.leave, None
-            leave(self)
-        elif self.takes_signals and self.waited_s > WAIT_LIMIT_S:
-            self.waited_s, self.is_awaited, self.is_signalled = 0.0, True, True
+            self.start_ns = cpu_ns
+            self._stop(NoAnswerError())
+        elif self.waited_s > WAIT_LIMIT_S:
+            self.waited_s = 0.0
+            self._stop(WaitedError())
+
+    def _stop(self, error: NoAnswerError) -> None:
+        if self.handler_before is not None:
+            self.due, self.is_signalled = error, True
             signal.pthread_kill(self.thread, WAKE_UP)
+        elif self.leave is not None:
+            leave, self.leave = self.leave, None
+            leave(self, error)
 
     def release_signals(self) -> None:
         """Set the handler of before; the watch does not look at the call any more."""
-        if self.takes_signals:
+        if self.handler_before is not None:
             if self.is_signalled:
                 time.sleep(0)  # a signal that has been sent is taken before a system call returns
-            self.takes_signals = False
             signal.signal(WAKE_UP, self.handler_before)
+            self.handler_before = None
 
     def _wake_up(self, number: int, frame: FrameType | None) -> None:
-        """Raise in a call that has waited too long; give every other such signal to the handler of before."""
-        is_own, self.is_awaited = self.is_awaited, False
-        if not is_own:
+        """Raise in a call that has had its time; give every other such signal to the handler of before."""
+        due, self.due = self.due, None
+        if due is None:
             if callable(self.handler_before):
                 self.handler_before(number, frame)
         elif self.is_on and not _in_debugger(frame):
-            raise WaitedError
+            raise due
 
 
 def _in_debugger(frame: FrameType | None) -> bool:
@@ -178,8 +157,6 @@ class _Watch:
         call.is_on = False
         with self._lock:
             self._calls.discard(call)
-        if call.is_interrupted:
-            call.take_back()
         call.release_signals()
 
     def _look(self) -> None:
@@ -201,18 +178,19 @@ def call_bounded(function: Callable[..., T], *arguments: object) -> T:
 
     It may compute for `LIMIT_S`, and wait for `WAIT_LIMIT_S`.
     """
-    if threading.current_thread() is threading.main_thread():
+    # None: a handler that Python has not set, and cannot set again.
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(WAKE_UP) is not None:
         return _call_here(_Call(), function, *arguments)
     return _call_aside(function, *arguments)
 
 
 def _call_aside(function: Callable[..., T], *arguments: object) -> T:
-    """Call on a thread of its own, which goes on by itself if it waits for too long: nobody takes its answer."""
+    """Call on a thread of its own, which goes on by itself once it has had its time: nobody takes its answer."""
     answers: SimpleQueue[Callable[[], T]] = SimpleQueue()
 
-    def leave(call: _Call) -> None:
-        waits = WaitedError().with_traceback(_stack(sys._current_frames().get(call.thread)))
-        answers.put(partial(_raise, waits))
+    def leave(call: _Call, error: NoAnswerError) -> None:
+        stack = _stack(sys._current_frames().get(call.thread))
+        answers.put(partial(_raise, error.with_traceback(stack)))
 
     def run() -> None:
         try:
@@ -234,7 +212,7 @@ def _stack(frame: FrameType | None) -> TracebackType | None:
     """Return the traceback from this file to where a thread stands, as if it had raised there."""
     traced: TracebackType | None = None
     while frame is not None and frame.f_code.co_filename != __file__:
-        traced = TracebackType(traced, frame, frame.f_lasti, frame.f_lineno)
+        traced = TracebackType(traced, frame, frame.f_lasti, frame.f_lineno or frame.f_code.co_firstlineno)
         frame = frame.f_back
     return traced
 

@@ -39,7 +39,7 @@ def test_the_full_ablation_has_every_combination() -> None:
     variants = full_ablation()
     assert len(variants) == 2**5
     assert next(iter(variants)) == "information, 200"
-    last = variants["estimates, no relay, 1000, no heading, no defence"]
+    last = variants["particles, no relay, 1000, no heading, no defence"]
     assert last.options["relay"] is False and last.keys == {"world.gnss.heading": False}
 
 

@@ -1,4 +1,4 @@
-"""Fusion: one filter's particles mixed with those of its neighbours, or moved towards their estimates (MODEL 5).
+"""Fusion: one filter's particles mixed with those of its neighbours (MODEL 5).
 
 A share a_ij of the particles is replaced by hypotheses of neighbour j. The mixture of posteriors counts nothing
 twice. The neighbour could not know the roads of those vehicles that it does not receive: these, and only these,
@@ -62,16 +62,6 @@ class Conditioned:
 
 
 # Estimates.
-
-
-def shift(rbpf: Rbpf, by_m: Array) -> None:
-    """Move the filter's cloud by (2,), and what goes with it along the regression on c. Nothing is resampled."""
-    slopes = regression_on_common_error(rbpf)
-    particles, tracks = rbpf.particles, rbpf.tracks
-    particles.common_m = particles.common_m + by_m[:, None]
-    particles.past_m += (slopes.past @ by_m)[..., None]
-    tracks.mean += (slopes.mean @ by_m)[..., None]
-    tracks.map_log_likelihood += (slopes.map_log_likelihood @ by_m)[..., None]
 
 
 def transport_cloud(rbpf: Rbpf, pooled: Information) -> None:

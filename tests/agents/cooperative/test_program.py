@@ -281,13 +281,12 @@ def cooperate(options: Options, seconds: float = 15.0, loss: float = 0.2, seed: 
 @pytest.mark.parametrize("consensus", ["ratio", "metropolis", "max-degree"])
 def test_together_they_find_the_common_error_whatever_the_consensus(consensus: Any) -> None:
     errors = cooperate(Options(particles=100, consensus=consensus), seconds=10.0)
-    assert errors.max() < 1.0, "the prior's deviation is 3 m an axis"
+    assert errors.max() < 1.5, "the prior's deviation is 3 m an axis"
 
 
 @pytest.mark.parametrize("fusion", ["random", "metropolis", "max-degree", "constant"])
-@pytest.mark.parametrize("exchange", ["estimates", "particles"])
-def test_every_rule_of_fusion_works_in_both_ways_of_exchange(fusion: Any, exchange: Any) -> None:
-    options = Options(particles=50, fusion=fusion, exchange=exchange, relay=exchange == "estimates")
+def test_every_rule_of_fusion_works(fusion: Any) -> None:
+    options = Options(particles=50, fusion=fusion, relay=False)
     assert cooperate(options, seconds=6.0).max() < 2.0
 
 
@@ -348,6 +347,11 @@ def test_fusion_brings_estimates_closer_than_none() -> None:
     assert fused < alone
 
 
+def test_the_exchange_that_is_gone_is_refused_with_those_that_there_are() -> None:
+    with pytest.raises(ProgramError, match=r"exchange = 'estimates': one of information, particles expected$"):
+        Options.parse({"exchange": "estimates"})
+
+
 @pytest.mark.parametrize("slots", [1, 2, 7, 1000])
 def test_vehicles_compute_in_turn_after_the_last_slot_and_long_before_the_next_fix(slots: int) -> None:
     options = Options.parse({"slots": slots})
@@ -359,7 +363,7 @@ def test_vehicles_compute_in_turn_after_the_last_slot_and_long_before_the_next_f
 
 
 def test_vehicles_that_send_what_they_have_computed_compute_at_once() -> None:
-    for exchange, shares in (("estimates", 1), ("information", 4)):  # with information nothing is left to send
+    for exchange, shares in (("particles", 1), ("information", 4)):  # with information nothing is left to send
         options = Options.parse({"two_frames": True, "exchange": exchange})
         names = [short_name(f"v{number}") for number in range(20)]
         assert len({listening_share(name, options) for name in names}) == shares

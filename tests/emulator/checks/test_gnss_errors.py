@@ -50,7 +50,7 @@ def test_errors_that_the_world_does_not_have_are_invalid(tmp_path: Path) -> None
     assert found(folder, "gnss")[0] == "invalid"
 
 
-@pytest.mark.parametrize("exchange", ["estimates", "information", "particles"])
+@pytest.mark.parametrize("exchange", ["information", "particles"])
 @pytest.mark.parametrize("network", [{"vehicles": 6}, {"kind": "city", "vehicles": 6, "size_m": 1000.0}])
 def test_cooperating_vehicles_cope(tmp_path: Path, exchange: str, network: dict[str, Any]) -> None:
     program = {"entry": "agents.cooperative:main", "options": {"exchange": exchange}}

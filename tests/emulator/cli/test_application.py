@@ -16,6 +16,7 @@ from docs.generate.commands import contexts
 from emulator.cli import commands
 from emulator.cli.application import build_app
 from emulator.cli.table import COMMANDS, find
+from emulator.learning.environment import environment
 from emulator.terminal.console import run_app
 from tests.support.paths import ROOT
 
@@ -193,3 +194,21 @@ def test_the_agent_says_its_name_and_version() -> None:
     )
     assert helped.startswith("Usage: vnet-agent [OPTIONS]")
     assert version.startswith("vnet-agent ")
+
+
+def test_what_may_change_or_go_in_any_version_is_marked_in_help_and_reference() -> None:
+    marked = {path for path, command in ALL.items() if "(experimental)" in str(command.help)}
+    marked |= {
+        f"{path} {option.opts[0]}"
+        for path, command in ALL.items()
+        for option in command.params
+        if "(experimental)" in (getattr(option, "help", None) or "")
+    }
+    assert marked == {
+        "vnet conformance",
+        "vnet host",
+        "vnet run --hosts",
+        "vnet emulator --hosts",
+        "vnet access --hosts",
+    }
+    assert "(experimental)" in str(environment.__doc__).splitlines()[0]

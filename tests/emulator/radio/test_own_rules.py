@@ -318,6 +318,37 @@ def test_a_rule_that_waits_on_another_thread_is_left_behind(name: str, handled: 
     assert air.rows() == chatted(periods=3).rows()
 
 
+def test_a_rule_that_computes_on_another_thread_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            air = pool.submit(chatted, rule("loops_for_now"), periods=3).result()
+    finally:
+        rules.ENOUGH.set()
+    (failure,) = air.failures
+    assert failure.error.startswith("does not answer within 0.05 s of processor time (rules.py:")
+    assert air.rows() == chatted(periods=3).rows()
+
+
+def test_a_rule_that_catches_everything_is_interrupted_until_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    caught = []
+
+    def stubborn() -> None:
+        while True:
+            try:
+                while True:
+                    pass
+            except BaseException as error:
+                caught.append(error)
+                if len(caught) == 2:
+                    raise
+
+    with pytest.raises(rule_watch.NoAnswerError):
+        rule_watch.call_bounded(stubborn)
+    assert len(caught) == 2
+
+
 def test_on_another_thread_no_handler_is_set(handled: list[int]) -> None:
     with ThreadPoolExecutor(1) as pool:
         during = pool.submit(rule_watch.call_bounded, signal.getsignal, rule_watch.WAKE_UP).result()

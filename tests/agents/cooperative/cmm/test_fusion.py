@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.cooperative.cmm.fusion import Cloud, condition_on, fuse, regression_on_common_error, shift
+from agents.cooperative.cmm.fusion import Cloud, condition_on, fuse, regression_on_common_error
 from agents.cooperative.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
 
@@ -85,24 +85,6 @@ def test_given_c_a_new_vehicle_is_where_its_fix_says_less_c(common_sigma_m: floa
     conditioned = condition_on(rbpf, np.array([[1.0, 1.0]] * 5), np.random.default_rng(0))
     assert pytest.approx(np.array([[2.0, 3.0]] * 5)) == conditioned.mean[0, :2].T
     assert pytest.approx(np.array([[1.0, 1.0]] * 5)) == conditioned.past_m[0].T
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**32), st.tuples(st.floats(-5, 5), st.floats(-5, 5)))
-def test_a_shift_moves_the_cloud_as_a_whole_and_the_vehicles_along_the_regression(
-    seed: int, by: tuple[float, float]
-) -> None:
-    rbpf = settled(seed)
-    by_m = np.array(by)
-    estimate, covariance, weight = rbpf.estimate_m, rbpf.estimate_covariance_m2, rbpf.weight
-    slope = regression_on_common_error(rbpf).mean
-    positions = {name: rbpf.tracks.mean[row, :2] @ weight for row, name in enumerate(rbpf.vehicles)}
-    shift(rbpf, by_m)
-    assert rbpf.estimate_m == pytest.approx(estimate + by_m)
-    assert rbpf.estimate_covariance_m2 == pytest.approx(covariance)
-    assert np.array_equal(rbpf.weight, weight), "nothing is resampled"
-    for row, name in enumerate(rbpf.vehicles):
-        assert rbpf.tracks.mean[row, :2] @ weight == pytest.approx(positions[name] + slope[row, :2] @ by_m)
 
 
 @settings(max_examples=30, deadline=None)

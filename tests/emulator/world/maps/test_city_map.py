@@ -83,7 +83,7 @@ def test_a_map_may_be_shifted(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exchange", ["information", "estimates"])
+@pytest.mark.parametrize("exchange", ["information", "particles"])
 def test_what_the_map_may_be_shifted_by_is_stated_and_not_exchanged(tmp_path: Path, exchange: str) -> None:
     """The same packets and estimates, with larger covariances."""
     anees, traces, errors = [], [], []
