@@ -4,18 +4,20 @@ That takes minutes. A page that passed is followed again once it, an example, a 
 changed; in CI (if the environment has `CI`), always.
 """
 
+import contextlib
 import gc
-import hashlib
 import os
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from tests.docs.commands import DocsError
 from tests.docs.markdown import PAGES, blocks
+from tests.docs.once import key_of, unless_passed
 from tests.docs.pages import Page, check_workflow, shows
 from tests.support.paths import ROOT
 
@@ -38,40 +40,57 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
 
 
 USED = ("docs/examples/**/*", "scenarios/*", "emulator/*.py", "emulator/cli/**/*", "agents/*.py", "vnet/*.py")
-"""What every page may use: with the code that follows pages, and the sources of its excerpts, its result's key."""
+"""Files that every page may use, beside the code that follows pages, and the sources of its excerpts."""
 
 
-def key_of(path: Path) -> str:
-    """Return a digest of a page and of the files that it may use."""
+def used_by(path: Path) -> list[Path]:
+    """Return a page and the files that it may use."""
     excerpts = [ROOT / name for name in re.findall(r"^```python of (\S+)$", path.read_text("utf-8"), re.MULTILINE)]
-    used = [file for pattern in (*USED, "tests/docs/*.py") for file in sorted(ROOT.glob(pattern))]
-    files = (file for file in (path, *excerpts, *used) if file.is_file() and file.suffix != ".pyc")
-    digests = (f"{file.relative_to(ROOT)} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files)
-    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
+    return [path, *excerpts, *(file for used in (*USED, "tests/docs/*.py") for file in ROOT.glob(used))]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_page_is_what_it_says(path: Path, page: Page, request: pytest.FixtureRequest) -> None:
-    name, key, passed = str(path.relative_to(ROOT)), key_of(path), getattr(request.config, "cache", None)
-    place = f"vnet/pages/{name.replace('/', '-')}"
-    if passed and passed.get(place, None) == key and not os.environ.get("CI"):
-        pytest.skip("passed with the same page, examples, commands and interface; CI=1 follows it again")
-    page.follow(path.read_text(encoding="utf-8"), name)
-    gc.collect()  # a file that the page has left open fails this test, and no later one
-    if passed:
-        passed.set(place, key)
+def test_a_page_is_what_it_says(path: Path, page: Page, pytestconfig: pytest.Config) -> None:
+    name = str(path.relative_to(ROOT))
+    with unless_passed(pytestconfig, name, used_by(path)):
+        page.follow(path.read_text(encoding="utf-8"), name)
+        gc.collect()  # a file that the page has left open fails this test, and no later one
 
 
-def test_a_page_is_followed_again_once_what_it_uses_has_changed(tmp_path: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(f"{__name__}.ROOT", tmp_path)
-        keys = set()
-        for name in ("page.md", "emulator/cli/run.py", "docs/examples/a/b.toml", "vnet/node.py", "docs/of.py"):
-            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / name).write_text("```python of docs/of.py\n```\n")
-            keys.add(key_of(tmp_path / "page.md"))
+def test_a_page_is_followed_again_once_what_it_uses_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{__name__}.ROOT", tmp_path)
+    keys = set()
+    for name in ("page.md", "emulator/cli/run.py", "docs/examples/a/b.toml", "vnet/node.py", "docs/of.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("```python of docs/of.py\n```\n")
+        keys.add(key_of(used_by(tmp_path / "page.md")))
     assert len(keys) == 5
+
+
+def test_what_has_passed_is_skipped_but_not_in_ci_nor_what_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("CI", raising=False)
+    stored: dict[str, str] = {}
+    config: Any = SimpleNamespace(cache=SimpleNamespace(get=stored.get, set=stored.__setitem__))
+    ran = []
+
+    def run(outcome: Exception | None) -> None:
+        with contextlib.suppress(RuntimeError, pytest.skip.Exception), unless_passed(config, "page", [tmp_path]):
+            ran.append(outcome)
+            if outcome:
+                raise outcome
+
+    failure = RuntimeError("it is not what it says")
+    for outcome in (failure, None, None):
+        run(outcome)
+    assert ran == [failure, None]
+    monkeypatch.setenv("CI", "true")
+    run(None)
+    assert ran == [failure, None, None]
 
 
 def test_there_are_pages_and_blocks() -> None:

@@ -10,7 +10,10 @@ from types import ModuleType
 import pytest
 
 from tests.docs.markdown import PAGES
+from tests.docs.once import unless_passed
 from tests.support.paths import ROOT
+
+LOADED = re.compile(r"""<(?:script|img|iframe)[^>]*\ssrc="(?:https?:)?//|<link[^>]*\shref="(?:https?:)?//""")
 
 
 @pytest.fixture(scope="module")
@@ -30,26 +33,20 @@ def test_the_contents_follow_the_index(configuration: ModuleType) -> None:
 
 
 @pytest.mark.slow
-def test_the_site_has_every_page_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-q",
-        "-W",
-        "-d",
-        str(tmp_path / "cache"),
-        "-c",
-        "docs/site",
-        ".",
-        str(tmp_path / "site"),
-    ]
-    subprocess.run(command, cwd=ROOT, check=True)
-    site = tmp_path / "site"
-    for page in PAGES:
-        assert (site / page.relative_to(ROOT).with_suffix(".html")).exists(), page
-    pages = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
-    loaded = re.compile(r"""<(?:script|img|iframe)[^>]*\ssrc="(?:https?:)?//|<link[^>]*\shref="(?:https?:)?//""")
-    assert [path for path, text in pages.items() if loaded.search(text)] == []
-    assert "broadcast" in pages[site / "docs" / "python.html"]
-    assert "lockstep" in (site / "searchindex.js").read_text(encoding="utf-8")
+def test_the_site_has_every_page_and_loads_nothing_from_elsewhere(
+    tmp_path: Path, pytestconfig: pytest.Config
+) -> None:
+    sources = [file for name in ("vnet", "agents", "emulator", "docs") for file in (ROOT / name).rglob("*.*")]
+    with unless_passed(pytestconfig, "site", [*PAGES, *sources]):
+        folders = [str(tmp_path / "cache"), "-c", "docs/site", ".", str(tmp_path / "site")]
+        subprocess.run([sys.executable, "-m", "sphinx", "-q", "-W", "-d", *folders], cwd=ROOT, check=True)
+        site = tmp_path / "site"
+        for page in PAGES:
+            assert (site / page.relative_to(ROOT).with_suffix(".html")).exists(), page
+        pages = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+        loaded = re.compile(
+            r"""<(?:script|img|iframe)[^>]*\ssrc="(?:https?:)?//|<link[^>]*\shref="(?:https?:)?//"""
+        )
+        assert [path for path, text in pages.items() if loaded.search(text)] == []
+        assert "broadcast" in pages[site / "docs" / "python.html"]
+        assert "lockstep" in (site / "searchindex.js").read_text(encoding="utf-8")

@@ -1,16 +1,15 @@
-"""Agents started by hand with a separate router: the same run as in one process, as `vnet run` has it."""
+"""An emulator, agents and a router that are started by hand."""
 
 import re
-import socket
 import subprocess
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
-from tests.system.conftest import AGENT, TIMEOUT_S, VNET, Finished, Vnet
+from tests.system.conftest import AGENT, TIMEOUT_S, Finished
 
 SCENARIO = "scenarios/beacon.toml"
 OPTIONS = ["--duration", "2", "--set", "network.vehicles=4"]
@@ -39,7 +38,7 @@ def start_emulator(stack: ExitStack, folder: Path, *options: str) -> tuple[subpr
     """`vnet emulator`, once it waits for its vehicles; and the endpoint that it names."""
     command = [*VNET, "emulator", SCENARIO, *OPTIONS, "--out", str(folder), *options]
     emulator = stack.enter_context(
-        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     )
     stack.callback(emulator.kill)
     assert emulator.stderr is not None
@@ -47,31 +46,3 @@ def start_emulator(stack: ExitStack, folder: Path, *options: str) -> tuple[subpr
         if found := re.search(r"listening at (\S+); waiting for 4 vehicles", line):
             return emulator, found[1]
     pytest.fail("the emulator ended early")
-
-
-def test_a_separate_router_changes_nothing(vnet: Vnet, tmp_path: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    access = tmp_path / "access"
-    command = [*VNET, "access", SCENARIO, *OPTIONS[2:], "--out", str(access), "--listen", endpoint]
-    subprocess.run(command, cwd=ROOT, check=True, timeout=TIMEOUT_S, capture_output=True)
-    assert all(path.stat().st_mode & 0o077 == 0 for path in access.rglob("*") if path.is_file())
-    with ExitStack() as stack:
-        router = stack.enter_context(
-            subprocess.Popen(
-                [sys.executable, "-c", ROUTER, str(access / "zenohd.json5")],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-        )
-        assert router.stdout is not None
-        assert router.stdout.readline() == "up\n"
-        folder = tmp_path / "separate"
-        emulator, _ = start_emulator(stack, folder, "--connect", endpoint, "--access", str(access))
-        start_agents(stack, endpoint, access)
-        separate = finish(emulator, folder)
-        router.communicate("\n", timeout=TIMEOUT_S)
-    assert separate.status == 0, separate.stderr + separate.stdout
-    assert separate.fingerprint == vnet("simulate", SCENARIO, *OPTIONS).fingerprint

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
-from tests.system.conftest import TIMEOUT_S, VNET
+from tests.system.conftest import TIMEOUT_S
 
 PROGRAM = """
 import asyncio, ctypes, os, pathlib, signal, threading

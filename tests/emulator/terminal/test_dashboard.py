@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from emulator.drivers.status import BINS, FIGURES, FaultState, Snapshot
-from emulator.records.events import Event
-from emulator.terminal.dashboard import Dashboard, describe, sparkline
+from emulator.records.run_folder import Event
+from emulator.terminal.dashboard import BAD_EVENTS, Dashboard, describe, is_bad, sparkline
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
 FAULTS = (
@@ -84,6 +84,11 @@ def written(console: Console) -> str:
 
 def rows(shot: Snapshot, width: int = 100, height: int = 30) -> list[str]:
     return render(Dashboard(shot), width, height).export_text().splitlines()
+
+
+def row(shot: Snapshot, label: str, width: int = 100, height: int = 30) -> str:
+    (found,) = [line for line in rows(shot, width, height) if line.startswith(label)]
+    return " ".join(found.split())
 
 
 MANY = tuple(FaultState(f"loss-{n}", "ended", n, n + 1.0, ()) for n in range(8))
@@ -232,3 +237,4 @@ def test_a_sparkline_of_odd_values() -> None:
 )
 def test_events_in_words(event: Event, said: str) -> None:
     assert describe(event) == said
+    assert is_bad(event) is (event.kind in BAD_EVENTS)
