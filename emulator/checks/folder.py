@@ -29,6 +29,7 @@ from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
 from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
+from emulator.records.tables import BACKBONE, DRIVEN
 from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict, result, unknown
 from emulator.scenario.fault_families import SenderFault
 from emulator.scenario.toml import parse_toml
@@ -85,8 +86,8 @@ def verdict_figures(recorded: RecordedRun, rows: Sequence[PeriodFigures]) -> dic
         "roadside_units": len(scenario.roadside),
         "packet_delivery_ratio": delivery_ratio(recorded),
         "figures": summarize(rows),
-        "driving": driving_figures(recorded.driven, recorded.events),
-        "backbone": backbone_figures(recorded.backbone),
+        "driving": driving_figures(recorded.table(DRIVEN), recorded.events),
+        "backbone": backbone_figures(recorded.table(BACKBONE)),
         "reported": {name: asdict(figure) for name, figure in reported_figures(recorded.states).items()},
     }
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import numbers_of, value_columns
 from emulator.records.run_tables import VALUES_AS_LIST
+from emulator.records.tables import BUSY, METRICS, STATES, TRACE, Table
 from emulator.records.verdicts import MOST_ROWS
 from emulator.scenario.scenario import Scenario
 from emulator.world.link_table import LinkTable
@@ -38,7 +39,7 @@ ON_AIR = decided_at(Stage.RECEPTION, Stage.ARRIVAL)
 
 @dataclass(frozen=True)
 class RecordedTables:
-    """The scenario, the three tables, and the events."""
+    """The scenario, the tables, and the events."""
 
     scenario: Scenario
     trace: pa.Table
@@ -47,16 +48,14 @@ class RecordedTables:
     events: Sequence[Event]
     known_m: Array | None = None
     """True positions (periods, N, 2), where the states have not got them all."""
-    busy: pa.Table | None = None
-    """busy.parquet, where there is a MAC."""
     world: RecordedWorld | None = None
     """world.npz."""
-    driven: pa.Table | None = None
-    """driven.parquet, where programs drive."""
-    backbone: pa.Table | None = None
-    """backbone.parquet, where there are roadside units."""
-    background: pa.Table | None = None
-    """background.parquet, where SUMO is stepped with the run."""
+    more: Mapping[Table, pa.Table | None] = field(default_factory=dict)
+    """Tables that only some runs have."""
+
+    def table(self, kind: Table) -> pa.Table | None:
+        """Return a table of the run; None if it has none of this kind."""
+        return {TRACE: self.trace, STATES: self.states, METRICS: self.metrics, **self.more}.get(kind)
 
     # Nodes and where they are.
 
@@ -119,7 +118,7 @@ class RecordedTables:
     @cached_property
     def busy_ratio(self) -> Array:
         """(windows, N), how busy each vehicle found the medium; no windows where senders share none."""
-        return busy_windows(self.busy, self.node_ids)
+        return busy_windows(self.table(BUSY), self.node_ids)
 
     # The trace, column by column.
 

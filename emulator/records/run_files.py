@@ -7,49 +7,34 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from emulator.radio.trace import ACKNOWLEDGED, Trace
-from emulator.records.backbone_table import BACKBONE
-from emulator.records.background_table import BACKGROUND
-from emulator.records.busy import busy_table
-from emulator.records.driven_table import driven_table
+from emulator.radio.trace import ACKNOWLEDGED
 from emulator.records.events import Event, parse_events
-from emulator.records.metrics import METRICS
-from emulator.records.payloads import PAYLOADS, KeptPayloads
+from emulator.records.payloads import KeptPayloads
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import value_columns
 from emulator.records.run_folder import (
-    BACKBONE_FILE,
-    BACKGROUND_FILE,
-    BUSY_FILE,
-    DRIVEN_FILE,
     EVENTS_FILE,
     FORMAT,
-    METRICS_FILE,
-    PAYLOADS_FILE,
     SCENARIO_FILE,
-    STATES_FILE,
-    TRACE_FILE,
     VERDICT_FILE,
     WORLD_FILE,
 )
 from emulator.records.run_tables import StatesReader, TableFile, TraceReader, open_table
-from emulator.records.states import STATES
+from emulator.records.tables import METRICS, PAYLOADS, STATES, TRACE, Table
 from emulator.records.verdict_file import Record, read_record
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.toml import LARGEST_BYTES
-from emulator.world.driven.vehicles import Log
 from emulator.world.world import build_world
 from vnet.bounded import read_regular
 from vnet.errors import ScenarioError, VnetError, printable
@@ -60,33 +45,9 @@ SPARE_ROWS = 1_000_000
 """Rows that every table may have, whatever verdict.json says."""
 MARKS = (SCENARIO_FILE, VERDICT_FILE, EVENTS_FILE)
 """A folder with any of these is a run's."""
-WITH_MAC = ("on_air_ns", "left_ns")
-"""Columns that the trace has where there is a MAC."""
-WITH_POWER = ("rssi_dbm", "snr_db")
-"""Columns that the trace has where there is a path loss, but for traces of vnet 0.2 and before."""
 WITH_UNICASTS = ACKNOWLEDGED
 """Columns that the trace has where programs send to single vehicles; without them every row is a broadcast's."""
-TABLES: dict[str, pa.Schema] = {
-    TRACE_FILE: Trace(["v01"], knows_air=True, knows_power=True).to_table().schema,
-    STATES_FILE: STATES,
-    METRICS_FILE: METRICS,
-    PAYLOADS_FILE: PAYLOADS,
-    BUSY_FILE: busy_table(np.zeros((1, 1)), ["v01"]).schema,
-    DRIVEN_FILE: driven_table(Log(), ["v01"]).schema,
-    BACKBONE_FILE: BACKBONE,
-    BACKGROUND_FILE: BACKGROUND,
-}
-"""The tables, with the columns that they must have."""
-# fmt: off
-WITHOUT_GAPS = frozenset((
-    "sent_ns", "sender", "seq", "receiver", "size_bytes", "payload_digest", "outcome", "cause", "copy",
-    "left_ns", "gain_db", "bitrate_mbps", "attempt", "acked", "period", "time_ns", "node",
-    "position_m", "heading_rad", "fix_m", "common_error_m", "reporting", "not_finite", "busy_ratio",
-    "component_rmse_m", "component_deviation_m",
-))
-# fmt: on
-"""Columns that have a value in every row."""
-Columns = Mapping[str, Collection[str]]
+Columns = Mapping[Table, Collection[str]]
 T = TypeVar("T")
 
 
@@ -103,6 +64,7 @@ class RunFiles:
     def __init__(self, folder: Path, columns: Columns | None = None) -> None:
         self.folder = folder
         self._columns = columns or {}
+        self._tables: dict[Table, pa.Table | None] = {}
 
     @cached_property
     def scenario_text(self) -> str:
@@ -157,61 +119,47 @@ class RunFiles:
             text = f"{self.folder}: of format 1 (vnet 0.1.0), which needs the run's input files: {error}"
             raise VnetError(text) from None
 
-    @cached_property
+    @property
     def trace(self) -> pa.Table:
         """A row for each frame and receiver in range."""
-        return self._table(TRACE_FILE, left_out=WITH_POWER + (WITH_MAC if self.scenario.radio.mac is None else ()))
+        return self.table(TRACE)
 
-    @cached_property
+    @property
     def states(self) -> pa.Table:
         """A row for each vehicle and period."""
-        return self._table(STATES_FILE)
+        return self.table(STATES)
 
-    @cached_property
+    @property
     def metrics(self) -> pa.Table:
         """A row for each period."""
-        return self._table(METRICS_FILE)
+        return self.table(METRICS)
 
-    @cached_property
-    def busy(self) -> pa.Table | None:
-        """A row for each vehicle and 100 ms; None where there is no MAC."""
-        return None if self.scenario.radio.mac is None else self._table(BUSY_FILE)
-
-    @cached_property
-    def driven(self) -> pa.Table | None:
-        """A row for each control instant and vehicle; None where programs do not drive."""
-        return self._table(DRIVEN_FILE) if self.scenario.network.programs_drive else None
-
-    @cached_property
-    def backbone(self) -> pa.Table | None:
-        """A row for each message of a roadside unit and receiver; None where there is no unit."""
-        return self._table(BACKBONE_FILE) if self.scenario.roadside else None
-
-    @cached_property
-    def background(self) -> pa.Table | None:
-        """A row for each period and vehicle without a program; None where SUMO is not stepped with the run."""
-        return self._table(BACKGROUND_FILE) if (self.folder / BACKGROUND_FILE).is_file() else None
+    def table(self, kind: Table) -> pa.Table | None:
+        """Return a table; None if the run has none of this kind."""
+        if kind not in self._tables:
+            there = (self.folder / kind.file).is_file() if kind.is_due is None else kind.is_due(self.scenario)
+            self._tables[kind] = self._read_table(kind) if there else None
+        return self._tables[kind]
 
     @cached_property
     def payloads(self) -> KeptPayloads | None:
         """Payloads of frames; None where the run has kept none."""
-        if not (self.folder / PAYLOADS_FILE).is_file():
-            return None
-        return KeptPayloads(self._table(PAYLOADS_FILE))
+        table = self.table(PAYLOADS)
+        return None if table is None else KeptPayloads(table)
 
     # Tables a piece at a time.
 
     def trace_reader(self, number: Mapping[str, int]) -> TraceReader:
         """The trace forward in time; `number` gives each node's."""
-        return TraceReader(self.folder / TRACE_FILE, number)
+        return TraceReader(self.folder / TRACE.file, number)
 
     def states_reader(self, number: Mapping[str, int]) -> StatesReader:
         """The states period by period; `number` gives each node's."""
-        return StatesReader(self.folder / STATES_FILE, number, self.scenario.period_ns)
+        return StatesReader(self.folder / STATES.file, number, self.scenario.period_ns)
 
     def figures(self) -> list[PeriodFigures]:
         """The rows of the metrics. Raises VnetError unless there is one for each period in turn."""
-        file = TableFile(self.folder / METRICS_FILE, [field.name for field in fields(PeriodFigures)])
+        file = TableFile(self.folder / METRICS.file, list(METRICS.columns))
         figures = [PeriodFigures(**row) for piece in file.pieces() for row in piece.to_pylist()]
         if [row.period for row in figures] != list(range(len(figures))):
             raise file.error("its rows are not those of one period after the other")
@@ -247,30 +195,31 @@ class RunFiles:
         except (ValueError, pa.ArrowException) as error:
             raise VnetError(f"{path}: cannot be read: {printable(' '.join(str(error).split()), 300)}") from None
 
-    def _table(self, name: str, left_out: Collection[str] = ()) -> pa.Table:
-        """A table with the types that it must have."""
-        path, schema = self.folder / name, TABLES[name]
+    def _read_table(self, kind: Table) -> pa.Table:
+        """Return a table with the types that it must have."""
+        path = self.folder / kind.file
         self.refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
             if path.exists():
                 raise VnetError(f"{path}: cannot be read: not a regular file")
-            if unkept := [line for line in self._unkept() if Path(line.partition(": ")[0]).name == name]:
+            if unkept := [line for line in self._unkept() if Path(line.partition(": ")[0]).name == path.name]:
                 raise VnetError(f"{self.folder}: its {VERDICT_FILE} says: not kept: {unkept[0]}")
-            raise not_finished(self.folder, name)
-        wanted = self._columns.get(name)
-        names = None if wanted is None else [*wanted, *self._columns_beside(path, wanted)]
+            raise not_finished(self.folder, path.name)
+        wanted = self._columns.get(kind)
+        names = None if wanted is None else [*wanted, *self._columns_beside(kind, path, wanted)]
         file = self._read(path, lambda: open_table(path, names))
-        self._bound_rows(path, file.metadata.num_rows)
+        self._bound_rows(kind, path, file.metadata.num_rows)
         kept = file.schema_arrow
-        for column in wanted or schema.names:
-            found = column in kept.names and kept.field(column).type == schema.field(column).type
-            if not found and column not in left_out:
-                raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
+        for name in wanted or kind.columns:
+            column = kind.columns[name]
+            found = name in kept.names and kept.field(name).type == column.type
+            if not found and column.is_due(self.scenario):
+                raise VnetError(f"{path}: has no column {name!r} of {column.type}")
         table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
-        for column in table.column_names:
-            if column in WITHOUT_GAPS and table[column].null_count:
-                raise VnetError(f"{path}: column {column!r} has gaps")
+        for name in table.column_names:
+            if name in kind.columns and not kind.columns[name].has_gaps and table[name].null_count:
+                raise VnetError(f"{path}: column {name!r} has gaps")
         return table.unify_dictionaries()
 
     def _unkept(self) -> list[str]:
@@ -281,7 +230,7 @@ class RunFiles:
             return []
         return [str(line) for lines in told if isinstance(lines, list) for line in lines]
 
-    def _bound_rows(self, path: Path, rows: int) -> None:
+    def _bound_rows(self, kind: Table, path: Path, rows: int) -> None:
         """Raise VnetError if a table has many times the rows that verdict.json speaks of."""
         try:
             record = self.record
@@ -289,17 +238,17 @@ class RunFiles:
             return
         nodes = record.vehicles + record.roadside_units
         periods = record.emulated_s * NS_PER_S / self.scenario.period_ns + 1
-        due = {TRACE_FILE: record.in_range, STATES_FILE: nodes * periods, METRICS_FILE: periods}
-        if path.name in due and rows > SPARE_ROWS + 2 * due[path.name]:
-            raise VnetError(f"{path}: {rows:,} rows, where {VERDICT_FILE} speaks of {due[path.name]:,.0f}")
+        due = {TRACE: record.in_range, STATES: nodes * periods, METRICS: periods}
+        if kind in due and rows > SPARE_ROWS + 2 * due[kind]:
+            raise VnetError(f"{path}: {rows:,} rows, where {VERDICT_FILE} speaks of {due[kind]:,.0f}")
 
-    def _columns_beside(self, path: Path, wanted: Collection[str]) -> list[str]:
+    def _columns_beside(self, kind: Table, path: Path, wanted: Collection[str]) -> list[str]:
         """Columns that only some runs have: reported values beside `values`, and what tells unicasts."""
-        if path.name == TRACE_FILE:
+        if kind is TRACE:
             there = self._read(path, lambda: open_table(path, ()).schema_arrow.names)
             beside = [*WITH_UNICASTS, "on_air_ns"] if "attempt" in there else WITH_UNICASTS
             return [name for name in beside if name in there and name not in wanted]
-        if path.name != STATES_FILE or "values" not in wanted:
+        if kind is not STATES or "values" not in wanted:
             return []
         return self._read(path, lambda: value_columns(open_table(path, ()).schema_arrow))
 

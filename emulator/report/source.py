@@ -19,16 +19,16 @@ from emulator.records.key_figures import SAME
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
-from emulator.records.run_folder import METRICS_FILE, STATES_FILE, TRACE_FILE
+from emulator.records.tables import METRICS, STATES, TRACE
 from emulator.records.verdict_file import Record
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
 from vnet.types import Array
 
 COLUMNS = {
-    TRACE_FILE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
-    STATES_FILE: ("period", "time_ns", "node", "position_m", "values"),
-    METRICS_FILE: (
+    TRACE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
+    STATES: ("period", "time_ns", "node", "position_m", "values"),
+    METRICS: (
         "time_ns",
         "reporting",
         "common_error_rmse_m",
@@ -102,7 +102,7 @@ class Source:
     @cached_property
     def bound(self) -> BoundSeries:
         """The hears-all bound. Raises VnetError if the run has none."""
-        return bound_of(RecordedRun.open(self.folder, {STATES_FILE: BOUND_COLUMNS}))
+        return bound_of(RecordedRun.open(self.folder, {STATES: BOUND_COLUMNS}))
 
     # What programs report by names of their own.
 
