@@ -14,7 +14,7 @@ from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
 from emulator.records.hears_all import BoundSeries, bound_of
-from emulator.records.recorded_tables import RecordedTables
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import reported_figures
 from vnet.errors import VnetError
@@ -109,13 +109,13 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
     return figures, metrics
 
 
-def _recorded(emulation: Emulation, states: pa.Table) -> RecordedTables:
+def _recorded(emulation: Emulation, states: pa.Table) -> RecordedRun:
     """Return the states of a run as those of its folder."""
     nothing, world = pa.table({}), RecordedWorld.of(emulation.world)
-    return RecordedTables(emulation.scenario, nothing, states, nothing, (), world=world)
+    return RecordedRun(emulation.scenario, nothing, states, nothing, (), world=world)
 
 
-def _bound(recorded: RecordedTables) -> BoundSeries | None:
+def _bound(recorded: RecordedRun) -> BoundSeries | None:
     """Return the errors of the hears-all bound; None if the run has no such bound."""
     try:
         return bound_of(recorded)

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.radio.connectivity import component_links
-from emulator.records.recorded_tables import RecordedTables
+from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import components
 from vnet.cmm.kalman_bound import KalmanBound, LaneModel, MultipathLaneModel
@@ -175,7 +175,7 @@ def _rms(values: Array) -> float | None:
     return None if mean is None else math.sqrt(mean)
 
 
-def bound_of(recorded: RecordedTables) -> BoundSeries:
+def bound_of(recorded: RecordedRun) -> BoundSeries:
     """Return the errors of the bound of a recorded run. Raises VnetError with the reason if it has none.
 
     Of the states the columns of `COLUMNS` are needed.
@@ -203,7 +203,7 @@ def bound_of(recorded: RecordedTables) -> BoundSeries:
     return _series(filters, scenario.period_ns / NS_PER_S, recorded, reported)
 
 
-def _series(filters: HearsAll, dt_s: float, recorded: RecordedTables, reported: Mask) -> BoundSeries:
+def _series(filters: HearsAll, dt_s: float, recorded: RecordedRun, reported: Mask) -> BoundSeries:
     """Run the filters over all periods; `reported` (K, N) are the reports that count."""
     fix_m, position_m, common_m = (recorded.vectors(name) for name in ("fix_m", "position_m", "common_error_m"))
     periods = len(fix_m)
