@@ -16,7 +16,7 @@ from emulator.records.busy import busy_windows, mean_busy
 from emulator.records.events import Event
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.records.run_files import check_is_run
+from emulator.records.run_folder import check_is_run
 from emulator.records.run_tables import StatesReader, TraceReader
 from emulator.records.tables import BACKGROUND, BUSY, STATES
 from emulator.stream.messages import event_message, period_message, scene_message

@@ -361,7 +361,7 @@ def repair(path: Path) -> Path:
         raise VnetError(f"{path}: was not closed, and cannot be repaired: {last}")
     repaired = repaired_path(path)
     if _is_empty(repaired):
-        from emulator.records.run_files import check_is_finished  # tables are slow to import
+        from emulator.records.run_folder import check_is_finished
 
         repaired.unlink()
         check_is_finished(path.parent)

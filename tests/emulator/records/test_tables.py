@@ -18,7 +18,7 @@ from vnet.errors import VnetError
 TYRES = Table(
     "tyres",
     "a row for each vehicle",
-    {"node": Column(TEXT, "id of the vehicle"), "wear_m": Column(FLOAT, "how much of the tread is gone", True)},
+    {"node": Column(TEXT, "id of the vehicle"), "wear_m": Column(FLOAT, "how much of the rubber is gone", True)},
     which=", where roads are rough",
     is_due=lambda scenario: scenario.run.name == "rough",
 )
@@ -53,7 +53,7 @@ def test_a_table_is_added_by_its_declaration(tmp_path: Path, monkeypatch: pytest
     finally:
         TABLES.remove(TYRES)
     assert "| `tyres.parquet` | [a row for each vehicle](#tyresparquet), where roads are rough |" in text
-    assert "| `wear_m` | `double` | m | how much of the tread is gone |" in text
+    assert "| `wear_m` | `double` | m | how much of the rubber is gone |" in text
 
 
 def test_a_gap_and_a_wrong_type_are_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
