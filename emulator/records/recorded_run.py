@@ -45,7 +45,7 @@ from emulator.records.run_folder import (
     not_finished,
 )
 from emulator.records.run_tables import VALUES_AS_LIST, StatesReader, TableFile, TraceReader, open_table
-from emulator.records.tables import BUSY, METRICS, PAYLOADS, STATES, TRACE, Table
+from emulator.records.tables import BUSY, METRICS, PAYLOADS, STATES, TRACE, Condition, Table, always
 from emulator.records.verdict_file import Record, read_record
 from emulator.records.verdicts import MOST_ROWS
 from emulator.scenario.fault_families import ProcessFault, SenderFault
@@ -695,7 +695,7 @@ class OpenedRun(RecordedRun):
     def table(self, kind: Table) -> pa.Table | None:
         """Return a table; None if the run has none of this kind."""
         if kind not in self._tables:
-            there = (self.folder / kind.file).is_file() if kind.is_due is None else kind.is_due(self.scenario)
+            there = (self.folder / kind.file).is_file() if kind.is_due is None else self._holds(kind.is_due)
             self._tables[kind] = self._read_table(kind) if there else None
         return self._tables[kind]
 
@@ -753,6 +753,9 @@ class OpenedRun(RecordedRun):
         except (ValueError, pa.ArrowException) as error:
             raise VnetError(f"{path}: cannot be read: {printable(' '.join(str(error).split()), 300)}") from None
 
+    def _holds(self, condition: Condition) -> bool:
+        return condition is always or condition(self.scenario)
+
     def _read_table(self, kind: Table) -> pa.Table:
         """Return a table with the types that it must have."""
         path = self.folder / kind.file
@@ -772,7 +775,7 @@ class OpenedRun(RecordedRun):
         for name in wanted or kind.columns:
             column = kind.columns[name]
             found = name in kept.names and kept.field(name).type == column.type
-            if not found and column.is_due(self.scenario):
+            if not found and self._holds(column.is_due):
                 raise VnetError(f"{path}: has no column {name!r} of {column.type}")
         table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
         for name in table.column_names:

@@ -17,7 +17,8 @@ from emulator.scenario.scenario import Scenario
 Condition = Callable[[Scenario], bool]
 
 
-def _always(scenario: Scenario) -> bool:
+def always(scenario: Scenario) -> bool:
+    """Hold for every run; readers then need no scenario."""
     return True
 
 
@@ -36,7 +37,7 @@ class Column:
     type: pa.DataType
     text: str
     has_gaps: bool = False
-    is_due: Condition = _always
+    is_due: Condition = always
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ class Table:
     rows: str
     columns: Mapping[str, Column]
     which: str = ""
-    is_due: Condition | None = _always
+    is_due: Condition | None = always
     about: str = ""
     further: str = ""
     fields_of: type | None = None
