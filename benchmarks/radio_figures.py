@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from emulator.checks.judge import RecordedRun
 from emulator.records.radio_metrics import radio_metrics
-from emulator.records.states import STATES
+from emulator.records.tables import STATES
 from emulator.scenario.scenario import Scenario
 
 PERIOD_NS = 100_000_000
@@ -33,7 +33,7 @@ def large(links: int, frames: int) -> RecordedRun:
         "copy": pa.array(np.zeros(rows, np.int16)),
     }
     states = [{"period": 0, "time_ns": 0, "node": name} for name in names.to_pylist()]
-    table = pa.Table.from_pylist(states, schema=STATES)
+    table = pa.Table.from_pylist(states, schema=STATES.schema)
     return RecordedRun(Scenario(), pa.table(columns), table, pa.table({}), [], rng.uniform(0, 3000, (1, count, 2)))
 
 

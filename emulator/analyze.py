@@ -24,7 +24,7 @@ from emulator.linear_model import convergence_factor, deviation_covariance
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.topology import Topology
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import METRICS_FILE
+from emulator.records.tables import METRICS
 from emulator.scenario.lookahead import lookahead_ns
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
@@ -102,7 +102,7 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
     `noise_m` is, by rule, the noise per axis and round with which the linear model deviates as much.
     """
-    recorded = RecordedRun.open(run, {METRICS_FILE: ["deviation_m"]})
+    recorded = RecordedRun.open(run, {METRICS: ["deviation_m"]})
     values = recorded.metrics["deviation_m"].to_pylist()
     settled = [value for value in values[len(values) // 5 :] if value is not None]
     if not settled:

@@ -4,25 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-import numpy as np
 import pyarrow as pa
 
 from docs.generate.markdown import attribute_docstrings, docstring, table
 from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
-from emulator.radio.trace import Trace
-from emulator.records.backbone_table import BACKBONE
-from emulator.records.background_table import BACKGROUND
-from emulator.records.busy import busy_table
-from emulator.records.driven_table import driven_table
 from emulator.records.events import EventKind
-from emulator.records.metrics import METRICS
-from emulator.records.payloads import PAYLOADS
-from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import ARRAYS
-from emulator.records.reported import MOST_COLUMNS
-from emulator.records.states import STATES
-from emulator.world.driven.vehicles import Log
+from emulator.records.tables import TABLES, Table
 from vnet.units import unit_of
 
 INTRODUCTION = """
@@ -36,15 +25,6 @@ give the same results on another machine, without the run's input files, its pro
 """
 FOLDER = {
     "scenario.toml": "[the scenario](#scenariotoml) with every default and digests of what it read; it runs again",
-    "trace.parquet": "[a row for each frame and receiver in range](#traceparquet)",
-    "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
-    "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
-    "driven.parquet": "[a row for each control instant and vehicle](#drivenparquet), where programs drive",
-    "backbone.parquet": "[a row for each message and receiver](#backboneparquet), where there are roadside units",
-    "background.parquet": "[a row for each period and vehicle without a program](#backgroundparquet), with "
-    "[SUMO in the loop](../how-to/sumo-in-the-loop.md)",
-    "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
-    "payloads.parquet": "[a row for each frame](#payloadsparquet), with `run.keep_payloads`",
     "tape.jsonl": "where [the order of events](../orders.md) was not FIFO, with `run.order` or `run.tape`",
     "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
@@ -72,18 +52,6 @@ Two sections are not the scenario's own: they hold SHA-256 of what the run has r
   If either has changed, `vnet run FOLDER/scenario.toml` says so in one line, records it (the event `code_changed`,
   and the new digests), and goes on. The hash of the trace does not depend on them.
 """
-CHOICES = """
-Where programs have [chosen powers or bit rates](../radio.md#power-and-bit-rate-of-a-frame), there are two more:
-`gain_db`, the power of the frame above that of the scenario, and `bitrate_mbps`.
-
-Where programs have sent [frames to single vehicles](../radio.md#frames-to-one-vehicle), each transmission of such
-a frame has one row, that of its addressee, with another `copy`, and there are three more columns: `attempt`, the
-number of the transmission (0 for a broadcast), `ack_on_air_ns`, the start of the acknowledgement (null without
-one), and `acked`, whether the sender received that.
-
-Where, in real time, the machine delivered over 20 ms late, `arrival_ns` is when the packet came, and there is one
-more column, `late_ns`, the machine's part of it; the radio's own arrival is `arrival_ns - late_ns`.
-"""
 WORLD_ABOUT = """
 An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.
 """
@@ -101,22 +69,6 @@ FORMATS = """
 
 A folder of a later format is refused, with the version of vnet that wrote it.
 """
-TRACE = {
-    "sent_ns": "when the program handed it to the radio",
-    "sender": "id of the vehicle",
-    "seq": "number of the frame, of this sender, from 0",
-    "receiver": "id of the vehicle",
-    "size_bytes": "length of the payload",
-    "payload_digest": "BLAKE2b of what arrives, 8 bytes, little-endian",
-    "outcome": "[what became of it](#outcomes)",
-    "cause": "the fault behind an outcome `fault`, a copy or changed bytes, as `loss-0`; else empty",
-    "arrival_ns": "when it arrived; null if it did not",
-    "copy": "0; 1, 2, … for what a fault sends, or lets arrive, again",
-    "on_air_ns": "with `[radio.mac]` only: when its transmission began; null if it never did",
-    "left_ns": "with `[radio.mac]` only: when its transmission ended, or it was given up",
-    "rssi_dbm": "with `[radio.path_loss]` only: received power; null if the frame was never on air",
-    "snr_db": "with `[radio.path_loss]` only: received power over noise and interference, the mean of the payload",
-}
 WORLD = {
     "node_ids": "ids of the vehicles, in the order of the scenario's network and of the tables' rows",
     "position_m": "positions at time 0; NaN of a vehicle that is not there yet",
@@ -134,65 +86,6 @@ WORLD = {
     "building_number": "the building to which each ring belongs; courts are rings of their own",
     "receiver_m": "with a recorded common error of several receivers only: what each has beyond the common error",
 }
-PAYLOAD = {
-    "time_ns": "when the program handed it to the radio",
-    "sender": "id of the vehicle",
-    "seq": "number of the frame, as in the trace",
-    "payload": "what the program sent; faults may let something else arrive",
-}
-BUSY = {
-    "time_ns": "when the 100 ms began",
-    "node": "id of the vehicle",
-    "busy_ratio": "the share of them in which it sent, or sensed `radio.mac.carrier_sense_dbm` or more",
-}
-DRIVEN = {
-    "time_ns": "the control instant",
-    "node": "id of the vehicle",
-    "along_m": "truth: position of its centre along the road, or on a map its route; on a ring it goes on "
-    "counting. NaN once it has left. In SUMO the way since it was inserted",
-    "left_m": "truth: its distance to the left of the rightmost lane's centre; in SUMO of its own lane's",
-    "speed_m_s": "truth: its speed",
-    "acceleration_m_s2": "truth: its acceleration",
-    "command_m_s2": "the acceleration that it was told from this instant on, within its limits; NaN if SUMO drives",
-}
-IN_BACKGROUND = {
-    "time_ns": "the start of the period",
-    "vehicle": "its id in SUMO",
-    "x_m": "truth: east of the middle of its front bumper",
-    "y_m": "truth: north of it",
-}
-ON_BACKBONE = {
-    "sent_ns": "when it was sent",
-    "sender": "id of the roadside unit that has sent it",
-    "number": "counts the messages of the sender, from 0",
-    "receiver": "id of a unit that it was meant for",
-    "size_bytes": "length of the payload",
-    "payload_digest": "as in the trace",
-    "arrival_ns": "when it arrived, or would have; null if it was lost",
-    "outcome": "`delivered`, `loss`, `receiver_down`, or `in_flight` at the end of the run",
-}
-STATE = {
-    "period": "counts from 0",
-    "time_ns": "start of the period",
-    "node": "id of the vehicle",
-    "position_m": "truth; NaN of a vehicle that is not there",
-    "heading_rad": "truth, counter-clockwise from east; NaN of one that is not there, or that nobody knows",
-    "fix_m": "what the receiver gave; NaN in an outage",
-    "common_error_m": "truth: the error that all receivers share",
-    "estimate_m": "the position that the vehicle reported last in this period; null if it reported none",
-    "covariance_m2": "of `estimate_m`, as it reported: a 2 × 2 matrix by rows",
-    "common_error_estimate_m": "`common_error_m` of its report",
-    "common_error_covariance_m2": "of its report: a 2 × 2 matrix by rows",
-    "mean_m": "of its report: what it takes for the mean of all estimates of the common error",
-    "stacked_common_error_m": "of its report: the common error right after fusion, before the map",
-    "cloud_m": "of its report: some hypotheses of the common error, x and y in turns",
-    "values": "what it reported besides and has no column, by name: lists, and weights of a fusion (`weight.v03`)",
-}
-STATES_ABOUT = (
-    "Then a column for each number (`double`), boolean (`bool`) or text (`string`) that programs report by a name "
-    "of their own, called as they call it: [own figures](../how-to/own-figures.md). Those after the first "
-    f"{MOST_COLUMNS} names stay in `values`."
-)
 VERDICT = {
     "format": "version of the folder, [3](#formats)",
     "verdict": "`valid`, `invalid` or `unknown`",
@@ -227,29 +120,16 @@ VERDICT = {
 
 def page() -> str:
     """The whole page. Raises LookupError where a text is missing, or speaks of what is not there."""
-    trace = Trace(["v01"], knows_air=True, knows_power=True).to_table().schema
-    parts = [INTRODUCTION, table(["file", "what"], ([f"`{name}`", what] for name, what in FOLDER.items()))]
-    parts += [
-        "## `trace.parquet`",
-        "In the order of `sent_ns`, sender, `seq`, receiver, `copy`.",
-        columns(trace, TRACE),
-    ]
-    parts.append(CHOICES)
-    parts += ["### Outcomes", "Each pair of a frame and a receiver has exactly one."]
+    tables = {each.file: f"[{each.rows}](#{each.name}parquet){each.which}" for each in TABLES}
+    rows = ([f"`{name}`", what] for name, what in (tables | FOLDER).items())
+    parts = [INTRODUCTION, table(["file", "what"], rows)]
+    for each in TABLES:
+        about = docstring(each.fields_of) if each.fields_of else each.about
+        parts += [f"## `{each.file}`", about, columns(each), each.further]
+    parts += ["## Outcomes", "Each pair of a frame and a receiver has exactly one."]
     public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
     parts += ["## `scenario.toml`", SCENARIO, "## `world.npz`", WORLD_ABOUT, table(WORLD_COLUMNS, world_rows())]
-    parts += ["## `states.parquet`", columns(STATES, STATE), STATES_ABOUT]
-    parts += ["## `payloads.parquet`", "No hash depends on it.", columns(PAYLOADS, PAYLOAD)]
-    parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
-    parts += ["## `driven.parquet`", columns(driven_table(Log(), ["v01"]).schema, DRIVEN)]
-    parts += ["## `backbone.parquet`", columns(BACKBONE, ON_BACKBONE)]
-    parts += ["## `background.parquet`", "No hash depends on it.", columns(BACKGROUND, IN_BACKGROUND)]
-    parts += [
-        "## `metrics.parquet`",
-        docstring(PeriodFigures),
-        columns(METRICS, attribute_docstrings(PeriodFigures)),
-    ]
     parts += [
         "## `events.jsonl`",
         "Each line is an object with `time_ns`, `kind`, `node` (or null) and what is named here.",
@@ -271,12 +151,12 @@ def world_rows() -> list[list[str]]:
     ]
 
 
-def columns(schema: pa.Schema, said: Mapping[str, str]) -> str:
-    """The columns of a table with their types and units. Raises LookupError where the texts do not fit them."""
-    _check_texts("column", schema.names, said)
-    rows = (
-        [f"`{field.name}`", f"`{_type(field.type)}`", unit_of(field.name), said[field.name]] for field in schema
-    )
+def columns(of: Table) -> str:
+    """The columns of a table with their types, units and texts. Raises LookupError where a text is missing."""
+    said = {name: column.text for name, column in of.columns.items()}
+    said |= attribute_docstrings(of.fields_of) if of.fields_of else {}
+    _check_texts("column", of.columns, {name: text for name, text in said.items() if text})
+    rows = ([f"`{n}`", f"`{_type(c.type)}`", unit_of(n), said[n]] for n, c in of.columns.items())
     return table(["column", "type", "unit", "what"], rows)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from emulator.records.distributions import chi2_quantiles
 from emulator.records.divergence import DIVERGENT_SIGMAS, first_divergences
-from emulator.records.recorded_tables import RecordedTables
+from emulator.records.recorded_run import RecordedRun
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
@@ -25,7 +25,7 @@ CONVERGED_S = 5.0
 """… for so long on end."""
 
 
-def consistency_figures(recorded: RecordedTables, from_s: float) -> dict[str, Any]:
+def consistency_figures(recorded: RecordedRun, from_s: float) -> dict[str, Any]:
     """Return figures of the states of a run from `from_s` on; None where nothing was reported.
 
     median_error_m, median_position_error_m: medians over vehicles and periods. median_anees: that of the normalized
@@ -57,7 +57,7 @@ def consistency_figures(recorded: RecordedTables, from_s: float) -> dict[str, An
     }
 
 
-def others_figures(recorded: RecordedTables, from_s: float) -> dict[str, Any]:
+def others_figures(recorded: RecordedRun, from_s: float) -> dict[str, Any]:
     """Return figures from `from_s` on of the vehicles that run the scenario's program; none where all do.
 
     others_rmse_m, others_position_rmse_m: roots of mean squares over vehicles and periods. others_anees: mean of

@@ -13,7 +13,7 @@ from emulator.cells.consistency import consistency_figures, others_figures
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
-from emulator.records.recorded_tables import RecordedTables
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reference import after, reference_series
 from emulator.records.reported import reported_figures
@@ -109,13 +109,13 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
     return figures, metrics
 
 
-def _recorded(emulation: Emulation, states: pa.Table) -> RecordedTables:
+def _recorded(emulation: Emulation, states: pa.Table) -> RecordedRun:
     """Return the states of a run as those of its folder."""
     nothing, world = pa.table({}), RecordedWorld.of(emulation.world)
-    return RecordedTables(emulation.scenario, nothing, states, nothing, (), world=world)
+    return RecordedRun(emulation.scenario, nothing, states, nothing, (), world=world)
 
 
-def _reference(recorded: RecordedTables) -> dict[str, Array]:
+def _reference(recorded: RecordedRun) -> dict[str, Array]:
     """Return the figures of a run's reference in each period; none if it has no reference."""
     try:
         return reference_series(recorded)

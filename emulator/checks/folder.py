@@ -28,7 +28,8 @@ from emulator.records.period_figures import PeriodFigures
 from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
-from emulator.records.run_folder import MANIFEST_FILE, PAYLOADS_FILE, VERDICT_FILE
+from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
+from emulator.records.tables import BACKBONE, DRIVEN, PAYLOADS
 from emulator.records.verdicts import (
     MOST_ROWS,
     CheckResult,
@@ -100,8 +101,8 @@ def verdict_figures(recorded: RecordedRun, rows: Sequence[PeriodFigures]) -> dic
         "roadside_units": len(scenario.roadside),
         "packet_delivery_ratio": delivery_ratio(recorded),
         "figures": summarize(rows),
-        "driving": driving_figures(recorded.driven, recorded.events),
-        "backbone": backbone_figures(recorded.backbone),
+        "driving": driving_figures(recorded.table(DRIVEN), recorded.events),
+        "backbone": backbone_figures(recorded.table(BACKBONE)),
         "reported": {name: asdict(figure) for name, figure in reported_figures(recorded.states).items()},
     }
 
@@ -294,7 +295,7 @@ FOLDER_CHECKS = (
     FolderCheck(
         "payloads",
         check_payloads,
-        f"`{PAYLOADS_FILE}` has the payload of each frame of the trace, by its digest.",
+        f"`{PAYLOADS.file}` has the payload of each frame of the trace, by its digest.",
         "another payload, or none",
         "a run without `run.keep_payloads`, or with faults that change what is sent or received",
     ),

@@ -22,7 +22,8 @@ from emulator.records.metrics import rows_of, sha256_of_rows
 from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.recorded_world import ARRAYS, RecordedWorld
-from emulator.records.run_folder import BUSY_FILE, STATES_FILE, WORLD_FILE
+from emulator.records.run_folder import WORLD_FILE
+from emulator.records.tables import BUSY, STATES
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result
 from emulator.scenario.fault_families import OwnRule, SenderFault
 from emulator.scenario.faults import StaleMessages
@@ -137,7 +138,7 @@ def check_truth(recorded: OpenedRun) -> Finding:
     ours, theirs = recorded.world, RecordedWorld.of(world)
     wrong = [{"file": WORLD_FILE, "column": each} for each in ARRAYS if not _same_array(ours, theirs, each)]
     if recorded.node_ids and list(world.node_ids) != recorded.node_ids:
-        wrong.append({"file": STATES_FILE, "column": "node"})
+        wrong.append({"file": STATES.file, "column": "node"})
     else:
         wrong += _wrong_states(recorded, FaultyGnss(world, recorded.plan, scenario.run.seed), recorded.periods)
     text = f"{counted(recorded.periods, 'period')} of {counted(vehicles, 'node')} as the scenario gives them"
@@ -168,7 +169,7 @@ def _wrong_states(recorded: RecordedRun, gnss: FaultyGnss, periods: int) -> list
             theirs = np.broadcast_to(getattr(instant, name), ours.shape)
             same = same_numbers(ours, theirs, TOLERANCE_M).reshape(len(ours), -1).all(axis=1)
             for node in np.flatnonzero(~same)[: MOST_ROWS - len(wrong)].tolist():
-                row = {"file": STATES_FILE, "column": name, "period": period, "node": recorded.node_ids[node]}
+                row = {"file": STATES.file, "column": name, "period": period, "node": recorded.node_ids[node]}
                 wrong.append({**row, "kept": ours[node].tolist(), "computed": theirs[node].tolist()})
         if len(wrong) >= MOST_ROWS:
             break
@@ -206,11 +207,11 @@ def _wrong_busy_ratios(recorded: RecordedRun, engine: Engine) -> list[dict[str, 
     computed = np.array(engine.busy_ratios(recorded.periods * recorded.scenario.period_ns)).reshape(
         -1, kept.shape[1]
     )
-    if recorded.busy is None or (len(kept) == len(computed) and same_numbers(kept, computed).all()):
+    if recorded.table(BUSY) is None or (len(kept) == len(computed) and same_numbers(kept, computed).all()):
         return []
     shared = min(len(kept), len(computed))
     windows = np.flatnonzero(~same_numbers(kept[:shared], computed[:shared]).all(axis=1))
-    return [{"trace": BUSY_FILE, "window": int(windows[0]) if len(windows) else shared}]
+    return [{"trace": BUSY.file, "window": int(windows[0]) if len(windows) else shared}]
 
 
 def _why_not_decided_again(recorded: RecordedRun) -> str:

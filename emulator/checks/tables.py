@@ -12,7 +12,7 @@ from emulator.records.events import Event, EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import is_text
 from emulator.records.run_tables import VALUES_AS_LIST
-from emulator.records.states import STATES
+from emulator.records.tables import STATES
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result
 from emulator.scenario.fault_families import ProcessFault
 from vnet.counted import counted
@@ -121,7 +121,7 @@ def _names(recorded: RecordedRun) -> list[str]:
     """Return the names of all values that were reported."""
     lists = recorded.states["values"].combine_chunks().cast(VALUES_AS_LIST)
     keys = pc.unique(pc.struct_field(lists.flatten(), "key")).to_pylist()
-    columns = [name for name in recorded.states.column_names if name not in STATES.names]
+    columns = [name for name in recorded.states.column_names if name not in STATES.columns]
     return [*columns, *(str(key) for key in keys)]
 
 

@@ -21,8 +21,7 @@ from emulator.cli.options import (
     RunArgument,
 )
 from emulator.drivers.control import read_control_file
-from emulator.records.run_files import check_is_finished, check_is_run
-from emulator.records.run_folder import RECORDING
+from emulator.records.run_folder import RECORDING, check_is_finished, check_is_run
 from emulator.terminal.console import one_line_errors
 from emulator.viewer.sinks import (
     choose_sinks,

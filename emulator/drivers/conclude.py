@@ -29,20 +29,13 @@ from emulator.records.node_files import collect
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run import Run
 from emulator.records.run_folder import (
-    BACKBONE_FILE,
-    BACKGROUND_FILE,
-    BUSY_FILE,
-    DRIVEN_FILE,
     FORMAT,
-    METRICS_FILE,
-    PAYLOADS_FILE,
-    STATES_FILE,
-    TRACE_FILE,
     VERDICT_FILE,
     WORLD_FILE,
     RunFolder,
     write_text,
 )
+from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised
 from vnet.runtime.environment import arithmetic
@@ -69,11 +62,14 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
         emulation.metrics.states_table(),
         emulation.metrics.metrics_table(),
         folder.events,
-        busy=_busy(emulation),
-        driven=emulation.driving.table(),
-        backbone=emulation.backbone.table(),
-        background=emulation.driving.background(),
         world=RecordedWorld.of(emulation.world),
+        more={
+            BUSY: _busy(emulation),
+            DRIVEN: emulation.driving.table(),
+            BACKBONE: emulation.backbone.table(),
+            BACKGROUND: emulation.driving.background(),
+            PAYLOADS: None if emulation.payloads is None else emulation.payloads.to_table(),
+        },
     )
 
 
@@ -145,19 +141,9 @@ def _put_tables(emulation: Emulation, recorded: RecordedRun) -> None:
     folder.complete_events()
     if recorded.world is not None:
         folder.keep(WORLD_FILE, recorded.world.write)
-    tables = {  # the largest come last: on a full disk the others are kept
-        METRICS_FILE: recorded.metrics,
-        STATES_FILE: recorded.states,
-        BUSY_FILE: recorded.busy,
-        DRIVEN_FILE: recorded.driven,
-        BACKBONE_FILE: recorded.backbone,
-        BACKGROUND_FILE: recorded.background,
-        TRACE_FILE: recorded.trace,
-        PAYLOADS_FILE: None if emulation.payloads is None else emulation.payloads.to_table(),
-    }
-    for name, table in tables.items():
-        if table is not None:
-            folder.keep_table(name, table)
+    tables = {kind: table for kind in TABLES if (table := recorded.table(kind)) is not None}
+    for kind in sorted(tables, key=lambda kind: tables[kind].nbytes):  # on a full disk the smaller ones are kept
+        folder.keep_table(kind.file, tables[kind])
     if emulation.orders.explores:
         tape = dump_tape(emulation.orders.in_order())
         folder.keep(TAPE_FILE, lambda path: write_text(path, tape))

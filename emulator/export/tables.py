@@ -12,6 +12,7 @@ import pyarrow.csv as pacsv
 
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import OpenedRun
+from emulator.records.tables import TABLES
 
 AXES = {2: ("x", "y"), 4: ("xx", "xy", "yx", "yy")}
 """Suffixes of the columns of a list by its length."""
@@ -24,23 +25,9 @@ def write_csv(recorded: OpenedRun, folder: Path) -> list[str]:
         for e in recorded.events
     ]
     figures = radio_metrics(recorded)
-    tables = {
-        "trace": recorded.trace,
-        "states": recorded.states,
-        "metrics": recorded.metrics,
-        "events": pa.Table.from_pylist(events),
-        "links": figures.links,
-        "vehicles": figures.vehicles,
-        "distances": figures.distances,
-    }
-    if recorded.busy is not None:
-        tables["busy"] = recorded.busy
-    if recorded.driven is not None:
-        tables["driven"] = recorded.driven
-    if recorded.payloads is not None:
-        kept = recorded.payloads.table
-        payloads = pa.array([payload.hex() for payload in kept["payload"].to_pylist()], pa.string())
-        tables["payloads"] = kept.set_column(kept.column_names.index("payload"), "payload_hex", payloads)
+    tables = {kind.name: table for kind in TABLES if (table := recorded.table(kind)) is not None}
+    tables["events"] = pa.Table.from_pylist(events)
+    tables |= {"links": figures.links, "vehicles": figures.vehicles, "distances": figures.distances}
     for name, table in tables.items():
         pacsv.write_csv(flat(table), folder / f"{name}.csv")
     return [f"{name}.csv" for name in tables]
@@ -60,6 +47,8 @@ def _flat_columns(table: pa.Table) -> Iterator[tuple[str, pa.Array]]:
         elif pa.types.is_fixed_size_list(kind) and kind.list_size in AXES:
             for index, axis in enumerate(AXES[kind.list_size]):
                 yield f"{name}_{axis}", pc.list_element(column, index)
+        elif pa.types.is_large_binary(kind):
+            yield f"{name}_hex", pa.array([entry.hex() for entry in column.to_pylist()], pa.string())
         elif pa.types.is_nested(kind):
             texts = (None if entry is None else json.dumps(_plain(entry)) for entry in column.to_pylist())
             yield name, pa.array(texts, pa.string())

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from emulator.records.tables import BACKBONE
+
 
 class BackboneRow(NamedTuple):
     """Outcome of a message at one receiver; `arrival_ns` is None if it was lost."""
@@ -22,27 +24,11 @@ class BackboneRow(NamedTuple):
     outcome: str
 
 
-BACKBONE = pa.schema(
-    [
-        ("sent_ns", pa.int64()),
-        ("sender", pa.string()),
-        ("number", pa.int64()),
-        ("receiver", pa.string()),
-        ("size_bytes", pa.int64()),
-        ("payload_digest", pa.uint64()),
-        ("arrival_ns", pa.int64()),
-        ("outcome", pa.string()),
-    ]
-)
-
-
 def backbone_table(rows: Sequence[BackboneRow]) -> pa.Table:
     """Return a row for each message and receiver, in the order of sending, sender, number and receiver."""
     in_order = sorted(rows, key=lambda row: row[:4])
-    columns = zip(*in_order, strict=True) if in_order else [[]] * len(BACKBONE)
-    return pa.table(
-        [pa.array(column, field.type) for column, field in zip(columns, BACKBONE, strict=True)], BACKBONE
-    )
+    columns = zip(*in_order, strict=True) if in_order else [[]] * len(BACKBONE.columns)
+    return pa.table(list(map(pa.array, columns, BACKBONE.schema.types)), BACKBONE.schema)
 
 
 def backbone_figures(table: pa.Table | None) -> dict[str, int]:

@@ -5,17 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
+from emulator.records.tables import BACKGROUND
 from emulator.world.driven.background import Background
 from vnet.types import Array
-
-BACKGROUND = pa.schema(
-    [
-        ("time_ns", pa.int64()),
-        ("vehicle", pa.dictionary(pa.int32(), pa.string())),
-        ("x_m", pa.float64()),
-        ("y_m", pa.float64()),
-    ]
-)
 
 
 def background_table(background: Background | None) -> pa.Table | None:
@@ -32,7 +24,7 @@ def background_table(background: Background | None) -> pa.Table | None:
         pa.array(position_m[:, 0]),
         pa.array(position_m[:, 1]),
     ]
-    return pa.table(columns, BACKGROUND)
+    return pa.table(columns, BACKGROUND.schema)
 
 
 def positions_by_time(table: pa.Table | None) -> dict[int, Array]:

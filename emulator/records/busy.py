@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.radio.medium import WINDOW_NS
-from emulator.records.run_folder import BUSY_FILE
+from emulator.records.tables import BUSY
 from vnet.errors import VnetError
 from vnet.types import Array
 
@@ -23,7 +23,8 @@ def busy_table(windows: Array, node_ids: Sequence[str]) -> pa.Table:
             "time_ns": pa.array(np.repeat(np.arange(count, dtype=np.int64) * WINDOW_NS, len(node_ids))),
             "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
             "busy_ratio": pa.array(windows.ravel()),
-        }
+        },
+        BUSY.schema,
     )
 
 
@@ -35,7 +36,7 @@ def busy_windows(table: pa.Table | None, node_ids: Sequence[str]) -> Array:
     windows = len(table) // max(1, count)
     number = pc.index_in(table["node"].cast(pa.string()), value_set=pa.array(list(node_ids), pa.string()))
     if not np.array_equal(pc.fill_null(number, -1).to_numpy(), np.tile(np.arange(count), windows)):
-        raise VnetError(f"{BUSY_FILE}: its rows are not those of {count} vehicles, one window after the other")
+        raise VnetError(f"{BUSY.file}: its rows are not those of {count} vehicles, one window after the other")
     return np.asarray(table["busy_ratio"].cast(pa.float64()).to_numpy()).reshape(windows, count)
 
 

@@ -9,11 +9,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.records.events import Event, EventKind
+from emulator.records.tables import DRIVEN
 from emulator.world.driven.vehicles import Log
 from vnet.types import Array
 
-QUANTITIES = ("along_m", "left_m", "speed_m_s", "acceleration_m_s2", "command_m_s2")
-"""Columns besides time and vehicle, in the order of the log's rows."""
+_TIME, _NODE, *QUANTITIES = DRIVEN.columns
+"""The columns besides time and vehicle are in the order of the log's rows."""
 
 
 def driven_table(log: Log, node_ids: Sequence[str]) -> pa.Table:
@@ -27,7 +28,8 @@ def driven_table(log: Log, node_ids: Sequence[str]) -> pa.Table:
             "time_ns": pa.array(np.repeat(np.array(log.time_ns, dtype=np.int64), count)),
             "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
             **columns,
-        }
+        },
+        DRIVEN.schema,
     )
 
 

@@ -13,47 +13,30 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from emulator.records.run_folder import (
-    BACKBONE_FILE,
-    BACKGROUND_FILE,
-    BUSY_FILE,
-    DRIVEN_FILE,
     EVENTS_FILE,
     FILES,
     MANIFEST_FILE,
-    METRICS_FILE,
-    PAYLOADS_FILE,
     PROGRAMS_LOG,
     SCENARIO_FILE,
-    STATES_FILE,
-    TRACE_FILE,
     VERDICT_FILE,
     WORLD_FILE,
     RunFolder,
 )
+from emulator.records.tables import TABLES
 from emulator.records.tape import TAPE_FILE
 from vnet.bounded import open_regular, read_regular
 from vnet.errors import VnetError, printable
 
 LARGEST_BYTES = 1 << 26
-EVIDENCE = (
-    SCENARIO_FILE,
-    TRACE_FILE,
-    STATES_FILE,
-    METRICS_FILE,
-    BUSY_FILE,
-    DRIVEN_FILE,
-    BACKBONE_FILE,
-    BACKGROUND_FILE,
-    PAYLOADS_FILE,
-    WORLD_FILE,
-    TAPE_FILE,
-    EVENTS_FILE,
-    VERDICT_FILE,
-)
-"""Files by which a run is judged; those that are there stand in the manifest."""
 CHECKS_LOG = "logs/checks.log"
 """What checks of the user's own print, also when they judge a folder again."""
 _MANIFEST = TypeAdapter(dict[str, str])
+
+
+def _evidence() -> list[str]:
+    """Return the files by which a run is judged; those that are there stand in the manifest."""
+    tables = [table.file for table in TABLES]
+    return [SCENARIO_FILE, *tables, WORLD_FILE, TAPE_FILE, EVENTS_FILE, VERDICT_FILE]
 
 
 def write_manifest(folder: RunFolder) -> None:
@@ -106,7 +89,7 @@ def sha256_of(path: Path) -> str:
 
 def _names(folder: Path) -> Iterator[str]:
     """Yield the files of a folder that is complete, as the manifest names them."""
-    yield from (name for name in EVIDENCE if (folder / name).is_file())
+    yield from (name for name in _evidence() if (folder / name).is_file())
     for below in (folder / "logs", folder / FILES):
         for path in sorted(below.rglob("*")):
             if path.is_file() and not path.is_symlink() and path.name != PROGRAMS_LOG:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,8 @@ from numpy.typing import NDArray
 from emulator.records.distributions import chi2_quantiles
 from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of, vectors
 from emulator.records.reported import ValueColumns, figures_among
-from emulator.records.states import COMMON_VALUES, STATES
+from emulator.records.states import COMMON_VALUES
+from emulator.records.tables import METRICS, STATES
 from emulator.world.world import Instant
 from vnet.reports import Report, Value
 
@@ -27,7 +27,7 @@ ROWS_A_PIECE = 2048
 """Largest number of states kept as Python numbers, except for the rest of a period."""
 TRUTH = ("period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_m")
 """Columns of the states that reports have no part in."""
-REPORTED = tuple(name for name in STATES.names if name not in TRUTH)
+REPORTED = tuple(name for name in STATES.columns if name not in TRUTH)
 """The other columns of `STATES`."""
 
 
@@ -111,20 +111,22 @@ class Metrics:
         """Put the rows so far into a table: as Python's numbers they take up many times the room."""
         self._compute()
         if self._instants:
-            self._packed.append(pa.table({**_truth(self._instants, self._node_ids), **self._states}, schema=STATES))
+            columns = {**_truth(self._instants, self._node_ids), **self._states}
+            self._packed.append(pa.table(columns, STATES.schema))
         self._instants, self._states = [], {name: [] for name in REPORTED}
 
     def states_table(self) -> pa.Table:
         """A row for each node and period; the columns of `STATES`, then those of reported values."""
         if self._table is None:
             self._pack()
-            packed = pa.concat_tables(self._packed) if self._packed else STATES.empty_table()
+            packed = pa.concat_tables(self._packed) if self._packed else STATES.schema.empty_table()
             self._table = self._values.add_to(packed.unify_dictionaries())
         return self._table
 
     def metrics_table(self) -> pa.Table:
         """A row for each period; columns are the fields of `PeriodFigures`."""
-        return pa.table({name: [getattr(row, name) for row in self.rows] for name in METRICS.names}, schema=METRICS)
+        columns = {name: [getattr(row, name) for row in self.rows] for name in METRICS.columns}
+        return pa.table(columns, METRICS.schema)
 
     def sha256(self) -> str:
         """A hash of the metrics' content, bit by bit."""
@@ -138,7 +140,7 @@ def sha256_of_rows(rows: Sequence[PeriodFigures]) -> str:
 
 def rows_of(metrics: pa.Table) -> list[PeriodFigures]:
     """Return the rows of a table of metrics."""
-    return [PeriodFigures(**row) for row in metrics.select(METRICS.names).to_pylist()]
+    return [PeriodFigures(**row) for row in metrics.select(list(METRICS.columns)).to_pylist()]
 
 
 def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa.Array]:
@@ -158,15 +160,6 @@ def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa
         "heading_rad": pa.array(np.concatenate([instant.heading_rad for instant in instants])),
         **{name: pa.FixedSizeListArray.from_arrays(array.ravel(), 2) for name, array in points.items()},
     }
-
-
-_ARROW = {
-    "int": pa.int64(),
-    "float": pa.float64(),
-    "float | None": pa.float64(),
-    "list[float | None]": pa.list_(pa.float64()),
-}
-METRICS = pa.schema([(field.name, _ARROW[str(field.type)]) for field in fields(PeriodFigures)])
 
 
 def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:

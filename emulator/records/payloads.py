@@ -7,11 +7,7 @@ from collections.abc import Collection, Sequence
 import pyarrow as pa
 
 from emulator.radio.trace import payload_digest
-
-PAYLOADS = pa.schema(
-    {"time_ns": pa.int64(), "sender": pa.string(), "seq": pa.int64(), "payload": pa.large_binary()}
-)
-"""Columns of `payloads.parquet`: a row for each frame, in the order in which they were enqueued."""
+from emulator.records.tables import PAYLOADS
 
 
 class PayloadRecorder:
@@ -28,7 +24,9 @@ class PayloadRecorder:
     def to_table(self) -> pa.Table:
         """Return the rows of `payloads.parquet`."""
         times_ns, nodes, seqs, payloads = zip(*self._rows, strict=True) if self._rows else ((), (), (), ())
-        return pa.table([times_ns, [self._node_ids[node] for node in nodes], seqs, payloads], schema=PAYLOADS)
+        return pa.table(
+            [times_ns, [self._node_ids[node] for node in nodes], seqs, payloads], schema=PAYLOADS.schema
+        )
 
 
 class KeptPayloads:

@@ -6,26 +6,71 @@ out again from the scenario and the true positions, so that a run is judged from
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import shlex
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
+from emulator.radio.connectivity import connectivity_of
+from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Stage, decided_at
-from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with
-from emulator.records.recorded_tables import ARRIVED, ON_AIR, RecordedTables
-from emulator.records.run_files import Columns, RunFiles
+from emulator.radio.trace import ACKNOWLEDGED, LATE
+from emulator.records.busy import busy_windows
+from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events
+from emulator.records.payloads import KeptPayloads
+from emulator.records.period_figures import PeriodFigures
+from emulator.records.positions import Places
+from emulator.records.recorded_world import RecordedWorld
+from emulator.records.reported import numbers_of, value_columns
+from emulator.records.run_folder import (
+    EVENTS_FILE,
+    FORMAT,
+    SCENARIO_FILE,
+    VERDICT_FILE,
+    WORLD_FILE,
+    LaterFormatError,
+    check_is_run,
+    is_run_folder,
+    not_finished,
+)
+from emulator.records.run_tables import VALUES_AS_LIST, StatesReader, TableFile, TraceReader, open_table
+from emulator.records.tables import BUSY, METRICS, PAYLOADS, STATES, TRACE, Condition, Table, always
+from emulator.records.verdict_file import Record, read_record
+from emulator.records.verdicts import MOST_ROWS
 from emulator.scenario.fault_families import ProcessFault, SenderFault
 from emulator.scenario.faults import Range, Swizzle
-from vnet.types import IntArray, Mask
+from emulator.scenario.recorded import parse_recorded_scenario
+from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.toml import LARGEST_BYTES
+from emulator.world.link_table import LinkTable
+from emulator.world.links import load_links
+from emulator.world.radio_inputs import RadioInputs
+from emulator.world.world import build_world
+from vnet.bounded import read_regular
+from vnet.errors import ScenarioError, VnetError, printable
+from vnet.types import Array, IntArray, Mask
+from vnet.units import NS_PER_S
 
-__all__ = ["ARRIVED", "ON_AIR", "OpenedRun", "RecordedRun", "Span"]
+ARRIVED = decided_at(Stage.ARRIVAL)
+ON_AIR = decided_at(Stage.RECEPTION, Stage.ARRIVAL)
+"""Outcomes of receptions that get as far as the receiver's radio."""
+LARGEST_EVENTS_BYTES = 1 << 28
+SPARE_ROWS = 1_000_000
+"""Rows that every table may have, whatever verdict.json says."""
+Columns = Mapping[Table, Collection[str]]
+T = TypeVar("T")
+
 
 NO_FAULT, UNHEARD_OF = -1, -2
 END_OF_TIME_NS = np.iinfo(np.int64).max
@@ -49,8 +94,24 @@ class Span:
 
 
 @dataclass(frozen=True)
-class RecordedRun(RecordedTables):
-    """A run's tables, and what they mean together."""
+class RecordedRun:
+    """The scenario of a run, its tables as arrays, its events, and what they mean together."""
+
+    scenario: Scenario
+    trace: pa.Table
+    states: pa.Table
+    metrics: pa.Table
+    events: Sequence[Event]
+    known_m: Array | None = None
+    """True positions (periods, N, 2), where the states have not got them all."""
+    world: RecordedWorld | None = None
+    """world.npz."""
+    more: Mapping[Table, pa.Table | None] = field(default_factory=dict)
+    """Tables that only some runs have."""
+
+    def table(self, kind: Table) -> pa.Table | None:
+        """Return a table of the run; None if it has none of this kind."""
+        return {TRACE: self.trace, STATES: self.states, METRICS: self.metrics, **self.more}.get(kind)
 
     @staticmethod
     def open(folder: Path, columns: Columns | None = None) -> OpenedRun:
@@ -59,6 +120,309 @@ class RecordedRun(RecordedTables):
         Of the tables that `columns` names, only those columns are read.
         """
         return OpenedRun(folder, columns)
+
+    # Nodes and where they are.
+
+    @cached_property
+    def node_ids(self) -> list[str]:
+        """The nodes in the order of their numbers, which is that of the states' rows."""
+        first = self.states.filter(pc.equal(self.states["period"], 0))
+        return [str(node) for node in first["node"].to_pylist()]
+
+    @cached_property
+    def number(self) -> dict[str, int]:
+        """The number of each node."""
+        return {node: number for number, node in enumerate(self.node_ids)}
+
+    def number_of(self, node: str | None) -> int:
+        """The number of a node that trace or events name. Raises VnetError if the states do not know it."""
+        if node not in self.number:
+            raise VnetError(f"node {node!r} in trace or events: the states know only {len(self.number)} others")
+        return self.number[node]
+
+    @cached_property
+    def runs_the_program(self) -> Mask:
+        """The nodes (N,) that run the scenario's program; those of its exceptions may well report what is false."""
+        excepted = {node for exception in self.scenario.program.exceptions for node in exception.nodes}
+        return np.array([node not in excepted for node in self.node_ids], dtype=bool)
+
+    @property
+    def moves(self) -> bool:
+        """True if vehicles drive, enter and leave; else only their lateral offsets change."""
+        return self.scenario.network.moves
+
+    @cached_property
+    def topology_changes(self) -> bool:
+        """True if the vehicles in range of each other change during the run."""
+        return self.moves or isinstance(self.radio_inputs.links, LinkTable)
+
+    @cached_property
+    def places(self) -> Places:
+        """Positions of the vehicles. Raises ScenarioError if the scenario's links do not fit them."""
+        connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self.radio_inputs)
+        position_m = self.vectors("position_m") if self.known_m is None else self.known_m
+        some = position_m if self.moves else position_m[:1]
+        return Places(some, self.moves, self.scenario.period_ns, connectivity, self.scenario.duration_ns)
+
+    @cached_property
+    def radio_inputs(self) -> RadioInputs:
+        """Inputs of the radio from files, as they were recorded; no input file is read."""
+        radio, count = self.scenario.radio, len(self.node_ids)
+        recorded = RadioInputs() if self.world is None else self.world.radio_inputs
+        recorded = replace(recorded, units=self.scenario.roadside)
+        if radio.buildings is not None and recorded.buildings is None:
+            raise VnetError("[radio.buildings]: no buildings were recorded")
+        if not isinstance(radio.links, Path):
+            return replace(recorded, links=load_links(radio, self.node_ids))
+        links = recorded.links
+        if links is None or (not isinstance(links, LinkTable) and len(links) != count):
+            raise VnetError(f"radio.links = {str(radio.links)!r}: no links of {count} vehicles were recorded")
+        return recorded
+
+    @cached_property
+    def busy_ratio(self) -> Array:
+        """(windows, N), how busy each vehicle found the medium; no windows where senders share none."""
+        return busy_windows(self.table(BUSY), self.node_ids)
+
+    # The trace, column by column.
+
+    def column(self, name: str) -> IntArray:
+        """A column of whole numbers of the trace; -1 where there is none."""
+        column = pc.fill_null(self.trace[name], -1) if self.trace[name].null_count else self.trace[name]
+        return np.asarray(column.to_numpy(), dtype=np.int64)
+
+    def nodes(self, name: str) -> NDArray[np.intp]:
+        """A column of node ids of the trace as numbers."""
+        column = self.trace[name].combine_chunks()
+        code = np.array([self.number_of(node) for node in column.dictionary.to_pylist()], dtype=np.intp)
+        return np.asarray(code[column.indices.to_numpy()], dtype=np.intp)
+
+    @cached_property
+    def sender(self) -> NDArray[np.intp]:
+        """Sender of each row's frame."""
+        return self.nodes("sender")
+
+    @cached_property
+    def receiver(self) -> NDArray[np.intp]:
+        """Receiver of each row."""
+        return self.nodes("receiver")
+
+    @cached_property
+    def sent_ns(self) -> IntArray:
+        """Instant at which each row's frame was sent."""
+        return self.column("sent_ns")
+
+    @cached_property
+    def arrival_ns(self) -> IntArray:
+        """Instant of each row's arrival; -1 where the frame did not arrive."""
+        return self.column("arrival_ns")
+
+    @cached_property
+    def due_ns(self) -> IntArray:
+        """Instant of each row's arrival by the radio: in real time `arrival_ns` without the machine's part."""
+        if self.scenario.run.pacing != "realtime":
+            return self.arrival_ns
+        return self.arrival_ns - self._optional(LATE, 0)
+
+    @cached_property
+    def shares_air(self) -> bool:
+        """True if the trace tells when frames were on air."""
+        return "on_air_ns" in self.trace.column_names
+
+    @cached_property
+    def on_air_ns(self) -> IntArray:
+        """Begin of each row's transmission; -1 where it never began."""
+        return self.column("on_air_ns")
+
+    @cached_property
+    def airtime_ns(self) -> IntArray:
+        """Duration of each row's transmission, but for throttles."""
+        return airtimes_ns(self.scenario.radio, self.column("size_bytes"), self.bitrate_mbps)
+
+    @cached_property
+    def bitrate_mbps(self) -> Array:
+        """Bit rate of each row's frame in Mbit/s."""
+        return self._chosen("bitrate_mbps", self.scenario.radio.bitrate_mbps)
+
+    @cached_property
+    def gain_db(self) -> Array:
+        """Power of each row's frame above the scenario's in dB."""
+        return self._chosen("gain_db", 0.0)
+
+    def _chosen(self, name: str, default: float) -> Array:
+        """Return a column that the trace has where programs choose, or else the default."""
+        if name not in self.trace.column_names:
+            return np.full(len(self.trace), default)
+        return np.asarray(self.trace[name].to_numpy(), dtype=np.float64)
+
+    @cached_property
+    def attempt(self) -> IntArray:
+        """Number of the transmission of a frame to a single vehicle, from 1 on; 0 for broadcasts."""
+        return self._optional("attempt", 0)
+
+    @cached_property
+    def ack_on_air_ns(self) -> IntArray:
+        """Begin of the acknowledgement of each row's frame; -1 without one."""
+        return self._optional("ack_on_air_ns", -1)
+
+    @cached_property
+    def acked(self) -> Mask:
+        """Mask of the rows whose frame's sender received an acknowledgement."""
+        return self._optional("acked", 0) > 0
+
+    def _optional(self, name: str, default: int) -> IntArray:
+        """Return a column that only some traces have, or else the default."""
+        if name not in self.trace.column_names:
+            return np.full(len(self.trace), default)
+        return np.asarray(pc.fill_null(self.trace[name].cast(pa.int64()), default).to_numpy(), np.int64)
+
+    @cached_property
+    def seq(self) -> IntArray:
+        """Sequence number of each row's frame."""
+        return self.column("seq")
+
+    @cached_property
+    def copy(self) -> IntArray:
+        """0, or the number of the copy."""
+        return self.column("copy")
+
+    @cached_property
+    def digest(self) -> NDArray[np.uint64]:
+        """The digest of what arrives."""
+        return np.asarray(self.trace["payload_digest"].to_numpy(), dtype=np.uint64)
+
+    @cached_property
+    def arrived(self) -> Mask:
+        """Mask of the rows whose frame came as far as its receiver."""
+        return self.outcome_is(*ARRIVED)
+
+    def outcome_is(self, *names: str) -> Mask:
+        """Mask of the rows with one of these outcomes."""
+        code, known = self._outcome
+        return np.asarray(np.array([name in names for name in known])[code], dtype=bool)
+
+    @cached_property
+    def _outcome(self) -> tuple[NDArray[np.intp], list[str | None]]:
+        """The outcome of each row as a code, and the outcomes that the codes stand for."""
+        column = self.trace["outcome"].combine_chunks()
+        if not pa.types.is_dictionary(column.type):
+            column = column.dictionary_encode()
+        names = [*column.dictionary.to_pylist(), None]
+        code = pc.fill_null(column.indices, len(names) - 1) if column.null_count else column.indices
+        return np.asarray(code.to_numpy(), dtype=np.intp), names
+
+    @cached_property
+    def placed(self) -> Mask:
+        """Mask of the rows for whose instant of sending positions are known."""
+        return self.places.known(self.sent_ns)
+
+    @cached_property
+    def in_range(self) -> Mask:
+        """Mask of the rows whose receiver was known to be in range of the sender."""
+        return self.places.pairs_in_range(self.sender, self.receiver, self.sent_ns)
+
+    @cached_property
+    def _by_time(self) -> tuple[NDArray[np.intp], IntArray]:
+        """The rows in the order in which their frames were sent, and when that was."""
+        order = np.argsort(self.sent_ns, kind="stable")
+        return order, self.sent_ns[order]
+
+    def sent_between(self, start_ns: int, end_ns: int) -> NDArray[np.intp]:
+        """The rows whose frames were sent in [start, end)."""
+        order, sent_ns = self._by_time
+        first, last = np.searchsorted(sent_ns, (start_ns, end_ns))
+        return order[first:last]
+
+    @cached_property
+    def frame(self) -> IntArray:
+        """One number for each (sender, seq)."""
+        return np.asarray(self.sender * (int(self.seq.max(initial=0)) + 1) + self.seq)
+
+    @cached_property
+    def emission(self) -> IntArray:
+        """One number for each (sender, seq, copy)."""
+        return np.asarray(self.frame * (int(self.copy.max(initial=0)) + 1) + self.copy)
+
+    def rows(self, broken: Mask | IntArray | NDArray[np.intp]) -> list[dict[str, Any]]:
+        """The first offending rows of the trace, by mask or by number."""
+        indices = np.flatnonzero(broken) if broken.dtype == bool else np.asarray(broken)
+        listed = self.trace.take(pa.array(np.sort(indices)[:MOST_ROWS].astype(np.int64))).to_pylist()
+        return [{**row, "payload_digest": f"{row['payload_digest']:016x}"} for row in listed]
+
+    # The states, as arrays over (period, node).
+
+    @cached_property
+    def _place(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        period = np.asarray(self.states["period"].to_numpy(), dtype=np.intp)
+        if len(period) and not 0 <= period.min() <= period.max() < len(period):
+            raise VnetError(f"states: periods {period.min()} to {period.max()} in {len(period)} rows")
+        node = self.states["node"].combine_chunks().dictionary_encode()
+        names = [*node.dictionary.to_pylist(), *([None] if node.null_count else [])]
+        code = np.array([self.number_of(name) for name in names], dtype=np.intp)
+        return period, code[node.indices.to_numpy()]
+
+    @cached_property
+    def periods(self) -> int:
+        """Number of periods that were kept."""
+        return int(self._place[0].max(initial=-1)) + 1
+
+    def vectors(self, name: str) -> Array:
+        """A column of points of the states (periods, N, 2); NaN where there is none."""
+        return self._spread(self.states[name].combine_chunks(), 2)
+
+    def matrices(self, name: str) -> Array:
+        """A column of covariances of the states (periods, N, 2, 2); NaN where there is none."""
+        return self._spread(self.states[name].combine_chunks(), 4).reshape(self.periods, -1, 2, 2)
+
+    def _spread(self, column: pa.Array, size: int) -> Array:
+        spread = np.full((self.periods, len(self.node_ids), size), np.nan)
+        there = np.asarray(column.is_valid())
+        period, node = self._place
+        flat = np.asarray(column.drop_null().flatten().to_numpy(zero_copy_only=False), dtype=float)
+        spread[period[there], node[there]] = flat.reshape(-1, size)
+        return spread
+
+    def by_period(self, name: str) -> Array:
+        """A column of the states, (periods, N) or (periods, N, size); NaN where there is none."""
+        kind = self.states.schema.field(name).type
+        if not pa.types.is_fixed_size_list(kind):
+            return self.scalars(name)
+        return self._spread(self.states[name].combine_chunks(), kind.list_size)
+
+    def scalars(self, name: str) -> Array:
+        """A column of numbers of the states (periods, N); NaN where there is none."""
+        spread = np.full((self.periods, len(self.node_ids)), np.nan)
+        spread[self._place] = numbers_of(self.states[name])
+        return spread
+
+    @cached_property
+    def value_names(self) -> list[str]:
+        """Names of the values that have a column of the states, in the order in which they were first reported."""
+        return value_columns(self.states.schema)
+
+    def value(self, name: str) -> Array:
+        """A number or boolean that programs report by this name (periods, N); NaN where there is none."""
+        if name in self.value_names:
+            return self.scalars(name)
+        lists = pc.map_lookup(self.states["values"].combine_chunks(), name, "first")
+        return self._spread(pc.if_else(pc.equal(pc.list_value_length(lists), 1), lists, None), 1)[..., 0]
+
+    @cached_property
+    def reported(self) -> Mask:
+        """(periods, N), who reported anything in which period."""
+        values = self.states["values"].combine_chunks().cast(VALUES_AS_LIST)
+        something = np.asarray(pc.fill_null(pc.list_value_length(values), 0)) > 0
+        for name in ("estimate_m", "common_error_estimate_m", "mean_m", "stacked_common_error_m", "cloud_m"):
+            something |= np.asarray(self.states[name].combine_chunks().is_valid())
+        for name in self.value_names:
+            something |= np.asarray(self.states[name].combine_chunks().is_valid())
+        reported = np.zeros((self.periods, len(self.node_ids)), dtype=bool)
+        reported[self._place] = something
+        return reported
+
+    def period_starts_ns(self) -> IntArray:
+        """Instant at which each period starts."""
+        return np.arange(self.periods, dtype=np.int64) * self.scenario.period_ns
 
     # Events, and who was up when.
 
@@ -254,5 +618,214 @@ class RecordedRun(RecordedTables):
         return max((planned.end_ns for planned in self.plan), default=0)
 
 
-class OpenedRun(RunFiles, RecordedRun):
-    """A run whose fields are the files of its folder."""
+class OpenedRun(RecordedRun):
+    """A run whose fields are the files of its folder, each read when it is first asked for.
+
+    Others may have written them: they are bounded and typed, and VnetError says in one line what is wrong with one.
+
+    Of the tables that `columns` names, only those columns are read.
+    """
+
+    def __init__(self, folder: Path, columns: Columns | None = None) -> None:
+        self.folder = folder
+        self._columns = columns or {}
+        self._tables: dict[Table, pa.Table | None] = {}
+
+    @cached_property
+    def scenario_text(self) -> str:
+        """The text of scenario.toml."""
+        path = self.folder / SCENARIO_FILE
+        return self._read(path, lambda: read_regular(path, LARGEST_BYTES).decode("utf-8", "replace"))
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The scenario; the files that it names need not be there any more."""
+        return parse_recorded_scenario(self.scenario_text, self.folder / SCENARIO_FILE)
+
+    @cached_property
+    def record(self) -> Record:
+        """Contents of verdict.json. A format that this vnet does not know is refused."""
+        path = self.folder / VERDICT_FILE
+        record = self._read(path, lambda: read_record(path))
+        if not 1 <= record.format <= FORMAT:
+            raise LaterFormatError(
+                f"{path}: format {record.format}, of vnet {printable(record.versions.get('vnet', '?'))}; this vnet "
+                f"reads 1 to {FORMAT}"
+            )
+        return replace(record, reproduce=_from_here(record.reproduce, self.folder))
+
+    def refuse_later_format(self) -> None:
+        """Raise VnetError if the folder is of a later format; its verdict may be missing or broken."""
+        try:
+            _ = self.record
+        except LaterFormatError:
+            raise
+        except VnetError:
+            return
+
+    @cached_property
+    def events(self) -> list[Event]:
+        """The events, in the order in which they were written; a last line that was cut off is left out."""
+        path = self.folder / EVENTS_FILE
+        return self._read(path, lambda: parse_events(path, read_regular(path, LARGEST_EVENTS_BYTES)))
+
+    @cached_property
+    def world(self) -> RecordedWorld:
+        """Contents of world.npz. Folders of format 1 have none: their input files are needed."""
+        path = self.folder / WORLD_FILE
+        self.refuse_later_format()
+        if path.exists():
+            return self._read(path, lambda: RecordedWorld.read(path))
+        if self.record.format > 1:
+            raise not_finished(self.folder, WORLD_FILE)
+        try:
+            return RecordedWorld.of(build_world(load_scenario(self.folder / SCENARIO_FILE)))
+        except ScenarioError as error:
+            text = f"{self.folder}: of format 1 (vnet 0.1.0), which needs the run's input files: {error}"
+            raise VnetError(text) from None
+
+    @property
+    def trace(self) -> pa.Table:
+        """A row for each frame and receiver in range."""
+        return self.table(TRACE)
+
+    @property
+    def states(self) -> pa.Table:
+        """A row for each vehicle and period."""
+        return self.table(STATES)
+
+    @property
+    def metrics(self) -> pa.Table:
+        """A row for each period."""
+        return self.table(METRICS)
+
+    def table(self, kind: Table) -> pa.Table | None:
+        """Return a table; None if the run has none of this kind."""
+        if kind not in self._tables:
+            there = (self.folder / kind.file).is_file() if kind.is_due is None else self._holds(kind.is_due)
+            self._tables[kind] = self._read_table(kind) if there else None
+        return self._tables[kind]
+
+    @cached_property
+    def payloads(self) -> KeptPayloads | None:
+        """Payloads of frames; None where the run has kept none."""
+        table = self.table(PAYLOADS)
+        return None if table is None else KeptPayloads(table)
+
+    # Tables a piece at a time.
+
+    def trace_reader(self, number: Mapping[str, int]) -> TraceReader:
+        """The trace forward in time; `number` gives each node's."""
+        return TraceReader(self.folder / TRACE.file, number)
+
+    def states_reader(self, number: Mapping[str, int]) -> StatesReader:
+        """The states period by period; `number` gives each node's."""
+        return StatesReader(self.folder / STATES.file, number, self.scenario.period_ns)
+
+    def figures(self) -> list[PeriodFigures]:
+        """The rows of the metrics. Raises VnetError unless there is one for each period in turn."""
+        file = TableFile(self.folder / METRICS.file, list(METRICS.columns))
+        figures = [PeriodFigures(**row) for piece in file.pieces() for row in piece.to_pylist()]
+        if [row.period for row in figures] != list(range(len(figures))):
+            raise file.error("its rows are not those of one period after the other")
+        return figures
+
+    # What lies in the folder.
+
+    @property
+    def has_record(self) -> bool:
+        """True if there is a verdict.json: the run has come to its end."""
+        return (self.folder / VERDICT_FILE).exists()
+
+    @property
+    def when(self) -> datetime:
+        """Local time at which the run ended, or last wrote something. Raises VnetError if the folder is gone."""
+        for path in (self.folder / VERDICT_FILE, self.folder / EVENTS_FILE, self.folder):
+            try:
+                return datetime.fromtimestamp(path.stat().st_mtime).astimezone()
+            except OSError:
+                continue
+        raise VnetError(f"{self.folder}: no such folder")
+
+    def _read(self, path: Path, read: Callable[[], T]) -> T:
+        """Return what `read` makes of a file; VnetError says in one line what is wrong with it."""
+        try:
+            return read()
+        except FileNotFoundError:
+            if is_run_folder(self.folder):
+                raise not_finished(self.folder, path.name) from None
+            raise VnetError(f"{self.folder}: not a run's folder: there is no {path.name} in it") from None
+        except OSError as error:
+            raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
+        except (ValueError, pa.ArrowException) as error:
+            raise VnetError(f"{path}: cannot be read: {printable(' '.join(str(error).split()), 300)}") from None
+
+    def _holds(self, condition: Condition) -> bool:
+        return condition is always or condition(self.scenario)
+
+    def _read_table(self, kind: Table) -> pa.Table:
+        """Return a table with the types that it must have."""
+        path = self.folder / kind.file
+        self.refuse_later_format()
+        if not path.is_file():
+            check_is_run(self.folder)
+            if path.exists():
+                raise VnetError(f"{path}: cannot be read: not a regular file")
+            if unkept := [line for line in self._unkept() if Path(line.partition(": ")[0]).name == path.name]:
+                raise VnetError(f"{self.folder}: its {VERDICT_FILE} says: not kept: {unkept[0]}")
+            raise not_finished(self.folder, path.name)
+        wanted = self._columns.get(kind)
+        names = None if wanted is None else [*wanted, *self._columns_beside(kind, path, wanted)]
+        file = self._read(path, lambda: open_table(path, names))
+        self._bound_rows(kind, path, file.metadata.num_rows)
+        kept = file.schema_arrow
+        for name in wanted or kind.columns:
+            column = kind.columns[name]
+            found = name in kept.names and kept.field(name).type == column.type
+            if not found and self._holds(column.is_due):
+                raise VnetError(f"{path}: has no column {name!r} of {column.type}")
+        table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
+        for name in table.column_names:
+            if name in kind.columns and not kind.columns[name].has_gaps and table[name].null_count:
+                raise VnetError(f"{path}: column {name!r} has gaps")
+        return table.unify_dictionaries()
+
+    def _unkept(self) -> list[str]:
+        """Return a line for each file that the disk refused at the end of the run."""
+        try:
+            told = [check.figures.get("unkept") for check in self.record.checks]
+        except VnetError:
+            return []
+        return [str(line) for lines in told if isinstance(lines, list) for line in lines]
+
+    def _bound_rows(self, kind: Table, path: Path, rows: int) -> None:
+        """Raise VnetError if a table has many times the rows that verdict.json speaks of."""
+        try:
+            record = self.record
+        except VnetError:  # a run that is on, or that was killed
+            return
+        nodes = record.vehicles + record.roadside_units
+        periods = record.emulated_s * NS_PER_S / self.scenario.period_ns + 1
+        due = {TRACE: record.in_range, STATES: nodes * periods, METRICS: periods}
+        if kind in due and rows > SPARE_ROWS + 2 * due[kind]:
+            raise VnetError(f"{path}: {rows:,} rows, where {VERDICT_FILE} speaks of {due[kind]:,.0f}")
+
+    def _columns_beside(self, kind: Table, path: Path, wanted: Collection[str]) -> list[str]:
+        """Columns that only some runs have: reported values beside `values`, and what tells unicasts."""
+        if kind is TRACE:
+            there = self._read(path, lambda: open_table(path, ()).schema_arrow.names)
+            beside = [*ACKNOWLEDGED, "on_air_ns"] if "attempt" in there else ACKNOWLEDGED
+            return [name for name in beside if name in there and name not in wanted]
+        if kind is not STATES or "values" not in wanted:
+            return []
+        return self._read(path, lambda: value_columns(open_table(path, ()).schema_arrow))
+
+
+def _from_here(command: str, folder: Path) -> str:
+    """The command that runs a run again, from any folder, with the path of its scenario as it is called now."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        return command
+    named = [str(folder.absolute() / SCENARIO_FILE) if Path(word).name == SCENARIO_FILE else word for word in words]
+    return command if named == words else shlex.join(named)

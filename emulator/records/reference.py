@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.connectivity import component_links
-from emulator.records.recorded_tables import RecordedTables
+from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.declared import declared_modules
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import components
@@ -63,7 +63,7 @@ def reference_of(scenario: Scenario) -> type[Reference]:
     return found[0]  # type: ignore[no-any-return]
 
 
-def reference_series(recorded: RecordedTables) -> dict[str, Array]:
+def reference_series(recorded: RecordedRun) -> dict[str, Array]:
     """Return the figures of a run's reference by name, (periods,) or (periods, components); NaN where it has none.
 
     Of the states the columns that the reference names are needed. Raises VnetError with the reason if the run has

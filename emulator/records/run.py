@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.tables import BACKBONE, BACKGROUND, DRIVEN
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
 from emulator.scenario.scenario import Scenario
@@ -136,17 +137,17 @@ class Run:
     @property
     def driven(self) -> pa.Table | None:
         """Table of driven vehicles: a row for each control instant and vehicle; None where no program drives."""
-        return self._recorded.driven
+        return self._recorded.table(DRIVEN)
 
     @property
     def backbone(self) -> pa.Table | None:
         """Table of the backbone: a row for each message of a roadside unit and receiver; None without a unit."""
-        return self._recorded.backbone
+        return self._recorded.table(BACKBONE)
 
     @property
     def background(self) -> pa.Table | None:
         """Table of vehicles without programs: a row for each period and vehicle; None where there are none."""
-        return self._recorded.background
+        return self._recorded.table(BACKGROUND)
 
     @property
     def metrics(self) -> pa.Table:

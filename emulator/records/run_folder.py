@@ -1,7 +1,7 @@
 """The folder of a run: everything that is kept of it, written so that an interruption leaves it readable.
 
 `scenario.toml` first, `events.jsonl` line by line as things happen, tables, `world.npz` and `verdict.json` at the
-end, each put in place in one step. `run_files` and `recorded_run` read it.
+end, each put in place in one step. `recorded_run` reads it.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from itertools import count
@@ -27,16 +28,10 @@ if TYPE_CHECKING:
 RUNS = Path("runs")
 SCENARIO_FILE = "scenario.toml"
 EVENTS_FILE = "events.jsonl"
-TRACE_FILE = "trace.parquet"
-STATES_FILE = "states.parquet"
-METRICS_FILE = "metrics.parquet"
-BUSY_FILE = "busy.parquet"
-DRIVEN_FILE = "driven.parquet"
-BACKBONE_FILE = "backbone.parquet"
-BACKGROUND_FILE = "background.parquet"
-PAYLOADS_FILE = "payloads.parquet"
 WORLD_FILE = "world.npz"
 VERDICT_FILE = "verdict.json"
+MARKS = (SCENARIO_FILE, VERDICT_FILE, EVENTS_FILE)
+"""A folder with any of these is a run's."""
 MANIFEST_FILE = "manifest.json"
 REPORT, INDEX, RECORDING = "report.html", "index.html", "recording.rrd"
 """Names of a run's report and recording, and of the list of the runs in a folder."""
@@ -243,3 +238,37 @@ def _point_latest_to(path: Path) -> None:
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(path.name)
     fresh.replace(link)
+
+
+# What a folder is.
+
+
+class LaterFormatError(VnetError):
+    """A folder is of a format that a later vnet writes."""
+
+
+def is_run_folder(folder: Path) -> bool:
+    """Return whether a folder is that of a run, broken ones included."""
+    return any((folder / mark).is_file() for mark in MARKS)
+
+
+def check_is_run(folder: Path) -> None:
+    """Raise VnetError if the folder has no scenario, and so is not a run's."""
+    if not (folder / SCENARIO_FILE).is_file():
+        raise VnetError(f"{folder}: not a run's folder: there is no {SCENARIO_FILE} in it")
+
+
+def check_is_finished(folder: Path) -> None:
+    """Raise VnetError if the folder is that of a run without a verdict: it is on, or was killed."""
+    if (folder / SCENARIO_FILE).is_file() and not (folder / VERDICT_FILE).exists():
+        raise not_finished(folder, VERDICT_FILE)
+
+
+def not_finished(folder: Path, name: str) -> VnetError:
+    """Return the error for a run's folder without a file that the end of a run writes; it says what to do."""
+    text = f"{folder}: not the folder of a finished run: there is no {name} in it"
+    scenario = folder / SCENARIO_FILE
+    if (folder / VERDICT_FILE).exists() or not scenario.is_file():
+        return VnetError(text)
+    again = f"vnet run {shlex.quote(str(scenario))}"
+    return VnetError(f"{text}: it is on, or was killed, which leaves no tables; {again} makes the run again")

@@ -16,7 +16,7 @@ from emulator.checks.replay import compare_folders
 from emulator.pages.text import cell
 from emulator.records.key_figures import KEY_FIGURES, shown_figures
 from emulator.records.reported import ReportedFigure, figure_text
-from emulator.records.run_files import check_is_run
+from emulator.records.run_folder import check_is_run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Finding, Verdict
 from emulator.report.source import Source

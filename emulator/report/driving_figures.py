@@ -7,6 +7,7 @@ import numpy as np
 from emulator.pages.canvas import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
 from emulator.records.driven_table import of_vehicles
 from emulator.records.events import EventKind
+from emulator.records.tables import DRIVEN
 from emulator.report.drawing import DASHES, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source
 
@@ -17,7 +18,7 @@ _COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 
 def speeds(source: Source) -> Drawing:
     """Draw the true speeds of driven vehicles against time, with the instants of collisions."""
-    table, units = source.recorded.driven, source.recorded.scenario.roadside
+    table, units = source.recorded.table(DRIVEN), source.recorded.scenario.roadside
     nodes = source.recorded.node_ids[: len(source.recorded.node_ids) - len(units)]
     if table is None or not len(table) or not nodes:
         raise NothingToShow("no program drives")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, legend
 from emulator.records.background_table import positions_by_time
 from emulator.records.reported import figure_text, is_text
+from emulator.records.tables import BACKGROUND
 from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
 from emulator.report.source import NothingToShow, Source
@@ -269,7 +270,7 @@ def _background_m(source: Source) -> Array:
     """Return where vehicles without programs were in the run's last period (k, 2)."""
     period_ns = source.recorded.scenario.period_ns
     last_ns = (source.recorded.closed_ns - 1) // period_ns * period_ns
-    positions_m = positions_by_time(source.recorded.background)
+    positions_m = positions_by_time(source.recorded.table(BACKGROUND))
     ends_ns = [time_ns for time_ns in positions_m if time_ns >= last_ns]
     return positions_m[ends_ns[-1]] if ends_ns else np.zeros((0, 2))
 

@@ -18,16 +18,16 @@ from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import Reference, reference_of, reference_series
 from emulator.records.reported import reported_figures
-from emulator.records.run_folder import METRICS_FILE, STATES_FILE, TRACE_FILE
+from emulator.records.tables import METRICS, STATES, TRACE
 from emulator.records.verdict_file import Record
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
 from vnet.types import Array
 
 COLUMNS = {
-    TRACE_FILE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
-    STATES_FILE: ("period", "time_ns", "node", "position_m", "values"),
-    METRICS_FILE: (
+    TRACE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
+    STATES: ("period", "time_ns", "node", "position_m", "values"),
+    METRICS: (
         "time_ns",
         "reporting",
         "common_error_rmse_m",
@@ -107,7 +107,7 @@ class Source:
     def reference_series(self) -> dict[str, Array]:
         """The figures of the reference, (periods,) by name. Raises VnetError if the run has none."""
         columns = ("period", "node", *self.reference.COLUMNS)
-        return reference_series(RecordedRun.open(self.folder, {STATES_FILE: columns}))
+        return reference_series(RecordedRun.open(self.folder, {STATES: columns}))
 
     # What programs report by names of their own.
 

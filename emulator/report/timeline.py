@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from emulator.radio.outcomes import Outcome, Stage
 from emulator.records.events import Event, EventKind, Level
 from emulator.records.recorded_run import END_OF_TIME_NS, OpenedRun, RecordedRun
-from emulator.records.run_folder import TRACE_FILE
+from emulator.records.tables import TRACE
 from emulator.report.source import Source, maybe
 from vnet.errors import printable
 from vnet.types import IntArray, Mask
@@ -275,7 +275,7 @@ def _on_air_us(source: Source) -> IntArray:
     """Return when each row's frame was sent: with a MAC when it was on the air, if it ever was."""
     sent_ns = source.recorded.sent_ns
     if source.scenario.radio.mac is not None:
-        on_air_ns = RecordedRun.open(source.folder, {TRACE_FILE: ("on_air_ns",)}).on_air_ns
+        on_air_ns = RecordedRun.open(source.folder, {TRACE: ("on_air_ns",)}).on_air_ns
         sent_ns = np.where(on_air_ns >= 0, on_air_ns, sent_ns)
     return np.asarray(sent_ns // NS_PER_US)
 

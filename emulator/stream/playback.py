@@ -16,14 +16,14 @@ from emulator.records.busy import busy_windows, mean_busy
 from emulator.records.events import Event
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.records.run_files import check_is_run
-from emulator.records.run_folder import STATES_FILE
+from emulator.records.run_folder import check_is_run
 from emulator.records.run_tables import StatesReader, TraceReader
+from emulator.records.tables import BACKGROUND, BUSY, STATES
 from emulator.stream.messages import event_message, period_message, scene_message
 from vnet.errors import VnetError
 from vnet.types import Array
 
-POSITIONS = {STATES_FILE: ("period", "node", "position_m")}
+POSITIONS = {STATES: ("period", "node", "position_m")}
 Message = tuple[str, dict[str, Any]]
 
 
@@ -36,7 +36,7 @@ def messages(folder: Path) -> Iterator[Message]:
     run = RecordedRun.open(folder)
     number = {node: number for number, node in enumerate(run.world.node_ids)}
     trace, states = run.trace_reader(number), run.states_reader(number)
-    busy = busy_windows(run.busy, run.world.node_ids)
+    busy = busy_windows(run.table(BUSY), run.world.node_ids)
     return _Playback(run, run.figures(), trace, states, busy).messages()
 
 
@@ -63,7 +63,7 @@ class _Playback:
         node_ids, period_ns = self.run.world.node_ids, self.run.scenario.period_ns
         told = self._events_and_positions()
         down = _Down(told)
-        states, background = self.states.periods(), positions_by_time(self.run.background)
+        states, background = self.states.periods(), positions_by_time(self.run.table(BACKGROUND))
         for figures, happened in zip(self.figures, events, strict=False):
             if (state := next(states, None)) is None:
                 raise self._misfit("fewer")
@@ -84,9 +84,8 @@ class _Playback:
         course_m = None
         if run.moves:
             course_m = RecordedRun.open(run.folder, POSITIONS).vectors("position_m")
-        return RecordedRun(
-            run.scenario, nothing, self.states.first(), nothing, run.events, course_m, None, run.world
-        )
+        states = self.states.first()
+        return RecordedRun(run.scenario, nothing, states, nothing, run.events, course_m, run.world)
 
     def _misfit(self, how: str) -> VnetError:
         return VnetError(f"{self.states.path}: is of {how} periods than the {len(self.figures)} of metrics.parquet")

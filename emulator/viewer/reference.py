@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.records.reference import Setting, reference_of
-from emulator.records.states import STATES
+from emulator.records.tables import STATES
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
 from vnet.types import Array
@@ -38,7 +38,7 @@ class DrawnReference:
 
     def _column(self, name: str, data: bytes) -> Array:
         """Return a column of the states, with a row for each vehicle."""
-        kind = STATES.field(name).type
+        kind = STATES.schema.field(name).type
         if not pa.types.is_fixed_size_list(kind):
             return unpack(data)[:, 0].astype(float)
         rows = unpack(data, kind.list_size).astype(float)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from emulator.records.run_folder import RECORDING
+from emulator.records.run_folder import RECORDING, check_is_finished
 from vnet.errors import VnetError
 
 if TYPE_CHECKING:  # Rerun is slow to import, and only those who open a recording need it
@@ -361,8 +361,6 @@ def repair(path: Path) -> Path:
         raise VnetError(f"{path}: was not closed, and cannot be repaired: {last}")
     repaired = repaired_path(path)
     if _is_empty(repaired):
-        from emulator.records.run_files import check_is_finished  # tables are slow to import
-
         repaired.unlink()
         check_is_finished(path.parent)
         raise VnetError(

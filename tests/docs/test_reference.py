@@ -1,6 +1,7 @@
 """The reference pages are what `make docs` makes of the code as it is, and leave nothing out."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -13,8 +14,9 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
+from emulator.radio.trace import ACKNOWLEDGED, CHOSEN, LATE
 from emulator.records.run_folder import RunFolder
-from emulator.records.states import STATES
+from emulator.records.tables import BUSY, METRICS, STATES, TABLES, TRACE, Column
 from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import Section
@@ -70,7 +72,7 @@ class Example:
 
 def test_a_column_without_a_text_is_refused() -> None:
     with pytest.raises(LookupError, match="cloud_m"):
-        files.columns(STATES, {name: text for name, text in files.STATE.items() if name != "cloud_m"})
+        files.columns(replace(STATES, columns={**STATES.columns, "cloud_m": Column(STATES.schema.types[0], "")}))
 
 
 def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
@@ -79,10 +81,14 @@ def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
     conclude(emulation, simulate(emulation)[0], "simulate")
     left = {path.name + "/" * path.is_dir() for path in (tmp_path / "run").iterdir()}
-    assert left <= set(files.FOLDER)
+    assert left <= {*files.FOLDER, *(table.file for table in TABLES)}
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
     assert verdict.keys() == files.VERDICT.keys()
     assert verdict["frames_by_outcome"].keys() == {outcome.name for outcome in Outcome} - {"pending"}
-    for name, said in (("trace", files.TRACE), ("states", files.STATE), ("busy", files.BUSY)):
-        own = ["neighbours"] if name == "states" else []  # what the program reports
-        assert pq.read_schema(tmp_path / "run" / f"{name}.parquet").names == [*said, *own]
+    optional = set(CHOSEN) | set(ACKNOWLEDGED) | {LATE}
+    for table in (TRACE, STATES, BUSY, METRICS):
+        own = ["neighbours"] if table is STATES else []  # what the program reports
+        due = [name for name in table.columns if table is not TRACE or name not in optional]
+        schema = pq.read_schema(tmp_path / "run" / table.file)
+        assert schema.names == [*due, *own]
+        assert [schema.field(name).type for name in due] == [table.columns[name].type for name in due]

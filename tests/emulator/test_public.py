@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import emulator
-from emulator.records.run_files import RunFiles
+from emulator.records.recorded_run import RecordedRun
 from tests.support.paths import ROOT
 from vnet import Node
 from vnet.errors import ProgramError, ScenarioError, VnetError
@@ -124,7 +124,7 @@ def test_an_interrupted_simulation_is_written_down(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(Future, "result", interrupted_once)
     with pytest.raises(KeyboardInterrupt):
         emulator.simulate(SMALL, duration_s=600, out=tmp_path / "run")
-    assert [event.kind for event in RunFiles(tmp_path / "run").events][-2:] == ["interrupted", "ended"]
+    assert [event.kind for event in RecordedRun.open(tmp_path / "run").events][-2:] == ["interrupted", "ended"]
     assert emulator.Run.open(tmp_path / "run").verdict == "unknown"
 
 

@@ -14,7 +14,7 @@ import pytest
 from emulator.checks.fault_effects import _wrong_fixes
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
 from emulator.records.events import Event
-from emulator.records.states import STATES
+from emulator.records.tables import STATES
 from emulator.scenario.faults import KINDS, DataReplay, parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
@@ -116,7 +116,7 @@ def with_cells(table: pa.Table, column: str, rows: Any, value: Any) -> pa.Table:
 
 def without_reports(recorded: RecordedRun, node: str, from_s: float) -> RecordedRun:
     """The states as if a node had reported nothing any more."""
-    empty = {name: None for name in STATES.names if name.endswith(("estimate_m", "covariance_m2"))}
+    empty = {name: None for name in STATES.columns if name.endswith(("estimate_m", "covariance_m2"))}
     empty |= dict.fromkeys(recorded.value_names)
     rows = [
         {**row, **empty, "values": []} if row["node"] == node and row["time_ns"] >= from_s * 1e9 else row

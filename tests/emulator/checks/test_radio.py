@@ -18,6 +18,7 @@ from emulator.drivers.simulate import simulate
 from emulator.radio.csma import Csma
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
+from emulator.records.tables import BUSY
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from tests.emulator.checks.test_judge import checked, result, verdict
@@ -45,7 +46,7 @@ def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) 
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
     done = RecordedRun.open(folder)
-    return RecordedRun(scenario, done.trace, done.states, done.metrics, done.events, busy=done.busy)
+    return RecordedRun(scenario, done.trace, done.states, done.metrics, done.events, more={BUSY: done.table(BUSY)})
 
 
 @pytest.fixture(scope="module")
@@ -248,10 +249,11 @@ def test_arrivals_are_held_to_the_end_of_the_transmission(shared: RecordedRun) -
 
 
 def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: RecordedRun) -> None:
-    assert shared.busy is not None
-    ratio = pc.multiply(shared.busy["busy_ratio"], 0.001)
-    idle = shared.busy.set_column(2, "busy_ratio", ratio)
-    assert checked(replace(shared, busy=idle), "medium").figures["too_idle"] > 100
+    busy = shared.table(BUSY)
+    assert busy is not None
+    ratio = pc.multiply(busy["busy_ratio"], 0.001)
+    idle = busy.set_column(2, "busy_ratio", ratio)
+    assert checked(replace(shared, more={BUSY: idle}), "medium").figures["too_idle"] > 100
 
 
 def test_who_never_senses_others_sends_when_it_likes_and_is_busy_while_it_sends(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.checks.replay import compare
-from emulator.records.states import STATES
+from emulator.records.tables import STATES
 from emulator.terminal.summary import print_checks, print_offending
 from tests.emulator.checks.test_faults import with_cells
 from tests.emulator.checks.test_judge import first, four, result, with_names
@@ -64,8 +64,8 @@ def compared(recorded: RecordedRun, **again: pa.Table) -> CheckResult:
 def test_runs_that_agree_are_valid_though_a_number_is_none(recorded: RecordedRun) -> None:
     rows = recorded.states.to_pylist()
     rows[3]["fix_m"] = [float("nan"), 1.0]
-    with_nan = replace(recorded, states=pa.Table.from_pylist(rows, schema=STATES))
-    assert compared(with_nan, states=pa.Table.from_pylist(rows, schema=STATES)).verdict is Verdict.VALID
+    with_nan = replace(recorded, states=pa.Table.from_pylist(rows, schema=STATES.schema))
+    assert compared(with_nan, states=pa.Table.from_pylist(rows, schema=STATES.schema)).verdict is Verdict.VALID
 
 
 @pytest.mark.parametrize(("column", "value"), [("arrival_ns", 1), ("payload_digest", 1), ("outcome", "lost")])

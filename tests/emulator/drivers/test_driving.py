@@ -12,6 +12,7 @@ from emulator.checks.judge import check_run
 from emulator.drivers.emulation import Emulation
 from emulator.export.tables import write_csv
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.tables import DRIVEN
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.vehicles import COLLISION
@@ -92,9 +93,10 @@ def test_a_run_is_judged_and_shown_from_its_folder(tmp_path: Path) -> None:
     again = RecordedRun.open(tmp_path / "run")
     (tmp_path / "tables").mkdir()
     assert "driven.csv" in write_csv(again, tmp_path / "tables")
-    assert again.driven is not None
-    speed = np.array(again.driven["speed_m_s"]).reshape(-1, 3)
-    along_m = np.array(again.driven["along_m"]).reshape(-1, 3)
+    motion = again.table(DRIVEN)
+    assert motion is not None
+    speed = np.array(motion["speed_m_s"]).reshape(-1, 3)
+    along_m = np.array(motion["along_m"]).reshape(-1, 3)
     position_m = again.vectors("position_m")
     assert_allclose(along_m[: len(position_m)], position_m[..., 0])
     assert speed[0].tolist() == [5.0, 25.0, 10.0]

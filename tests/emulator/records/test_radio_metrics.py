@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from emulator.checks.judge import RecordedRun
 from emulator.records.radio_metrics import radio_metrics
-from emulator.records.states import STATES
+from emulator.records.tables import STATES
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips
@@ -42,7 +42,7 @@ def evidence_of(rows: list[Row], position_m: np.ndarray, moves: bool) -> Recorde
     states = [{"period": 0, "time_ns": 0, "node": name} for name in names]
     network = {"kind": "trips", "path": "none"} if moves else {}
     scenario = Scenario.model_validate({"network": network})
-    table = pa.Table.from_pylist(states, schema=STATES)
+    table = pa.Table.from_pylist(states, schema=STATES.schema)
     return RecordedRun(scenario, pa.table(columns), table, pa.table({}), [], position_m)
 
 

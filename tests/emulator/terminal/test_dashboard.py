@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from emulator.drivers.status import BINS, FIGURES, FaultState, Snapshot
-from emulator.records.run_folder import Event
-from emulator.terminal.dashboard import BAD_EVENTS, Dashboard, describe, is_bad, sparkline
+from emulator.records.events import Event
+from emulator.terminal.dashboard import Dashboard, describe, sparkline
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
 FAULTS = (
@@ -237,4 +237,3 @@ def test_a_sparkline_of_odd_values() -> None:
 )
 def test_events_in_words(event: Event, said: str) -> None:
     assert describe(event) == said
-    assert is_bad(event) is (event.kind in BAD_EVENTS)

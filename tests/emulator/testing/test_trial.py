@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from emulator.checks.own import PREFIX
-from emulator.records.run_folder import SCENARIO_FILE, TRACE_FILE, RunFolder
+from emulator.records.run_folder import SCENARIO_FILE, RunFolder
+from emulator.records.tables import TRACE
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
 from emulator.testing.trial import run_trial
@@ -26,7 +27,7 @@ def test_tables_that_a_check_looks_at_are_in_no_file(tmp_path: Path) -> None:
 def test_files_that_a_check_asks_for_are_written(tmp_path: Path) -> None:
     trial = run_trial(scenario_with("reads_files"), RunFolder.scratch(tmp_path))
     assert trial.verdicts[f"{PREFIX}files"] is Verdict.VALID, trial.texts
-    assert {SCENARIO_FILE, TRACE_FILE} <= {path.name for path in tmp_path.iterdir()}
+    assert {SCENARIO_FILE, TRACE.file} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_the_next_run_finds_nothing_of_the_last(tmp_path: Path) -> None:

@@ -19,9 +19,10 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
-from emulator.records.background_table import BACKGROUND, positions_by_time
+from emulator.records.background_table import positions_by_time
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import BACKGROUND_FILE, RunFolder
+from emulator.records.run_folder import RunFolder
+from emulator.records.tables import BACKGROUND, DRIVEN
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import map_charts
@@ -124,8 +125,8 @@ def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> Non
     live, told = Messages(emulation), list[dict[str, Any]]()
     emulation.watch(lambda view: told.append(live.period(view)))
     conclude(emulation, simulate(emulation)[0], "simulate")
-    table = RecordedRun.open(tmp_path / "run").background
-    assert table is not None and table.schema == BACKGROUND
+    table = RecordedRun.open(tmp_path / "run").table(BACKGROUND)
+    assert table is not None and table.schema == BACKGROUND.schema
     first = table.slice(0, 1).to_pylist()[0]
     assert first == {"time_ns": 0, "vehicle": "behind", "x_m": 30.0, "y_m": 5.0}
     of_late = table.filter(pc.equal(table["vehicle"].cast("string"), "late"))
@@ -144,7 +145,7 @@ def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> Non
     drawn = read_back(tmp_path / "recording.rrd")["/map/background"]
     assert_allclose(drawn.array("Points2D:positions", 0.0), [[30.0, -5.0]], err_msg="north is up")
     gone = table.filter(pc.less(table["time_ns"], 2 * 10**9))
-    pq.write_table(gone, tmp_path / "run" / BACKGROUND_FILE)
+    pq.write_table(gone, tmp_path / "run" / BACKGROUND.file)
     (drawing, *_), _ = draw_charts(map_charts(Source(tmp_path / "run")))
     assert "vehicles without programs" not in drawing.caption, "they were not there at the end"
 
@@ -186,7 +187,7 @@ def test_a_folder_is_read_without_sumo_and_runs_again_only_with_the_same(
         load_scenario(recorded)
     monkeypatch.setitem(sys.modules, "libsumo", None)  # as if it were not installed
     assert check_run(tmp_path / "run").verdict is Verdict.VALID
-    assert RecordedRun.open(tmp_path / "run").driven is not None
+    assert RecordedRun.open(tmp_path / "run").table(DRIVEN) is not None
 
 
 def test_without_libsumo_it_is_said_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
