@@ -29,6 +29,7 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
 from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
 from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict, result, unknown
+from emulator.scenario.declared import are_here, declared_checks
 from emulator.scenario.fault_families import SenderFault
 from emulator.scenario.toml import parse_toml
 from vnet.counted import counted
@@ -182,8 +183,9 @@ def _wrong_checks(recorded: OpenedRun, judgement: Judgement) -> list[dict[str, A
     theirs = _by_name(judgement)
     of_tests = [event.details.get("checks") for event in recorded.event("judged_by_test")]
     asked = {name for names in of_tests if isinstance(names, list) for name in names if isinstance(name, str)}
+    silent = not program.checks and are_here(program) and not declared_checks(program)
     for name in ours:
-        if name.startswith(PREFIX) and not program.checks and name not in asked:
+        if name.startswith(PREFIX) and silent and name not in asked:
             wrong.append({"figure": name, "kept": "a check of your own", "computed": "the scenario has none"})
     code = parse_toml(recorded.scenario_text).get("code")
     if not isinstance(code, dict) or code.get("vnet") != vnet_digest():  # another vnet may have judged otherwise
