@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.pages.canvas import Span
-from emulator.records.key_figures import SAME
+from emulator.records.key_figures import KEY_FIGURES, SAME
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import Reference, reference_of, reference_series
@@ -23,22 +23,12 @@ from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
 from vnet.types import Array
 
-COLUMNS = {
+TABLES = {
     TRACE_FILE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
     STATES_FILE: ("period", "time_ns", "node", "position_m", "values"),
-    METRICS_FILE: (
-        "time_ns",
-        "reporting",
-        "common_error_rmse_m",
-        "deviation_m",
-        "position_rmse_m",
-        "fix_rmse_m",
-        "consensus_error_m",
-        "common_error_anees",
-        "position_anees",
-    ),
 }
-"""The columns that reports need."""
+"""The columns that reports need; of the metrics also the key figures."""
+METRICS = ("time_ns", "reporting", "common_error_anees", "position_anees")
 CUT = ("interrupted", "stalled", "memory_exceeded")
 """Events that end a run before its time."""
 T = TypeVar("T")
@@ -57,7 +47,8 @@ class Source:
     @cached_property
     def recorded(self) -> OpenedRun:
         """The run, with the columns that reports need."""
-        return RecordedRun.open(self.folder, COLUMNS)
+        metrics = [*METRICS, *(each.name for each in KEY_FIGURES)]
+        return RecordedRun.open(self.folder, {**TABLES, METRICS_FILE: metrics})
 
     @property
     def scenario_text(self) -> str:
