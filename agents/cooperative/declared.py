@@ -6,3 +6,4 @@ CHECKS = (
     "agents.cooperative.checks:check_bounded_error",
 )
 REFERENCE = "agents.cooperative.hears_all:HearsAll"
+PUBLISHED = "agents.cooperative.paper_values:paper_rmse"

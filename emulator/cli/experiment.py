@@ -16,7 +16,7 @@ from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.cli.help import group
 from emulator.cli.options import pair
 from emulator.experiments import paper
-from emulator.records.paper_values import PAPER_RMSE_M
+from emulator.experiments.paper_values import PAPER_RMSE_M
 from emulator.scenario.limits import DAY_S
 from emulator.terminal.console import one_line_errors, tell
 from vnet.errors import VnetError

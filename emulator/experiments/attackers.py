@@ -15,10 +15,10 @@ import numpy as np
 from emulator.cells.cells import Cell
 from emulator.experiments.comparisons import COOPERATIVE
 from emulator.experiments.paper import Labels
+from emulator.experiments.paper_values import PAPER_RANGE_M
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.statistics import shown_interval
 from emulator.experiments.tables import MISSING, markdown_table, paired_ratio, with_error
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import links_within
 from emulator.world.world import build_world

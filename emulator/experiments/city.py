@@ -19,11 +19,11 @@ from pydantic import ValidationError
 
 from emulator.cells.cells import Cell, has_result, has_states, read_series, read_states
 from emulator.experiments.paper import SETTLED_S, everybody
+from emulator.experiments.paper_values import PAPER_RANGE_M
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.result_figures import against_time
 from emulator.experiments.style import save, styled
 from emulator.experiments.tables import MISSING, in_seeds, markdown_table, mean_and_error
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world

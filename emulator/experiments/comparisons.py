@@ -17,12 +17,12 @@ import pyarrow as pa
 
 from emulator.cells.cells import Cell, has_result, read_series
 from emulator.experiments.paper import BOUND, BOUND_POSITION, Labels, counted_from
+from emulator.experiments.paper_values import PAPER_RANGE_M
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.result_figures import against_time
 from emulator.experiments.statistics import paired_tests, shown_interval
 from emulator.experiments.tables import MISSING, markdown_table, paired_ratio
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.source import scenario_of
 from vnet.counted import counted

@@ -30,8 +30,8 @@ from emulator.experiments.analyze import (
 )
 from emulator.experiments.linear_model import convergence_factor
 from emulator.experiments.paper import network_sections
+from emulator.experiments.paper_values import PAPER_RANGE_M
 from emulator.pages.palette import PALETTE
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import VnetError

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from emulator.experiments.paper import ALPHAS
+from emulator.experiments.paper_values import PAPER_RMSE_M
 from emulator.experiments.tables import (
     in_seeds,
     markdown_table,
@@ -17,7 +18,6 @@ from emulator.experiments.tables import (
     with_error,
 )
 from emulator.records.metrics import anees_band
-from emulator.records.paper_values import PAPER_RMSE_M
 
 Result = Mapping[str, Any]
 BOUND_RATIO = 1.35

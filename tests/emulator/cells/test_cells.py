@@ -10,7 +10,7 @@ from emulator.cells import cells as cells_module
 from emulator.cells.cells import Cell, CellResult, compute, read_series, run_cells
 from emulator.cli.commands import app
 from emulator.experiments import paper, reports
-from emulator.records.paper_values import PAPER_RANGE_M
+from emulator.experiments.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import VnetError

@@ -8,8 +8,8 @@ import pytest
 
 from emulator.experiments import network_figures, reports, result_figures
 from emulator.experiments.paper import ALPHAS, load_positions
+from emulator.experiments.paper_values import PAPER_VEHICLES
 from emulator.experiments.tables import with_error
-from emulator.records.paper_values import PAPER_VEHICLES
 
 pytestmark = pytest.mark.slow
 
