@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from emulator.cells.cells import Cell
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import links_within
 from emulator.world.world import build_world
 from studies.comparisons import COOPERATIVE
 from studies.paper import Labels
+from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
 from studies.statistics import shown_interval
 from studies.tables import MISSING, markdown_table, paired_ratio, with_error

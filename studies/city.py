@@ -18,11 +18,11 @@ from matplotlib.figure import Figure
 from pydantic import ValidationError
 
 from emulator.cells.cells import Cell, has_result, has_states, read_series, read_states
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
 from studies.paper import SETTLED_S, everybody
+from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
 from studies.result_figures import against_time
 from studies.style import save, styled

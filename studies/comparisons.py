@@ -17,10 +17,10 @@ import pyarrow as pa
 
 from emulator.cells.cells import Cell, has_result, read_series
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.source import scenario_of
 from studies.paper import BOUND, BOUND_POSITION, Labels, counted_from
+from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
 from studies.result_figures import against_time
 from studies.statistics import paired_tests, shown_interval

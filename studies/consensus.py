@@ -30,10 +30,10 @@ from emulator.analyze import (
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.linear_model import convergence_factor
 from emulator.pages.palette import PALETTE
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.paper import network_sections
+from studies.paper_values import PAPER_RANGE_M
 from vnet.errors import VnetError
 from vnet.types import Array
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from emulator.cells.cells import Cell
 from emulator.cells.measure import REFERENCE
-from emulator.records.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
 from emulator.scenario.scenario import Scenario
 from emulator.world.networks import generate_network, load_network
 from emulator.world.world import build_world, components
+from studies.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
 from vnet.errors import VnetError
 
 Labels = dict[str, str | int | float]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from emulator.records.metrics import anees_band
-from emulator.records.paper_values import PAPER_RMSE_M
 from studies.paper import ALPHAS
+from studies.paper_values import PAPER_RMSE_M
 from studies.tables import (
     in_seeds,
     markdown_table,

@@ -16,7 +16,6 @@ from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
 from emulator.scenario.faults import Custom, CustomSender, StaleMessages
 from emulator.world.link_table import LinkTable
-from emulator.world.neighbours import Links
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
@@ -205,23 +204,10 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
         rows = recorded.sent_between(start_ns, end_ns)
         if len(rows):
             up = ~recorded.is_down(everybody, np.full(len(everybody), start_ns))
-            admitted = admitted_by_cap(recorded, up, start_ns)
+            admitted = recorded.admitted(up, start_ns)
             is_admitted = admitted.contain(recorded.sender[rows], recorded.receiver[rows])
             wrong[rows] = judged[rows] & (is_admitted == capped[rows])
     return wrong
-
-
-def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Links:
-    """Return the pairs of a sender and a receiver whose cap admits it when these nodes (N,) are up."""
-    pairs = recorded.places.links(time_ns)
-    pairs = pairs.of(up[pairs.sender])
-    # For each receiver the nearest first, equally near ones by number.
-    order = np.lexsort((pairs.sender, pairs.distance_m, pairs.receiver))
-    first = np.cumsum(pairs.in_degrees()) - pairs.in_degrees()
-    rank = np.arange(len(order)) - first[pairs.receiver[order]]
-    admitted = np.zeros(len(order), dtype=bool)
-    admitted[order] = rank < recorded.scenario.radio.max_peers
-    return pairs.of(admitted)
 
 
 def check_loss_rate(recorded: RecordedRun) -> Finding:

@@ -40,6 +40,7 @@ from emulator.records.verdicts import (
     result,
     unknown,
 )
+from emulator.scenario.declared import are_here, declared_checks
 from emulator.scenario.fault_families import OwnRule, SenderFault
 from emulator.scenario.faults import Corrupt
 from emulator.scenario.toml import parse_toml
@@ -223,8 +224,9 @@ def _wrong_checks(recorded: OpenedRun, judgement: Judgement) -> list[dict[str, A
     theirs = _by_name(judgement)
     of_tests = [event.details.get("checks") for event in recorded.event(EventKind.judged_by_test)]
     asked = {name for names in of_tests if isinstance(names, list) for name in names if isinstance(name, str)}
+    silent = not program.checks and are_here(program) and not declared_checks(program)
     for name in ours:
-        if name.startswith(PREFIX) and not program.checks and name not in asked:
+        if name.startswith(PREFIX) and silent and name not in asked:
             wrong.append({"figure": name, "kept": "a check of your own", "computed": "the scenario has none"})
     code = parse_toml(recorded.scenario_text).get("code")
     if not isinstance(code, dict) or code.get("vnet") != vnet_digest():  # another vnet may have judged otherwise

@@ -1,8 +1,8 @@
 """Checks of a user's own: functions of a `Run` that yield results, which stand in the verdict beside vnet's.
 
-`[program] checks` and `--check` name them. They run in the emulator's process once the tables are written. A
-function that raises, or answers nonsense, makes a check *unknown* that bears its name and says how; it stops
-nothing else.
+`[program] checks` and `--check` name them; programs declare others. They run in the emulator's process once the
+tables are written. A function that raises, or answers nonsense, makes a check *unknown* that bears its name and
+says how; it stops nothing else.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from emulator.records.run import Run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, unknown
+from emulator.scenario.declared import declared_checks
 from emulator.scenario.own_functions import in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
 from vnet.errors import VnetError, printable, shown
@@ -65,10 +66,13 @@ def load_checks(program: Program) -> dict[str, CheckFunction]:
 
 
 def own_findings(program: Program, run: Run) -> list[Finding]:
-    """Judge a run by its own checks. Ctrl-C ends them; those that are left are unknown."""
+    """Judge a run by the checks that its programs declare, and by its own.
+
+    Ctrl-C ends them; those that are left are unknown.
+    """
     findings: dict[str, Finding] = {}
     interrupted = False
-    for entry in program.checks:
+    for entry in dict.fromkeys([*declared_checks(program), *program.checks]):
         try:
             if interrupted:
                 raise KeyboardInterrupt

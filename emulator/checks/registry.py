@@ -21,7 +21,6 @@ from emulator.checks.channel import (
     check_peer_cap,
     check_range,
 )
-from emulator.checks.cooperation import check_bounded_error, check_consensus_mean, check_convergence
 from emulator.checks.fault_effects import check_fault_effects
 from emulator.checks.faults import (
     check_causes,
@@ -48,7 +47,6 @@ from emulator.checks.run import (
 )
 from emulator.checks.senders import check_copies, check_gnss
 from emulator.checks.tables import check_fault_events, check_reports, check_row_order
-from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict
 from vnet.reports import LONGEST_TEXT
@@ -299,37 +297,6 @@ CHECKS: list[Check] = [
         invalid="a second of silence",
         unknown=BEHIND,
         not_applicable="no program reports so often, or less than a second is left",
-        realtime_sensitive=True,
-    ),
-    Check(
-        check_consensus_mean,
-        REPORTS,
-        "Over the last second, each vehicle's `mean_m` is within 1 m of the mean `common_error_m` of its "
-        "component: links in both directions under the cap, among vehicles that are up.",
-        invalid="further off",
-        unknown=f"further off, less than 10 s after the last fault; {BEHIND}",
-        not_applicable="no mean reported, less than 5 s since the last fault, or no component without exceptions "
-        "to the program in which all report both",
-        realtime_sensitive=True,
-    ),
-    Check(
-        check_convergence,
-        REPORTS,
-        "After each heal the worst component's deviation returns within 10 s to less than twice its level "
-        "before the first fault (at least 0.3 m).",
-        invalid="it does not",
-        unknown=f"it does not, and the run was over sooner; {BEHIND}",
-        not_applicable="no faults, no common error reported, or the next fault came first",
-        realtime_sensitive=True,
-    ),
-    Check(
-        check_bounded_error,
-        REPORTS,
-        f"No common error is over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s, of vehicles that are up, run the "
-        "scenario's program, and have had no faulty receiver for 10 s.",
-        invalid="a divergent vehicle",
-        unknown=BEHIND,
-        not_applicable="no common error reported",
         realtime_sensitive=True,
     ),
     Check(

@@ -38,6 +38,7 @@ from emulator.records.run_folder import (
 from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised
+from emulator.scenario.declared import declared_checks
 from vnet.runtime.environment import arithmetic
 
 
@@ -174,7 +175,7 @@ def _own_findings(
     `write` makes the folder's files should a check ask for them.
     """
     program = recorded.scenario.program
-    if not program.checks:
+    if not program.checks and not declared_checks(program):
         return []
     with redirect_stdout(StringIO()) as printed, signals_handled(signal.default_int_handler, signal.SIGINT):
         findings = own_findings(program, Run(recorded, folder.path, write=write))

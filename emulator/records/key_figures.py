@@ -4,16 +4,49 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-KEY_FIGURES = {
-    "common_error_rmse_m": "common error, RMSE",
-    "deviation_m": "deviation between vehicles",
-    "position_rmse_m": "position, RMSE of the estimates",
-    "fix_rmse_m": "position, RMSE of the raw fixes",
-    "consensus_error_m": "consensus error",
-}
-"""Titles by name; all are in metres, and means after the first fifth of the run."""
-_OF_POSITIONS = ("position_rmse_m", "fix_rmse_m")
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """A figure of the periods, in metres, whose mean after the first fifth of a run is shown by `title`."""
+
+    name: str
+    title: str
+    chart: tuple[str, str, str] | None = None
+    """Id, title and axis of its chart in a comparison."""
+    column: str = ""
+    """Title of its column in the list of runs."""
+    is_less: bool = False
+    """True if narrow screens go without that column."""
+    of_positions: bool = False
+    """True for an error of positions, shown only where programs estimate them."""
+
+
+KEY_FIGURES: list[KeyFigure] = [
+    KeyFigure(
+        "common_error_rmse_m",
+        "common error, RMSE",
+        ("common-error", "Common error", "RMSE of the common error (m)"),
+        "RMSE (m)",
+    ),
+    KeyFigure(
+        "deviation_m",
+        "deviation between vehicles",
+        ("deviation", "Deviation", "deviation (m)"),
+        "deviation (m)",
+        is_less=True,
+    ),
+    KeyFigure(
+        "position_rmse_m",
+        "position, RMSE of the estimates",
+        ("position", "Position", "RMSE of position (m)"),
+        of_positions=True,
+    ),
+    KeyFigure("fix_rmse_m", "position, RMSE of the raw fixes", of_positions=True),
+    KeyFigure("consensus_error_m", "consensus error", ("consensus", "Consensus error", "consensus error (m)")),
+]
+"""All of them, in their order: summary, report, comparison, sweep and list of runs draw from this list."""
 SAME = 1e-9
 """Relative difference of two errors up to which they are those of the same positions."""
 
@@ -25,6 +58,11 @@ def estimates_differ(estimate_m: float | None, fix_m: float | None) -> bool:
 
 def shown_figures(figures: Mapping[str, float | None]) -> dict[str, float]:
     """Return the key figures that a run has, by title: errors of positions only where programs estimate them."""
-    own = estimates_differ(*(figures.get(name) for name in _OF_POSITIONS))
-    values = {title: figures.get(name) for name, title in KEY_FIGURES.items() if own or name not in _OF_POSITIONS}
+    own = estimates_differ(figures.get("position_rmse_m"), figures.get("fix_rmse_m"))
+    values = {each.title: figures.get(each.name) for each in KEY_FIGURES if own or not each.of_positions}
     return {title: value for title, value in values.items() if value is not None}
+
+
+def title_of_figure(name: str) -> str | None:
+    """Return the title of a key figure; None for another figure."""
+    return next((each.title for each in KEY_FIGURES if each.name == name), None)

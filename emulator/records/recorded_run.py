@@ -55,6 +55,7 @@ from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.toml import LARGEST_BYTES
 from emulator.world.link_table import LinkTable
 from emulator.world.links import load_links
+from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
 from emulator.world.world import build_world
 from vnet.bounded import read_regular
@@ -163,6 +164,18 @@ class RecordedRun:
         position_m = self.vectors("position_m") if self.known_m is None else self.known_m
         some = position_m if self.moves else position_m[:1]
         return Places(some, self.moves, self.scenario.period_ns, connectivity, self.scenario.duration_ns)
+
+    def admitted(self, up: Mask, time_ns: int) -> Links:
+        """Return the pairs of a sender and a receiver whose cap admits it when these nodes (N,) are up."""
+        pairs = self.places.links(time_ns)
+        pairs = pairs.of(up[pairs.sender])
+        # For each receiver the nearest first, equally near ones by number.
+        order = np.lexsort((pairs.sender, pairs.distance_m, pairs.receiver))
+        first = np.cumsum(pairs.in_degrees()) - pairs.in_degrees()
+        rank = np.arange(len(order)) - first[pairs.receiver[order]]
+        admitted = np.zeros(len(order), dtype=bool)
+        admitted[order] = rank < self.scenario.radio.max_peers
+        return pairs.of(admitted)
 
     @cached_property
     def radio_inputs(self) -> RadioInputs:

@@ -1,6 +1,7 @@
 """The reference that a run's program declares: an estimator that is told more than any vehicle, run over a run.
 
-It is a class `REFERENCE` of the declared module. Its figures stand beside those of the run that have their names.
+The declared module names its class as `REFERENCE = "module:class"`. Its figures stand beside those of the run that
+have their names.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.connectivity import component_links
 from emulator.records.recorded_run import RecordedRun
-from emulator.scenario.declared import declared_modules
+from emulator.scenario.declared import declared, load_entry
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import components
 from vnet.errors import VnetError
@@ -57,10 +58,10 @@ class Reference(Protocol):
 
 def reference_of(scenario: Scenario) -> type[Reference]:
     """Return the reference that a scenario's programs declare. Raises VnetError if they declare none."""
-    found = [module.REFERENCE for module in declared_modules(scenario.program) if hasattr(module, "REFERENCE")]
-    if not found:
+    entries = declared(scenario.program, "REFERENCE")
+    if not entries:
         raise VnetError("the program declares no reference")
-    return found[0]  # type: ignore[no-any-return]
+    return load_entry(entries[0])  # type: ignore[no-any-return]
 
 
 def reference_series(recorded: RecordedRun) -> dict[str, Array]:

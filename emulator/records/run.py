@@ -13,12 +13,16 @@ from typing import ClassVar
 import numpy as np
 import pyarrow as pa
 
+from emulator.faults.plan import PlannedFault
+from emulator.records.divergence import first_lasting
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import BACKBONE, BACKGROUND, DRIVEN
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
+from emulator.scenario.fault_families import GnssFault
 from emulator.scenario.scenario import Scenario
+from emulator.world.graph import components_of_links
 from vnet.errors import VnetError, did_you_mean, first_names, shown
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
@@ -182,6 +186,26 @@ class Run:
         """Time in s from which on no fault acts; 0 without faults."""
         return self._recorded.last_heal_ns / NS_PER_S
 
+    @property
+    def faults(self) -> Sequence[PlannedFault]:
+        """Faults with `start_ns`, `end_ns` and `label`."""
+        return self._recorded.plan
+
+    @property
+    def rested_s(self) -> float:
+        """Time in s from the end of the last fault to that of the run; negative if a fault acts at the end."""
+        return (self._recorded.closed_ns - self._recorded.last_heal_ns) / NS_PER_S
+
+    @property
+    def links_change(self) -> bool:
+        """True if the vehicles in range of each other change during the run, by other causes than faults."""
+        return self._recorded.topology_changes
+
+    @property
+    def runs_the_program(self) -> Mask:
+        """Vehicles (N,) that run the scenario's program, and none of its exceptions."""
+        return self._recorded.runs_the_program
+
     def index(self, node: str) -> int:
         """Return the index of a vehicle in arrays. Raises VnetError for an id that no vehicle has."""
         if node not in self._recorded.number:
@@ -212,6 +236,45 @@ class Run:
         count = len(self.nodes)
         times_ns: IntArray = np.full(count, round(time_s * NS_PER_S), dtype=np.int64)
         return np.asarray(~self._recorded.is_down(np.arange(count), times_ns))
+
+    @property
+    def up_throughout(self) -> Mask:
+        """Vehicles (periods, N) that are up throughout a period."""
+        up = np.ones((self._recorded.periods, len(self.nodes)), dtype=bool)
+        start_ns = self._recorded.period_starts_ns()
+        for span in self._recorded.down:
+            up[(span.start_ns < start_ns + self.scenario.period_ns) & (span.end_ns > start_ns), span.node] = False
+        return up
+
+    def misled(self, after_s: float = 0.0) -> Mask:
+        """Return the vehicles (periods, N) on whose receiver a fault acts, or has acted in the last `after_s`."""
+        misled = np.zeros((self._recorded.periods, len(self.nodes)), dtype=bool)
+        start_ns = self._recorded.period_starts_ns()
+        for planned in self._recorded.plan:
+            if isinstance(planned.fault, GnssFault):
+                until_ns = planned.end_ns + round(after_s * NS_PER_S)
+                when = (planned.start_ns <= start_ns) & (start_ns < until_ns)
+                # Where it follows a region, every vehicle that has been within it.
+                ever = np.logical_or.accumulate(self._recorded.struck(planned)) | planned.nodes
+                misled |= when[:, None] & ever
+        return misled
+
+    def components(self, time_s: float, among: Mask) -> IntArray:
+        """Return the label (N,) of each vehicle's component at `time_s`.
+
+        A component is connected by links in both directions under the peer cap, `among` these vehicles (N,).
+        """
+        pairs = self._recorded.admitted(among, round(time_s * NS_PER_S))
+        both = pairs.contain(pairs.receiver, pairs.sender)
+        return components_of_links(pairs.sender[both], pairs.receiver[both], pairs.count)
+
+    def first_lasting(self, holds: Mask, duration_s: float) -> dict[int, int]:
+        """Return the period in which a condition (periods, N) had first held for `duration_s`, by vehicle."""
+        return first_lasting(holds, self.scenario.period_ns, duration_s)
+
+    def column(self, name: str) -> Array:
+        """Return a column of `states` over time, (periods, N) or (periods, N, size); NaN where there is none."""
+        return self._recorded.by_period(name)
 
     def reported(self, name: str) -> Array:
         """Return a value of `node.report(…, name=value)` (periods, N); NaN where there is none."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from emulator.pages.canvas import BLUE, RED, Canvas, Span, canvas, legend
 from emulator.pages.page import SIGNS, put_page, render, table
+from emulator.records.key_figures import KEY_FIGURES
 from emulator.records.verdicts import Verdict
 from emulator.report.comparison import A, B, Comparison, turned
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
@@ -22,12 +23,6 @@ from vnet.units import NS_PER_S, title_of
 
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
 REPORTED = "reported by the programs: means and 5 to 95 % of all reports of all vehicles"
-METRICS = {
-    "common-error": ("Common error", "common_error_rmse_m", "RMSE of the common error (m)"),
-    "deviation": ("Deviation", "deviation_m", "deviation (m)"),
-    "position": ("Position", "position_rmse_m", "RMSE of position (m)"),
-    "consensus": ("Consensus error", "consensus_error_m", "consensus error (m)"),
-}
 
 
 def write_comparison(comparison: Comparison, path: Path) -> Path:
@@ -72,7 +67,10 @@ def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, list[str]]]:
         for number, name in enumerate(_own_names(comparison))
     }
     drawers |= {
-        key: (title, partial(_metric, comparison, name, label)) for key, (title, name, label) in METRICS.items()
+        key: (title, partial(_metric, comparison, each.name, axis))
+        for each in KEY_FIGURES
+        if each.chart
+        for key, title, axis in [each.chart]
     }
     drawers["delivered"] = ("Packet delivery ratio", partial(_delivered, comparison))
     drawers["latency"] = ("Latency", partial(_latency, comparison))

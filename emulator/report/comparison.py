@@ -82,7 +82,7 @@ class Comparison:
     def figures(self) -> list[Row]:
         """Key figures with B − A; lengths in metres, ratios in percent."""
         ours, theirs = (shown_figures(record.figures) for record in self.records)
-        titles = [title for title in KEY_FIGURES.values() if title in ours or title in theirs]
+        titles = [each.title for each in KEY_FIGURES if each.title in ours or each.title in theirs]
         rows = [_difference(f"{title} (m)", ours.get(title), theirs.get(title), ".3f") for title in titles]
         ratios = [record.packet_delivery_ratio for record in self.records]
         if any(ratio is not None for ratio in ratios):

@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 from emulator.pages.page import put_page, render
 from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
+from emulator.records.key_figures import KEY_FIGURES
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE, is_run_folder
 from emulator.records.verdict_file import Record
@@ -21,8 +22,6 @@ from vnet.errors import VnetError, first_names
 
 MOST_REPORTED = 6
 """Values of programs' own that have a column: those that most runs report."""
-ERRORS = {"common_error_rmse_m": ("RMSE (m)", False), "deviation_m": ("deviation (m)", True)}
-"""Titles of the errors of estimates, and whether narrow screens go without, by the name of the key figure."""
 Number = tuple[str, str, str]
 """A number in a row: the key by which its column is sorted, its text, and a smaller text below."""
 NONE: Number = ("", "–", "")
@@ -144,9 +143,9 @@ def _columns(records: Sequence[Record]) -> list[Column]:
         Column("vehicles", True, lambda record: _number(record.vehicles, "d")),
         Column("emulated (s)", True, lambda record: _number(record.emulated_s, ".1f")),
     ]
-    for name, (title, is_less) in ERRORS.items():
-        if any(record.figures.get(name) is not None for record in records):
-            columns.append(Column(title, is_less, partial(_figure, name)))
+    for key in KEY_FIGURES:
+        if key.column and any(record.figures.get(key.name) is not None for record in records):
+            columns.append(Column(key.column, key.is_less, partial(_figure, key.name)))
     columns.append(Column("PDR (%)", False, _delivered))
     counts = Counter(name for record in records for name in record.reported)
     for name, _ in counts.most_common(MOST_REPORTED):

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from emulator.pages.canvas import Span
 from emulator.records.events import CUTS_RUN, Event, EventKind
-from emulator.records.key_figures import SAME
+from emulator.records.key_figures import KEY_FIGURES, SAME
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import Reference, reference_of, reference_series
@@ -24,22 +24,12 @@ from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
 from vnet.types import Array
 
-COLUMNS = {
+TABLES = {
     TRACE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
     STATES: ("period", "time_ns", "node", "position_m", "values"),
-    METRICS: (
-        "time_ns",
-        "reporting",
-        "common_error_rmse_m",
-        "deviation_m",
-        "position_rmse_m",
-        "fix_rmse_m",
-        "consensus_error_m",
-        "common_error_anees",
-        "position_anees",
-    ),
 }
-"""The columns that reports need."""
+"""The columns that reports need; of the metrics also the key figures."""
+OF_METRICS = ("time_ns", "reporting", "common_error_anees", "position_anees")
 T = TypeVar("T")
 
 
@@ -56,7 +46,8 @@ class Source:
     @cached_property
     def recorded(self) -> OpenedRun:
         """The run, with the columns that reports need."""
-        return RecordedRun.open(self.folder, COLUMNS)
+        metrics = [*OF_METRICS, *(each.name for each in KEY_FIGURES)]
+        return RecordedRun.open(self.folder, {**TABLES, METRICS: metrics})
 
     @property
     def scenario_text(self) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from emulator.pages.canvas import BLUE, GREEN, GREY, NAVY, ORANGE, PURPLE, RED, SKY, Canvas, canvas, legend
 from emulator.pages.page import render, table
-from emulator.records.key_figures import KEY_FIGURES, estimates_differ
+from emulator.records.key_figures import KEY_FIGURES, estimates_differ, title_of_figure
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import DASHES, Drawing, draw_charts
 from emulator.scenario.scenario import Scenario
@@ -26,8 +26,6 @@ ASIDE = 0.012
 """Step between the intervals of two curves, as a share of the axis."""
 NO_FIGURES = ("seed", "vehicles", "emulated_s", "wall_s", "real_time_factor")
 """Numbers of a row that are no results."""
-OF_ESTIMATES = ("position_rmse_m", "fix_rmse_m", "position_anees")
-"""Figures of positions, shown only where a program estimates them."""
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -85,7 +83,8 @@ def figures_of(rows: Rows, varied: Sequence[str]) -> list[str]:
     found = [n for n in names if n not in (*NO_FIGURES, *varied) and not n.startswith("frames_")]
     numeric = [n for n in found if any(_is_number(row.get(n)) for row in rows)]
     if not any(estimates_differ(row.get("position_rmse_m"), row.get("fix_rmse_m")) for row in rows):
-        numeric = [name for name in numeric if name not in OF_ESTIMATES]
+        of_positions = ["position_anees", *(each.name for each in KEY_FIGURES if each.of_positions)]
+        numeric = [name for name in numeric if name not in of_positions]
     own = [name.removeprefix("last.") for name in numeric if name.startswith("last.")]
     return sorted(numeric, key=lambda name: name.removeprefix("last.") not in own)
 
@@ -100,7 +99,7 @@ def heading(name: str) -> str:
     last = name.startswith("last.")
     plain = name.removeprefix("last.")
     unit = unit_of(plain)
-    title = KEY_FIGURES.get(plain, title_of(plain))
+    title = title_of_figure(plain) or title_of(plain)
     return f"{title}{f' ({unit})' if unit else ''}{', at the end' if last else ''}"
 
 

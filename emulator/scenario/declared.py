@@ -1,4 +1,4 @@
-"""Modules that programs declare: a reference for their figures, which runs in the emulator's process.
+"""Modules that programs declare: checks and a reference, which run in the emulator's process.
 
 A program's module names one in a constant, `DECLARES = "package.module"`. The constant is read from the source, so
 that no program is imported here. docs/how-to/own-figures.md describes such a module.
@@ -13,6 +13,7 @@ from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from emulator.scenario.own_functions import in_words
 from emulator.scenario.program import Program
@@ -21,18 +22,51 @@ from vnet.errors import ScenarioError
 CONSTANT = "DECLARES"
 
 
-def declared_modules(program: Program) -> list[ModuleType]:
-    """Import the modules that a scenario's programs declare, each once. Raises ScenarioError."""
-    entries = [each.entry.partition(":")[0] for each in (program, *program.exceptions)]
-    names = dict.fromkeys(filter(None, map(_declared_by, entries)))
-    return [_imported(name) for name in names]
+def declared(program: Program, name: str) -> list[Any]:
+    """Return what the modules that a scenario's programs declare hold by this name. Raises ScenarioError."""
+    modules = map(_imported, _declared(program))
+    return [getattr(module, name) for module in modules if hasattr(module, name)]
+
+
+def declared_checks(program: Program) -> list[str]:
+    """Return the checks that a scenario's programs declare, `CHECKS`, as entries; so is a module that fails."""
+    entries: list[str] = []
+    for module in _declared(program):
+        try:
+            entries += getattr(_imported(module), "CHECKS", ())
+        except ScenarioError:
+            entries.append(f"{module}:CHECKS")  # its check says why
+    return entries
+
+
+def are_here(program: Program) -> bool:
+    """Return whether all programs of a scenario are found, so that what they declare is known."""
+    return all(module in sys.modules or _text(module) for module in _modules(program))
+
+
+def load_entry(entry: str) -> Any:
+    """Import what a declared `module:name` names. Raises ScenarioError."""
+    module, _, name = entry.partition(":")
+    found = getattr(_imported(module), name, None)
+    if found is None:
+        raise ScenarioError(f"{entry!r}: module {module} has no {name!r}")
+    return found
+
+
+def _declared(program: Program) -> list[str]:
+    """Return the names of the declared modules, each once."""
+    return list(dict.fromkeys(filter(None, map(_declared_by, _modules(program)))))
+
+
+def _modules(program: Program) -> list[str]:
+    return [each.entry.partition(":")[0] for each in (program, *program.exceptions)]
 
 
 def _imported(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except (Exception, SystemExit) as error:
-        raise ScenarioError(f"{CONSTANT} = {name!r}: cannot import: {in_words(error)}") from error
+        raise ScenarioError(f"{CONSTANT}: cannot import {name!r}: {in_words(error)}") from error
 
 
 def _declared_by(module: str) -> str | None:
@@ -41,8 +75,8 @@ def _declared_by(module: str) -> str | None:
         name = getattr(sys.modules[module], CONSTANT, None)
         return name if isinstance(name, str) else None
     try:
-        tree = ast.parse(_source(module))
-    except (OSError, SyntaxError, ValueError, ImportError):
+        tree = ast.parse(_text(module))
+    except (SyntaxError, ValueError):
         return None
     for statement in tree.body:
         match statement:
@@ -51,11 +85,14 @@ def _declared_by(module: str) -> str | None:
     return None
 
 
-def _source(module: str) -> str:
+def _text(module: str) -> str:
     """Return the source of a module without importing it, or a package that it is in; "" where there is none."""
     first, *others = module.split(".")
-    spec, name = find_spec(first), first
-    for part in others:
-        name = f"{name}.{part}"
-        spec = None if spec is None else PathFinder.find_spec(name, spec.submodule_search_locations)
-    return Path(spec.origin).read_text() if spec is not None and spec.origin and spec.has_location else ""
+    try:
+        spec, name = find_spec(first), first
+        for part in others:
+            name = f"{name}.{part}"
+            spec = None if spec is None else PathFinder.find_spec(name, spec.submodule_search_locations)
+        return Path(spec.origin).read_text() if spec is not None and spec.origin and spec.has_location else ""
+    except (OSError, ValueError, ImportError):
+        return ""

@@ -22,9 +22,9 @@ class CommonError(Section):
     sigma_m: float = Field(3.0, ge=0, le=WILD_M)
     """Its standard deviation in each axis: by default that of ionosphere and orbits, so that all fixes are some
     metres off in the same direction. For studies that are not about positioning: 0. Of a recorded error what the
-    hears-all bound assumes."""
+    reference of a program assumes."""
     tau_s: float = Field(600.0, gt=0)
-    """Its correlation time. Of a recorded error what the hears-all bound assumes."""
+    """Its correlation time. Of a recorded error what the reference of a program assumes."""
     path: Path | None = None
     """`file`: CSV, relative to the scenario file, with the columns time_s, east_m, north_m; or of several receivers
     NAME_east_m and NAME_north_m each. Then their mean is common, and the rest is each receiver's own: vehicles

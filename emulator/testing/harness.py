@@ -329,6 +329,7 @@ class RunHarness:
         judgement = self.end()
         left_out = {skipped.name: skipped.reason for skipped in judgement.not_exercised}
         known = {check.name: check for check in judgement.checks}
+        names = tuple(PREFIX + name if PREFIX + name in {*known, *left_out} else name for name in names)
         for name in names:
             if name not in known and name not in left_out:
                 raise VnetError(f"no check is called {name!r}; there are: {', '.join([*known, *left_out])}")

@@ -48,4 +48,4 @@ class Content:
 
 
 EVERYTHING = Content(common=True, position=True, consensus=True, weights=True, busy=True)
-"""All that the cooperative positioning program shows, without values of its own."""
+"""All views of estimates and of the radio, without values of a program's own."""

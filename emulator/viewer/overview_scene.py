@@ -13,7 +13,6 @@ import rerun as rr
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import WARNING, EventKind, level_of
-from emulator.records.paper_values import paper_rmse
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
@@ -40,7 +39,7 @@ from emulator.viewer.drawing import (
     outcome_colours,
 )
 from emulator.viewer.radio_scene import next_charts_s
-from emulator.viewer.reference import DrawnReference
+from emulator.viewer.reference import DrawnReference, published
 from vnet.errors import VnetError, first_names
 
 LANE_HALF_LENGTH_M = 250.0
@@ -68,7 +67,7 @@ class OverviewScene:
             self._reference: DrawnReference | None = DrawnReference(scene)
         except VnetError:
             self._reference = None
-        self._paper = paper_rmse(scene)
+        self._published = published(scene).get("common_error_rmse_m")
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
         self._known_faults: set[str] = set()
@@ -108,8 +107,8 @@ class OverviewScene:
         common = [("RMSE", RED, 2.0), ("deviation between vehicles", SKY, 2.0)]
         if self._reference is not None:
             common.append((self._reference.label, GREEN, 1.5))
-        if self._paper is not None:
-            common.append((self._paper[0], GREY, 1.5))
+        if self._published is not None:
+            common.append((self._published[0], GREY, 1.5))
         canvas.series("figures/common", common)
         canvas.states("faults/down", {NOBODY: DARK})
         consensus = [("consensus error", BLUE, 2.0), ("error of the network's mean", GREEN, 1.5)]
@@ -175,8 +174,8 @@ class OverviewScene:
         common = [figure("common_error_rmse_m"), figure("deviation_m")]
         if self._reference is not None:
             common.append(self._reference.step(period.message).get("common_error_rmse_m", float("nan")))
-        if self._paper is not None:
-            common.append(self._paper[1])
+        if self._published is not None:
+            common.append(self._published[1])
         plot("figures/common", *common)
         plot("figures/consensus", figure("consensus_error_m"), figure("bias_m"))
         plot("figures/position", figure("position_rmse_m"), figure("fix_rmse_m"))

@@ -11,8 +11,10 @@ import pyarrow as pa
 
 from emulator.records.reference import Setting, reference_of
 from emulator.records.tables import STATES
+from emulator.scenario.declared import declared, load_entry
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
+from vnet.errors import VnetError
 from vnet.types import Array
 
 
@@ -43,3 +45,15 @@ class DrawnReference:
             return unpack(data)[:, 0].astype(float)
         rows = unpack(data, kind.list_size).astype(float)
         return np.broadcast_to(rows, (self._count, kind.list_size))
+
+
+def published(scene: Mapping[str, Any]) -> dict[str, tuple[str, float]]:
+    """Return what has been published of such a run, as its programs declare it: a label and a value by figure."""
+    found: dict[str, tuple[str, float]] = {}
+    try:
+        scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
+        for entry in declared(scenario.program, "PUBLISHED"):
+            found |= load_entry(entry)(scene)
+    except VnetError:  # a run is drawn all the same
+        return {}
+    return found

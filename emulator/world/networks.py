@@ -26,7 +26,7 @@ COLUMNS = ("id", "x_m", "y_m", "heading_rad")
 REFERENCE_RANGE_M = 3000.0
 """Radio range at which the degrees below hold."""
 MAX_COORDINATE_M = 2e7
-"""Bound of coordinates: twice what projections use, and what the cooperative program's frames hold in 32-bit cm."""
+"""Bound of coordinates: twice what projections use, and what 32 bits hold in cm."""
 LARGEST_EXTENT_DEG = 2.0
 """Extent of the largest region whose vehicles are taken for positions in degrees."""
 DEGREES_NOTE = "x_m and y_m look like degrees, and are taken for metres; trips may be in lat_deg and lon_deg"

@@ -7,9 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cli.commands import app
-from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.world.world import build_world
 from studies import paper, reports
+from studies.paper_values import PAPER_RANGE_M
 
 pytestmark = pytest.mark.slow
 

@@ -6,9 +6,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator.records.paper_values import PAPER_VEHICLES
 from studies import network_figures, reports, result_figures
 from studies.paper import ALPHAS, load_positions
+from studies.paper_values import PAPER_VEHICLES
 from studies.tables import with_error
 
 pytestmark = pytest.mark.slow

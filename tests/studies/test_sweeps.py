@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from emulator.cells import cells as cells_module
 from emulator.cli.commands import app
 from emulator.records.metrics import anees_band
-from emulator.records.paper_values import PAPER_VEHICLES
 from studies import divergence, paper, tempering
+from studies.paper_values import PAPER_VEHICLES
 
 pytestmark = pytest.mark.slow
 

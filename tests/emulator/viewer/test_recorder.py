@@ -8,12 +8,12 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from agents.cooperative.paper_values import paper_rmse
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import Event
-from emulator.records.paper_values import paper_rmse
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import event_message, unpack
@@ -491,8 +491,8 @@ def test_the_papers_value_only_where_it_applies(
     program = {"entry": "agents.cooperative:main", "options": {}, **program}
     scenario = tomli_w.dumps({"network": network, "program": program})
     scene = {"scenario": scenario, "node_ids": ["v"] * 24, "range_m": 3000.0}
-    assert paper_rmse(scene) == found
-    assert paper_rmse({**scene, "range_m": 500.0}) is None
+    assert paper_rmse(scene).get("common_error_rmse_m") == found
+    assert paper_rmse({**scene, "range_m": 500.0}) == {}
 
 
 def test_nothing_plotted_sends_nothing(tmp_path: Path) -> None:

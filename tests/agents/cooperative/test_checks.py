@@ -2,15 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict
+from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
+from emulator.checks.own import own_findings
 from emulator.records.events import Event
-from tests.emulator.checks.test_faults import not_valid, simulated
-from tests.emulator.checks.test_judge import checked, result, verdict
+from emulator.records.run import Run
+from tests.emulator.checks.test_faults import simulated
 from vnet.node import Node
+
+DECLARES = "agents.cooperative.declared"
 
 BLOCK = {"kind": "block", "at_s": 2.0, "duration_s": 1.0}
 COOPERATION = ("consensus_mean", "convergence", "bounded_error")
@@ -26,6 +30,13 @@ async def believes(node: Node) -> None:
         if wrong and node.id == wrong["node"] and wrong["from_s"] <= fix.time_ns / 1e9 < wrong["to_s"]:
             values[wrong["what"]][1] += wrong["by_m"]
         node.report(fix.position_m, fix.covariance_m2, **values)
+
+
+async def silent(node: Node) -> None:
+    """Report only the fix."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"hello")
+        node.report(fix.position_m, fix.covariance_m2)
 
 
 def run(
@@ -48,6 +59,32 @@ def run(
     )
 
 
+def findings(recorded: RecordedRun) -> dict[str, CheckResult | NotExercised]:
+    """All findings of a run, those of the declared checks without their prefix."""
+    judgement = judge(recorded, own_findings(recorded.scenario.program, Run(recorded, Path())))
+    found: list[CheckResult | NotExercised] = [*judgement.checks, *judgement.not_exercised]
+    return {each.name.removeprefix("own:"): each for each in found}
+
+
+def not_valid(recorded: RecordedRun) -> dict[str, Verdict]:
+    checks = [each for each in findings(recorded).values() if isinstance(each, CheckResult)]
+    return {each.name.removeprefix("own:"): each.verdict for each in checks if each.verdict is not Verdict.VALID}
+
+
+def result(recorded: RecordedRun, name: str) -> CheckResult | NotExercised:
+    return findings(recorded)[name]
+
+
+def checked(recorded: RecordedRun, name: str) -> CheckResult:
+    found = result(recorded, name)
+    assert isinstance(found, CheckResult)
+    return found
+
+
+def verdict(recorded: RecordedRun, name: str) -> Verdict:
+    return checked(recorded, name).verdict
+
+
 def test_vehicles_that_agree_and_recover_are_valid() -> None:
     recorded = run(BLOCK)
     assert not_valid(recorded) == {}
@@ -55,7 +92,7 @@ def test_vehicles_that_agree_and_recover_are_valid() -> None:
 
 
 def test_programs_without_beliefs_leave_nothing_to_judge() -> None:
-    recorded = simulated(BLOCK)
+    recorded = simulated(BLOCK, program=f"{__name__}:silent")
     assert all(isinstance(result(recorded, name), NotExercised) for name in COOPERATION)
 
 

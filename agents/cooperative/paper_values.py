@@ -25,21 +25,23 @@ def network_file(network: str) -> str:
     return f"network_{network}.csv"
 
 
-def paper_rmse(scene: Mapping[str, Any]) -> tuple[str, float] | None:
-    """Return the paper's result for the network and mechanism of this run: a label and metres; None for other runs.
+def paper_rmse(scene: Mapping[str, Any]) -> dict[str, tuple[str, float]]:
+    """Return the paper's result for the network and mechanism of this run, a label and metres, by figure.
 
+    Other runs have none. `scene` is the message of a run's constants (docs/messages.md).
     The network is known by its file's name and its number of vehicles, the mechanism by program and `fusion`.
     """
     scenario = tomllib.loads(scene["scenario"])
     name = Path(scenario["network"].get("path", "")).name
     network = next((each for each in PAPER_VEHICLES if network_file(each) == name), None)
     if network is None or PAPER_VEHICLES[network] != len(scene["node_ids"]) or scene["range_m"] != PAPER_RANGE_M:
-        return None
+        return {}
     program = scenario["program"]
     mechanism = {
         "agents.centralized:main": "centralized",
         "agents.cooperative:main": program["options"].get("fusion", "optimized"),
     }.get(program["entry"])
     if mechanism not in PAPER_RMSE_M:
-        return None
-    return f"the paper's RMSE: {mechanism}, {network.upper()}", PAPER_RMSE_M[mechanism][network]
+        return {}
+    label = f"the paper's RMSE: {mechanism}, {network.upper()}"
+    return {"common_error_rmse_m": (label, PAPER_RMSE_M[mechanism][network])}
