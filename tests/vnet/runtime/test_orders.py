@@ -1,6 +1,7 @@
 """The order of events that a node sees: asyncio's own primitives hold in all, and its promises are kept."""
 
 import asyncio
+import os
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -256,9 +257,9 @@ PRIMITIVES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("program", PRIMITIVES, ids=lambda program: program.__name__)
 def test_asyncio_s_primitives_hold_in_every_order(program: Callable[[Node], Awaitable[None]]) -> None:
-    """626 shuffles and 626 times PCT of each of eight programs: 10 016 orders without an alarm."""
+    """Without an alarm. In CI there are 626 shuffles and 626 times PCT of each of eight programs: 10 016 orders."""
     different = set()
-    for seed in range(626):
+    for seed in range(626 if os.environ.get("CI") else 110):
         for order in (Order("shuffle", seed), Order("pct", seed, 1 + seed % 5, 50)):
             different.add(tuple((each.time_ns, each.decision, each.label) for each in run(program, order)))
     assert len(different) > 100, "orders were explored"
