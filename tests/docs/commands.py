@@ -16,6 +16,8 @@ import typer.main
 
 import agents.cli
 import emulator.cli.commands
+from tests.support import forked_commands
+from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
 
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
@@ -90,7 +92,7 @@ def run(words: Sequence[str], status: int, folder: Path) -> str | None:
         with forgetting(folder):
             text, ended = captured(typer.main.get_command(APPS["vnet"]), arguments)
     else:
-        text, ended = _process(process(words))
+        text, ended = _process(words)
     if ended == UNKNOWN and "realtime" in arguments:
         return None
     if ended != status:
@@ -166,9 +168,11 @@ def captured(command: Any, arguments: list[str]) -> tuple[str, int]:
     return out.getvalue() + error.getvalue(), status if isinstance(status, int) else 1
 
 
-def _process(words: list[str]) -> tuple[str, int]:
-    out, error = subprocess.PIPE, subprocess.STDOUT
-    done = subprocess.run(words, stdin=subprocess.DEVNULL, stdout=out, stderr=error, text=True, timeout=TIMEOUT_S)
+def _process(words: Sequence[str]) -> tuple[str, int]:
+    started = process(words)
+    start = forked_commands.run if started[: len(VNET)] == VNET else subprocess.run
+    nothing, out, error = subprocess.DEVNULL, subprocess.PIPE, subprocess.STDOUT
+    done = start(started, stdin=nothing, stdout=out, stderr=error, text=True, timeout=TIMEOUT_S)
     return done.stdout, done.returncode
 
 

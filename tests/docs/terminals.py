@@ -10,8 +10,10 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from tests.docs.commands import DocsError
+from tests.support.forked_commands import VNET, Command
 
 TIMEOUT_S = 120.0
 """Seconds of wall clock until a command must have printed what it should, or ended."""
@@ -26,7 +28,7 @@ class Terminals:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._stack = ExitStack()
-        self._started: list[tuple[str, subprocess.Popen[bytes], Path, int]] = []
+        self._started: list[tuple[str, subprocess.Popen[Any], Path, int]] = []
         self._ports: set[str] = set()
 
     def start(self, words: Sequence[str], process: Sequence[str], status: int, place: str) -> None:
@@ -35,7 +37,8 @@ class Terminals:
             self._reserve(port)
         printed = self._folder.parent / f"{self._folder.name}.terminal-{len(self._started)}.log"
         with printed.open("wb") as log:
-            started = subprocess.Popen(process, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
+            start = Command if list(process[: len(VNET)]) == VNET else subprocess.Popen
+            started = start(process, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
         self._stack.callback(started.wait)
         self._stack.callback(started.kill)
         self._started.append((f"{place}: {shlex.join(words)}", started, printed, status))

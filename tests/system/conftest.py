@@ -18,9 +18,10 @@ import pytest
 
 from emulator.cli.commands import app
 from emulator.terminal.console import run_app
+from tests.support import forked_commands
+from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
 
-VNET = [sys.executable, "-P", "-m", "emulator.cli"]
 AGENT = [sys.executable, "-P", "-m", "agents.cli"]
 TIMEOUT_S = 300
 """Only against hanging for ever; nothing here is judged by how long it takes."""
@@ -87,7 +88,7 @@ APART = {"--log-format", "--quiet", "--rerun"}
 def vnet(tmp_path: Path) -> Vnet:
     """Run a vnet command to its end: vnet("run", "scenarios/twelve.toml", "--seed", "3").
 
-    What starts processes is a process itself; a simulation runs in this one.
+    What starts processes is a process itself, forked; a simulation runs in this one.
     """
     return command_in(tmp_path)
 
@@ -104,7 +105,7 @@ def command_in(parent: Path) -> Vnet:
         words = [command, scenario, "--out", str(folder), *plain, *options]
         if command == "simulate" and APART.isdisjoint(options):
             return Finished(*in_this_process(words), folder)
-        done = subprocess.run([*VNET, *words], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
+        done = forked_commands.run([*VNET, *words], cwd=ROOT, capture_output=True, timeout=TIMEOUT_S)
         return Finished(done.returncode, done.stdout, done.stderr, folder)
 
     return run
@@ -127,7 +128,7 @@ def run_until(enough: Callable[[], bool], folder: Path, scenario: str, *options:
     """`vnet run`, ended by Ctrl-C once it is `enough`: what a run in real time shows in a fixed time depends on the
     machine. The run must be long."""
     command = [*VNET, "run", scenario, "--out", str(folder), "--no-report", *PATIENT, *options]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + TIMEOUT_S
             while not enough():

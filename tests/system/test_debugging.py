@@ -14,8 +14,9 @@ import pytest
 
 from tests.docs.markdown import blocks
 from tests.docs.pages import shows
+from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
-from tests.system.conftest import TIMEOUT_S, VNET
+from tests.system.conftest import TIMEOUT_S
 
 PROGRAM = """
 async def main(node):

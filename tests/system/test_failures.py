@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from emulator.checks.judge import check_run
+from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.processes import has_ended
-from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet, killed_at_last, running_agents
+from tests.system.conftest import TIMEOUT_S, Finished, Vnet, killed_at_last, running_agents
 
 LONG = [
     "--program",
@@ -30,7 +31,7 @@ LONG = [
 def long_run(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`vnet run` of a run that would take very long, once it has emulated its first periods."""
     command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(folder), *LONG, *options]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         while "real time" not in (line := process.stderr.readline()):
             assert line, "it ended early"
@@ -66,7 +67,7 @@ def test_an_interruption_before_the_start_is_as_clean(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     command = [*VNET, "emulator", "scenarios/beacon.toml", "--listen", "tcp/127.0.0.1:0", "--out", str(folder)]
     with (
-        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+        Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
         killed_at_last(process),
     ):
         assert process.stderr is not None
@@ -107,9 +108,7 @@ def test_a_killed_run_can_still_be_read(tmp_path: Path) -> None:
         wait_for_exit(agents)
     done = Finished(-9, "", "", folder)
     assert done.events_of("started")
-    judged = subprocess.run(
-        [*VNET, "check", str(folder)], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S
-    )
+    judged = run([*VNET, "check", str(folder)], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert judged.returncode == 2
     assert judged.stderr.count("\n") == 1
     assert "not the folder of a finished run" in judged.stderr
@@ -128,7 +127,7 @@ def test_a_port_in_use_is_one_line(vnet: Vnet) -> None:
 def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(tmp_path / "file" / "run")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 2  # what is going to run, and why it is not
     assert "cannot write" in done.stderr.splitlines()[1]

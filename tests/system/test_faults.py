@@ -13,9 +13,10 @@ from typing import Any
 import pytest
 import tomli_w
 
+from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
 from tests.support.processes import has_ended
-from tests.system.conftest import TIMEOUT_S, VNET, Vnet, heard_by, run_until, zygote_of
+from tests.system.conftest import TIMEOUT_S, Vnet, heard_by, run_until, zygote_of
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
 
@@ -91,7 +92,7 @@ def events_of(folder: Path, kind: str) -> list[dict[str, Any]]:
 def started(scenario: str, folder: Path, *options: str, after: str) -> Iterator[subprocess.Popen[str]]:
     """`vnet run`, once the event `after` has happened."""
     command = [*VNET, "run", scenario, "--out", str(folder), *options]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + TIMEOUT_S
             while not events_of(folder, after):

@@ -15,9 +15,10 @@ import pytest
 import tomli_w
 import zenoh
 
+from tests.support.forked_commands import VNET
 from tests.support.namespaces import NetworkHost, network, why_impossible
 from tests.support.paths import ROOT
-from tests.system.conftest import PATIENT, TIMEOUT_S, VNET, Finished, Vnet
+from tests.system.conftest import PATIENT, TIMEOUT_S, Finished, Vnet
 from vnet.transport import keys
 from vnet.transport.access import Access, host_user
 from vnet.transport.session import open_client, open_router, router_endpoint

@@ -5,7 +5,6 @@ import os
 import shlex
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,11 @@ from typing import Any
 import pytest
 
 from emulator.viewer.sinks import is_closed
+from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.processes import has_ended
 from tests.support.recordings import descendants, listening_addresses, read_back, rrd
-from tests.system.conftest import TIMEOUT_S, VNET, killed_at_last
+from tests.system.conftest import TIMEOUT_S, killed_at_last
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
 LONG: dict[str, dict[str, Any]] = {
@@ -113,7 +113,7 @@ def test_what_is_served_is_served_here_only_and_nothing_of_it_outlives_an_emulat
     long = {**LONG, "run": {**LONG["run"], "duration_s": 7200.0, "orphan_timeout_s": 0.5}}
     with started(write(tmp_path, [], **long), folder, "--rerun", "serve", after="started") as process:
         wait_for_recording(folder, process)
-        told = subprocess.run([*VNET, "view", str(folder)], cwd=ROOT, capture_output=True, text=True)
+        told = run([*VNET, "view", str(folder)], cwd=ROOT, capture_output=True, text=True)
         assert told.returncode == 0, told.stderr
         assert told.stdout.startswith("the run is on\nviewer: rerun --connect rerun+http://127.0.0.1:")
         pids = descendants(observer_of(folder))
@@ -142,12 +142,12 @@ def test_the_server_of_web_pages_ends_with_an_observer_that_is_killed(tmp_path: 
 def test_a_finished_run_is_served_until_it_is_enough(tmp_path: Path, ending: signal.Signals) -> None:
     folder = tmp_path / "run"
     scenario = write(tmp_path, [], run={"duration_s": 1.0}, program={"entry": "agents.beacon:main"})
-    done = subprocess.run([*VNET, "simulate", scenario, "--out", str(folder), "--rerun", "save"], cwd=ROOT)
+    done = run([*VNET, "simulate", scenario, "--out", str(folder), "--rerun", "save"], cwd=ROOT)
     assert done.returncode == 0
     whole = (folder / "recording.rrd").read_bytes()
     (folder / "recording.rrd").write_bytes(whole[:-100])  # as if it had been killed
     command = [*VNET, "view", str(folder), "--serve"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process, killed_at_last(process):
+    with Command(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process, killed_at_last(process):
         assert process.stdout is not None
         assert "was not closed" in process.stdout.readline()
         assert process.stdout.readline().startswith("serving ")
@@ -169,8 +169,8 @@ def test_there_is_nothing_to_view(tmp_path: Path) -> None:
     folder = tmp_path / "run"
 
     def view() -> str:
-        command = [sys.executable, "-P", "-m", "emulator.cli", "view", str(folder)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        command = [*VNET, "view", str(folder)]
+        done = run(command, cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1
         return done.stderr

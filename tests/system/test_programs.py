@@ -1,12 +1,13 @@
 """Whole runs of programs that behave and misbehave, live and simulated."""
 
-import subprocess
 from pathlib import Path
 
 import pytest
 
+from tests.support import forked_commands
+from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
-from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet, heard_by, run_until
+from tests.system.conftest import TIMEOUT_S, Finished, Vnet, heard_by, run_until
 
 OPTIONS = ["--duration", "2", "--set", "network.vehicles=4"]
 
@@ -116,7 +117,7 @@ def test_a_program_that_a_package_of_vnet_s_own_hides_is_named_in_one_line(
     file.write_text("async def main(node):\n    pass\n")
     scenario = str(ROOT / "scenarios" / "beacon.toml")
     arguments = [command, scenario, "--program", f"{package}:main", "--out", "run", "--quiet", *OPTIONS]
-    done = subprocess.run([*VNET, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = forked_commands.run([*VNET, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert done.returncode != 0
     assert done.stderr.count("\n") == 1
     assert done.stderr.endswith(f"{package} is a package of vnet's own: rename {file}\n")

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
-from tests.system.conftest import TIMEOUT_S, VNET
+from tests.system.conftest import TIMEOUT_S
 
 PROGRAM = """
 import ctypes, os, pathlib, signal

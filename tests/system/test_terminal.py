@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import struct
-import subprocess
 import termios
 from collections.abc import Callable
 from dataclasses import fields
@@ -22,9 +21,10 @@ from emulator.drivers.control import ask, control_endpoint
 from emulator.drivers.status import Snapshot
 from emulator.scenario.scenario import load_scenario
 from emulator.terminal.console import run_app
+from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.screen import Screen
-from tests.system.conftest import TIMEOUT_S, VNET, Vnet
+from tests.system.conftest import TIMEOUT_S, Vnet
 from tests.system.test_failures import long_run
 from vnet.errors import TransportError
 from vnet.transport import session
@@ -44,7 +44,7 @@ def at_a_terminal(
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", HEIGHT, WIDTH, 0, 0))
     kept = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
     environment = {**kept, "TERM": "xterm-256color", "PYTHONHASHSEED": "0", **environment}
-    with subprocess.Popen([*VNET, *arguments], cwd=ROOT, stdout=slave, stderr=slave, env=environment) as process:
+    with Command([*VNET, *arguments], cwd=ROOT, stdout=slave, stderr=slave, env=environment) as process:
         os.close(slave)
         written = b""
         done = False
@@ -138,7 +138,7 @@ def fields_in_the_docs(heading: str) -> set[str]:
 
 
 def test_the_docs_name_every_field(tmp_path: Path) -> None:
-    told = subprocess.run(
+    told = run(
         [*VNET, "simulate", *SHORT, "--out", str(tmp_path / "run"), "--log-format", "json"],
         cwd=ROOT,
         capture_output=True,
@@ -232,14 +232,14 @@ def test_a_mistake_of_a_machine_gets_an_object(arguments: list[str], capsys: pyt
 def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with long_run(folder) as process:
-        told = subprocess.run([*VNET, "status", "--run", str(folder)], cwd=ROOT, capture_output=True, text=True)
+        told = run([*VNET, "status", "--run", str(folder)], cwd=ROOT, capture_output=True, text=True)
         assert told.returncode == 0, told.stderr
         rows = [line.split() for line in told.stdout.splitlines()]
         assert rows[0][:6] == ["beacon", "lockstep", "·", "seed", "1", "·"]
         (vehicles,) = [row for row in rows if row and row[0] == "vehicles"]
         assert vehicles == ["vehicles", "●●●", "3", "up"]
         assert "\x1b" not in told.stdout
-        asked = subprocess.run([*VNET, "status", "--run", str(folder), "--json"], capture_output=True, text=True)
+        asked = run([*VNET, "status", "--run", str(folder), "--json"], capture_output=True, text=True)
         status = json.loads(asked.stdout)
         assert (status["run"], status["phase"], status["node_ids"]) == ("beacon", "running", ["v01", "v02", "v03"])
         assert 0 < status["emulated_s"] < status["duration_s"] == 3600

@@ -4,7 +4,6 @@ import inspect
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from io import StringIO
@@ -21,6 +20,7 @@ from emulator.records.states import STATES
 from emulator.terminal.summary import print_checks, print_offending
 from tests.emulator.checks.test_faults import with_cells
 from tests.emulator.checks.test_judge import first, four, result, with_names
+from tests.support.forked_commands import VNET, run
 from tests.support.paths import ROOT
 from vnet.node import Node
 
@@ -127,9 +127,7 @@ def replayed(command: str, program: str, folder: Path, asked: str = "--check-det
 
 
 def vnet(command: str, *options: str) -> subprocess.CompletedProcess[str]:
-    arguments = [sys.executable, "-P", "-m", "emulator.cli", command, "scenarios/beacon.toml", *options]
-    environment = {**os.environ, "PYTHONHASHSEED": "0"}  # it need not start itself anew for that
-    return subprocess.run(arguments, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    return run([*VNET, command, "scenarios/beacon.toml", *options], cwd=ROOT, capture_output=True, timeout=300)
 
 
 @pytest.mark.parametrize("command", ["simulate", "run"])

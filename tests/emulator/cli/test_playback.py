@@ -18,6 +18,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from tests.emulator.stream.test_playback import Watched, watch
+from tests.support.forked_commands import VNET, Command
 
 pytestmark = pytest.mark.slow
 
@@ -124,8 +125,8 @@ def test_what_cannot_be_is_said_in_one_line(
 
 @contextmanager
 def playing(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-P", "-m", "emulator.cli", "play", str(folder), "--serve", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    command = [*VNET, "play", str(folder), "--serve", *arguments]
+    with Command(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
         finally:

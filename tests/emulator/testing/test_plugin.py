@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.support.forked_commands import VNET, run
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -267,8 +268,8 @@ def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester) 
     run_tests(pytester, LIVE_OR_NOT).assert_outcomes(passed=2)
     folders = sorted((pytester.path.parent / "basetemp").glob("**/vnet-1"))
     again = pytester.path / "again"
-    command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", str(folders[0] / "scenario.toml")]
-    subprocess.run([*command, "--out", str(again)], cwd=ROOT, capture_output=True, check=False, timeout=120)
+    command = [*VNET, "simulate", str(folders[0] / "scenario.toml")]
+    run([*command, "--out", str(again)], cwd=ROOT, capture_output=True, timeout=120)
     fingerprints = [
         (verdict["trace_sha256"], verdict["metrics_sha256"], verdict["emulated_s"])
         for verdict in map(verdict_of, [*folders, again])
@@ -292,8 +293,8 @@ async def test_order(vnet_emulation):
     result.assert_outcomes(passed=1)
     (folder,) = (pytester.path.parent / "basetemp").glob("**/vnet-1")
     again = pytester.path / "again"
-    command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", str(folder / "scenario.toml")]
-    subprocess.run([*command, "--out", str(again)], cwd=ROOT, capture_output=True, check=False, timeout=120)
+    command = [*VNET, "simulate", str(folder / "scenario.toml")]
+    run([*command, "--out", str(again)], cwd=ROOT, capture_output=True, timeout=120)
     first, second = verdict_of(folder), verdict_of(again)
     assert first["trace_sha256"] == second["trace_sha256"]
     tapes = [(each / "tape.jsonl").read_text() for each in (folder, again)]
