@@ -3,8 +3,6 @@
 import io
 import json
 import signal
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
@@ -26,6 +24,8 @@ from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.regression_test import TEST_FILE, failures
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.trial import TrialPool
+from tests.support import forked_commands
+from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
 from vnet.errors import ProgramError, ScenarioError, VnetError
 
@@ -177,22 +177,21 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
     assert (status, "1 run, 0 failed" in said) == (3, True)
 
 
-def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path) -> None:
+def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path, pytester: pytest.Pytester) -> None:
     folder = tmp_path / "campaign"
     plan = Plan.of(planted("stubborn"), "kill", 1, seed=1, limit_s=2.0, shrink_steps=0)
     assert run(plan, folder)[0] == 1
     (row,) = results_of(folder)
     assert row["failed"] == {"hung": "not over within 2 s of wall clock; logs/stacks.txt says where it stood"}
     assert load_scenario(Path(row["folder"]) / "scenario.toml").fault
-    assert "hung" in said_by_pytest(Path(row["folder"]) / TEST_FILE)
+    assert "hung" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)
 
 
-def said_by_pytest(test: Path) -> str:
+def said_by_pytest(test: Path, pytester: pytest.Pytester) -> str:
     """The output of pytest on a failure's test, which fails."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(test)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 1, done.stdout
-    return done.stdout
+    done = pytester.runpytest_inprocess("-q", "-p", "no:cacheprovider", str(test))
+    assert done.ret == 1, done.stdout.str()
+    return done.stdout.str()
 
 
 def test_a_failure_that_has_gone_away_lets_its_test_pass(tmp_path: Path) -> None:
@@ -200,7 +199,7 @@ def test_a_failure_that_has_gone_away_lets_its_test_pass(tmp_path: Path) -> None
     assert failures(tmp_path / "scenario.toml", tmp_path / "run", limit_s=60.0) == {}
 
 
-def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path) -> None:
+def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path, pytester: pytest.Pytester) -> None:
     plan = Plan.of(planted("proud"), "partition,block", 3, seed=1, shrink_steps=4)
     run(plan, tmp_path / "proud")
     assert any("finite" in row.get("failed", {}) for row in results_of(tmp_path / "proud"))
@@ -209,7 +208,7 @@ def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path) -> None:
     (row,) = results_of(tmp_path / "growing")
     assert list(row["failed"]) == ["growth"]
     assert row["shrunk"] == "", "it grows without any fault"
-    assert "growth" in said_by_pytest(Path(row["folder"]) / TEST_FILE)
+    assert "growth" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)
 
 
 def test_an_interrupted_campaign_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,12 +248,10 @@ def test_what_cannot_be_a_campaign_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_command_says_by_its_status_whether_anything_failed(tmp_path: Path) -> None:
-    command = [sys.executable, "-P", "-m", "emulator.cli", "campaign", str(ROOT / "scenarios" / "beacon.toml")]
+    command = [*VNET, "campaign", str(ROOT / "scenarios" / "beacon.toml")]
     options = ["--runs", "2", "--duration", "1", "--set", "run.settle_s=0.2", "--set", "network.vehicles=3"]
     out = tmp_path / "campaign"
-    done = subprocess.run(
-        [*command, *options, "--out", str(out)], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
+    done = forked_commands.run([*command, *options, "--out", str(out)], cwd=ROOT, capture_output=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "2 runs, 0 failed" in done.stderr
     assert "Warning" not in done.stderr

@@ -2,8 +2,6 @@
 
 import io
 import json
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from emulator.testing.explanation import PARTING_FILE
 from emulator.testing.failure_page import FAILURE_PAGE
 from emulator.testing.regression_test import TEST_FILE
 from emulator.testing.shrinking_runs import fewest, order_text
+from tests.emulator.testing.test_campaign import said_by_pytest
 from vnet.transport.orders import Deviation
 
 
@@ -66,7 +65,9 @@ def test_an_order_is_a_phrase() -> None:
 
 
 @pytest.mark.slow
-def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(tmp_path: Path) -> None:
+def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(
+    tmp_path: Path, pytester: pytest.Pytester
+) -> None:
     """One deviation of hundreds is left; FIFO does not fail; the test that was written fails, and says why."""
     scenario = Scenario.model_validate(
         {
@@ -94,7 +95,4 @@ def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(tmp_path
     assert page.count('<a href="failures/001/failure.html">') == 1
     assert [row["parting"]["differences"][0]["first"] for row in failed] == ["decision"] * len(failed)
     test = folder / "failures" / "001" / TEST_FILE
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(test)], capture_output=True, text=True
-    )
-    assert done.returncode == 1 and "agents_alive" in done.stdout, done.stdout
+    assert "agents_alive" in said_by_pytest(test, pytester)
