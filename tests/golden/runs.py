@@ -9,7 +9,6 @@ import json
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 from collections import Counter
@@ -25,8 +24,10 @@ import typer.main
 
 from tests.docs.commands import APPS, captured, forgetting
 from tests.docs.markdown import blocks
+from tests.support import forked_commands
+from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
-from tests.system.conftest import AGENT, PATIENT, TIMEOUT_S, VNET
+from tests.system.conftest import PATIENT, TIMEOUT_S
 from vnet.runtime.environment import arithmetic
 
 TABLE = Path(__file__).with_name("runs.toml")
@@ -36,9 +37,6 @@ WAYS: dict[str, list[str]] = {
     "no windows": ["simulate", "--set", "run.windows=false"],
     "live": ["run"],
     "live, three a process": ["run", "--set", "run.nodes_per_process=3"],
-    "live, separate router": ["run", "--router", "separate", "--set", "run.start=spawn"],
-    "two hosts": ["run", "--hosts", "2"],
-    "by hand, TLS": ["emulator", "--listen", "tls/127.0.0.1:0"],
     "real time": ["run", "--pacing", "realtime"],
 }
 """The ways of running a row's command, and what each adds to it."""
@@ -101,7 +99,7 @@ class Row:
             first, *more = WAYS[way]
             words = [first, *shlex.split(self.command), *more, "--out", "golden"]
             words += [] if first == "simulate" else PATIENT
-            status, said = (_by_hand if way == "by hand, TLS" else _vnet)([*words, "--no-report"], folder)
+            status, said = _vnet([*words, "--no-report"], folder)
             assert (folder / "golden" / "verdict.json").exists(), said
             if way == "real time":
                 return kinds_of(folder / "golden")
@@ -162,26 +160,8 @@ def _vnet(words: Sequence[str], folder: Path) -> tuple[int, str]:
         with forgetting(folder):
             text, status = captured(typer.main.get_command(APPS["vnet"]), list(words))
         return status, text
-    done = subprocess.run([*VNET, *words], capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = forked_commands.run([*VNET, *words], capture_output=True, timeout=TIMEOUT_S)
     return done.returncode, done.stdout + done.stderr
-
-
-def _by_hand(words: Sequence[str], folder: Path) -> tuple[int, str]:
-    """Return the same of an emulator whose agents are started one by one."""
-    pipe = subprocess.PIPE
-    with contextlib.ExitStack() as stack:
-        emulator = stack.enter_context(subprocess.Popen([*VNET, *words], stdout=pipe, stderr=pipe, text=True))
-        stack.callback(emulator.kill)
-        assert emulator.stderr is not None
-        endpoint = next(
-            found[1] for line in emulator.stderr if (found := re.search(r"listening at (\S+); waiting", line))
-        )
-        for credentials in sorted((folder / "golden" / "access" / "credentials").glob("v*.json")):
-            agent = [*AGENT, "--connect", endpoint, "--run", Path(words[1]).stem, "--node", credentials.stem]
-            agent += ["--credentials", str(credentials)]
-            stack.callback(stack.enter_context(subprocess.Popen(agent)).wait, TIMEOUT_S)
-        said = "".join(emulator.communicate(timeout=TIMEOUT_S))
-    return emulator.returncode, said
 
 
 def dump(made_with: dict[str, str], rows: dict[str, Row]) -> str:

@@ -12,8 +12,8 @@ from typing import IO
 import pytest
 
 from tests.support.paths import ROOT
+from tests.system.by_hand import NODES, finish, start_emulator
 from tests.system.conftest import AGENT, Finished, heard_by
-from tests.system.test_by_hand import NODES, finish, start_emulator
 
 FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py"]
 WRONG = [sys.executable, "-P", "-m", "tests.emulator.testing.conformance.wrong_agent"]

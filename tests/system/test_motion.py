@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 import tomli_w
 
+from tests.support.forked_commands import VNET, Command
 from tests.support.motion import Stay, along, still, write_trips
 from tests.support.paths import ROOT
-from tests.system.conftest import AGENT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
+from tests.system.conftest import AGENT, TIMEOUT_S, Finished, Vnet, running_agents
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
 VEHICLES: dict[str, list[Stay]] = {
@@ -43,24 +44,17 @@ def comings_and_goings(run: Finished) -> list[tuple[str, str, int]]:
     return [(event["kind"], event["node"], event["time_ns"]) for event in events]
 
 
-def test_processes_that_come_and_go_do_the_same_as_their_simulation(vnet: Vnet, scenario: str) -> None:
-    live, simulated = vnet("run", scenario), vnet("simulate", scenario)
-    for run in (live, simulated):
-        assert run.status == 0, run.stderr + run.stdout
-        assert comings_and_goings(run) == [("entered", "v4", 1_200_000_000), ("left", "v5", 2_200_000_000)]
-    assert live.fingerprint == simulated.fingerprint
-    assert not running_agents(live.folder)
-    again = vnet("simulate", str(live.folder / "scenario.toml"))
-    assert again.fingerprint == live.fingerprint
-
-
-def test_with_faults_as_well(vnet: Vnet, scenario: str) -> None:
+def test_processes_that_come_and_go_do_the_same_as_their_simulation_with_faults(vnet: Vnet, scenario: str) -> None:
     kill = '[[fault]]\nkind = "kill"\nat_s = 0.9\nduration_s = 0.7\nnodes = { ids = ["v4", "v2"] }\n'
     Path(scenario).write_text(Path(scenario).read_text() + kill)
     live, simulated = (vnet(command, scenario) for command in ("run", "simulate"))
     assert live.status == simulated.status == 0, live.stderr + live.stdout
     assert live.fingerprint == simulated.fingerprint
-    assert ("entered", "v4", 1_600_000_000) in comings_and_goings(live)
+    came_and_went = [("entered", "v4", 1_600_000_000), ("left", "v5", 2_200_000_000)]
+    assert comings_and_goings(live) == comings_and_goings(simulated) == came_and_went
+    assert not running_agents(live.folder)
+    again = vnet("simulate", str(live.folder / "scenario.toml"))
+    assert again.fingerprint == live.fingerprint
 
 
 def test_on_the_wall_clock_vehicles_come_and_go_as_well(vnet: Vnet, scenario: str) -> None:
@@ -77,7 +71,7 @@ def test_agents_started_by_hand_wait_until_they_enter(vnet: Vnet, scenario: str,
     command = [*VNET, "emulator", scenario, "--out", str(folder), "--listen", "tcp/127.0.0.1:0"]
     with ExitStack() as stack:
         emulator = stack.enter_context(
-            subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         )
         stack.callback(emulator.kill)
         assert emulator.stderr is not None
@@ -92,4 +86,5 @@ def test_agents_started_by_hand_wait_until_they_enter(vnet: Vnet, scenario: str,
         by_hand = Finished(emulator.returncode, stdout, stderr, folder)
         assert {node: agent.wait(TIMEOUT_S) for node, agent in agents.items()} == dict.fromkeys(VEHICLES, 0)
     assert by_hand.status == 0, stderr + stdout
+    assert comings_and_goings(by_hand) == [("entered", "v4", 1_200_000_000), ("left", "v5", 2_200_000_000)]
     assert by_hand.fingerprint == vnet("simulate", scenario).fingerprint

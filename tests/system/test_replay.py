@@ -4,19 +4,9 @@ import multiprocessing
 import os
 from multiprocessing.synchronize import Event
 
-import pytest
-
-from tests.system.conftest import Finished, Vnet, command_in
+from tests.system.conftest import Vnet
 
 SCENARIO = "scenarios/twelve.toml"
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """The scenario in one process."""
-    done = command_in(tmp_path_factory.mktemp("simulated"))("simulate", SCENARIO)
-    assert done.status == 0, done.stderr + done.stdout
-    return done
 
 
 def _burn(stop: Event) -> None:
@@ -24,20 +14,20 @@ def _burn(stop: Event) -> None:
         sum(range(10_000))
 
 
-def test_a_live_run_beside_a_busy_machine_is_the_simulated_one(vnet: Vnet, simulated: Finished) -> None:
+def test_a_live_run_beside_a_busy_machine_is_the_simulated_one(vnet: Vnet) -> None:
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     burners = [context.Process(target=_burn, args=(stop,)) for _ in range(2 * (os.cpu_count() or 1))]
     for burner in burners:
         burner.start()
     try:
-        busy = vnet("run", SCENARIO)
+        busy = vnet("run", SCENARIO, "--duration", "2")
     finally:
         stop.set()
         for burner in burners:
             burner.join()
     assert busy.status == 0, busy.stderr + busy.stdout
-    assert busy.fingerprint == simulated.fingerprint
+    assert busy.fingerprint == vnet("simulate", SCENARIO, "--duration", "2").fingerprint
 
 
 def test_a_runs_own_scenario_file_reproduces_it(vnet: Vnet) -> None:

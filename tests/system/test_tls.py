@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from tests.support.forked_commands import VNET, run
 from tests.support.paths import ROOT
-from tests.system.conftest import TIMEOUT_S, VNET, Vnet
-from tests.system.test_by_hand import OPTIONS, ROUTER, SCENARIO, finish, start_agents, start_emulator
+from tests.system.by_hand import OPTIONS, ROUTER, SCENARIO, finish, start_agents, start_emulator
+from tests.system.conftest import TIMEOUT_S, Vnet
 from vnet.errors import TransportError
 from vnet.transport import keys, session
 from vnet.transport.access import Access, node_user
@@ -133,7 +134,8 @@ def test_a_separate_router_over_tls_changes_nothing(vnet: Vnet, tmp_path: Path) 
         endpoint = f"tls/127.0.0.1:{free.getsockname()[1]}"
     access = tmp_path / "access"
     command = [*VNET, "access", SCENARIO, *OPTIONS[2:], "--out", str(access), "--listen", endpoint]
-    subprocess.run(command, cwd=ROOT, check=True, timeout=TIMEOUT_S, capture_output=True)
+    assert run(command, cwd=ROOT, timeout=TIMEOUT_S, capture_output=True).returncode == 0
+    assert all(path.stat().st_mode & 0o077 == 0 for path in access.rglob("*") if path.is_file())
     with ExitStack() as stack:
         router = stack.enter_context(
             subprocess.Popen(
