@@ -40,7 +40,7 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
 
 
 USED = ("docs/examples/**/*", "scenarios/*", "emulator/*.py", "emulator/cli/**/*", "agents/*.py", "vnet/*.py")
-"""What every page may use, beside what follows pages, and the sources of its excerpts."""
+"""Files that every page may use, beside the code that follows pages, and the sources of its excerpts."""
 
 
 def used_by(path: Path) -> list[Path]:
