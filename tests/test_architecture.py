@@ -197,7 +197,6 @@ def test_vnet_imports_neither_agents_nor_emulator() -> None:
 EXAMPLES = re.compile(
     r"agents\.(averaging|baselines|centralized|cooperative)|hears.all|cooperative (positioning )?program"
 )
-NAMING_EXAMPLES = {"vnet/cmm.py", "vnet/runtime/programs.py", "emulator/cli/experiment.py"}
 """The former place of the mathematics, the former name of a program, and a command of the studies'."""
 
 

@@ -78,7 +78,7 @@ class OwnChild:
 
 
 _leaving: list[OwnChild] = []
-"""What stands for this process in its parent, if it is such a child."""
+"""The child that this process is, if it is one."""
 
 
 def leave(status: int) -> NoReturn:

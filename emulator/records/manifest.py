@@ -29,7 +29,7 @@ from vnet.errors import VnetError, printable
 
 LARGEST_BYTES = 1 << 26
 CHECKS_LOG = "logs/checks.log"
-"""What checks of the user's own print, also when they judge a folder again."""
+"""The log of checks of the user's own, which they also write when they judge a folder again."""
 _MANIFEST = TypeAdapter(dict[str, str])
 
 
