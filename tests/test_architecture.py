@@ -197,7 +197,8 @@ def test_vnet_imports_neither_agents_nor_emulator() -> None:
 EXAMPLES = re.compile(
     r"agents\.(averaging|baselines|centralized|cooperative)|hears.all|cooperative (positioning )?program"
 )
-"""The former place of the mathematics, the former name of a program, and a command of the studies'."""
+NAMING_EXAMPLES = {"vnet/cmm.py", "vnet/runtime/programs.py"}
+"""The former place of the mathematics, and the former name of a program."""
 
 
 def test_neither_vnet_nor_the_emulator_names_an_example_program() -> None:

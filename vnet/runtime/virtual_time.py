@@ -516,6 +516,9 @@ def _copy_result(job: Job[Any], outer: asyncio.Future[Any]) -> None:
     if job.cancelled():
         outer.cancel()
     elif (error := job.exception()) is not None:
+        if isinstance(error, StopIteration):  # no future takes it: as asyncio does from Python 3.12 on
+            stopped, error = error, RuntimeError("a job raised StopIteration, which no future can hold")
+            error.__cause__ = stopped
         outer.set_exception(error)
     else:
         outer.set_result(job.result())

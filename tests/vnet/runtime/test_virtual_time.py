@@ -168,6 +168,15 @@ def test_a_thread_may_not_call_into_the_loop(loop: VirtualTimeLoop, call: str) -
     run(loop, program)
 
 
+def test_a_job_that_raises_stop_iteration_reaches_the_program_as_another_error(loop: VirtualTimeLoop) -> None:
+    async def program() -> None:
+        with pytest.raises(RuntimeError, match="StopIteration") as raised:
+            await asyncio.to_thread(next, iter(()))
+        assert isinstance(raised.value.__cause__, StopIteration)
+
+    loop.run_until_complete(program())
+
+
 def test_an_exception_in_an_executor_reaches_the_program(loop: VirtualTimeLoop) -> None:
     async def program() -> None:
         with pytest.raises(ZeroDivisionError):
