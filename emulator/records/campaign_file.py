@@ -25,6 +25,8 @@ class CampaignRecord:
     runs: int
     kinds: list[str]
     results: list[dict[str, Any]]
+    drawn_from: str = ""
+    """Digest of what decides which runs can be drawn; "" in campaigns of earlier versions."""
 
     @property
     def failed(self) -> int:

@@ -264,6 +264,7 @@ class Campaign:
     def write(self) -> None:
         """Write campaign.json and campaign.html of the runs so far."""
         head = {"format": FORMAT, "seed": self._plan.seed, "runs": self._plan.runs, "kinds": self._plan.kinds}
+        head["drawn_from"] = self._plan.drawn_from
         if self._plan.ranges:
             head["ranges"] = {k: {n: r.bounds for n, r in of.items()} for k, of in self._plan.ranges.items()}
         write_atomically(self._folder / CAMPAIGN_FILE, json.dumps(head | {"results": self.rows}, indent=1) + "\n")
@@ -331,17 +332,25 @@ def _folders(name: str) -> Iterator[Path]:
         yield RUNS / (name if number == 1 else f"{name}-{number}")
 
 
-def _earlier(name: str, before: Path | None, out: Path | None) -> list[dict[str, Any]]:
+def _earlier(plan: Plan, name: str, before: Path | None, out: Path | None) -> list[dict[str, Any]]:
     """Return the runs of the earlier campaign that this one is compared with; none if there is none.
 
-    Raises VnetError for a named folder that has none.
+    Raises VnetError for a named folder that has none, or one whose runs were drawn from something else.
     """
     if before is not None:
-        return read_campaign(before).results
+        found = read_campaign(before)
+        if found.drawn_from not in ("", plan.drawn_from):
+            kinds = ", ".join(found.kinds) or "none"
+            raise VnetError(
+                f"--before {before}: its runs are not comparable: another scenario, or other faults ({kinds}) or "
+                "ranges; a fix is credible by runs like those that failed"
+            )
+        return found.results
     if out is None:
         there = list(takewhile(Path.exists, _folders(name)))
         with suppress(VnetError):  # of another version, or edited
-            return read_campaign(there[-1]).results if there else []
+            if there and (last := read_campaign(there[-1])).drawn_from in ("", plan.drawn_from):
+                return last.results
     return []
 
 
@@ -378,7 +387,7 @@ def run_campaign(
     """
     name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
     folder = out or next(path for path in _folders(name) if not path.exists())
-    earlier = _earlier(name, before, out)
+    earlier = _earlier(plan, name, before, out)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise VnetError(f"--out {folder}: exists and is not an empty folder")
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -50,6 +52,15 @@ class Plan:
     """Change of the scenario that the campaign has made by itself, in one line; "" if none."""
     constraints: ScheduleConstraints | None = None
     """Those of every run's schedule: vehicles have the same names whatever the seed. None without faults."""
+
+    @property
+    def drawn_from(self) -> str:
+        """A digest of what decides, beside the program and the seed, which runs can be drawn."""
+        left_out: dict[str, Any] = {"program": True, "run": {"name", "seed", "order_seed", "order_steps"}}
+        scenario = self.scenario.model_dump(mode="json", exclude=left_out)
+        ranges = {kind: {name: each.bounds for name, each in of.items()} for kind, of in self.ranges.items()}
+        text = json.dumps([scenario, self.kinds, ranges], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @classmethod
     def of(cls, scenario: Scenario, faults: str, runs: int, seed: int, **options: Any) -> Plan:

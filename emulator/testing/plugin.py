@@ -50,7 +50,9 @@ def vnet_emulation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[C
     from emulator.testing.death_watch import watch
     from emulator.testing.harness import RunHarness
     from emulator.testing.scenarios import make_scenario
+    from vnet.runtime.process_end import refuse_success
 
+    refuse_success()
     watch(request.config)
     runs: list[RunHarness] = []
     request.node.stash[_runs] = runs

@@ -28,6 +28,7 @@ JOBS = "vnet"
 _takers: list[Callable[[Node | None, str], None]] = []
 _process = os.getpid()
 _is_programs_own = False
+_status_late = 0
 
 
 class ProcessEndedError(BaseException):
@@ -54,6 +55,16 @@ def count_as_death() -> None:
     _process, _is_programs_own = os.getpid(), True
 
 
+def refuse_success() -> None:
+    """Have `os._exit` and `exec*` end this process with a status other than 0 from now on, whoever calls them.
+
+    A test's process that a thread, a finalizer or an `atexit` function of a program ends has not passed.
+    """
+    global _process, _status_late
+    _replace()
+    _process, _status_late = os.getpid(), DEATH_STATUS
+
+
 def _replace() -> None:
     for name in ("_exit", "execv", "execve"):
         original = getattr(os, name)
@@ -74,6 +85,9 @@ def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
             status = args[0] if name == "_exit" and args and isinstance(args[0], int) else 0
             _end_as_death(node, call, status)
         if not _takers or (node is None and not threading.current_thread().name.startswith(f"{JOBS}_")):
+            if _status_late and (name != "_exit" or not args or args[0] == 0):
+                sys.stderr.write(f"vnet: {call} ended the process of the tests\n")
+                exit_now(_status_late)
             return original(*args, **options)
         for taker in tuple(_takers):
             taker(node, call)

@@ -90,6 +90,9 @@ def test_after_a_fix_a_campaign_says_whether_it_is_credible(tmp_path: Path) -> N
     assert "in 1 of 1 runs before, and in none of 2 now: a fix is credible from 59 runs on" in fixed.getvalue()
     with pytest.raises(VnetError, match="cannot be read"):
         run_campaign(plan, tmp_path / "other", Console(quiet=True), before=tmp_path / "nowhere")
+    unlike = Plan.of(planted("growing"), "kill", 2, seed=5)
+    with pytest.raises(VnetError, match="not comparable"):
+        run_campaign(unlike, tmp_path / "other", Console(quiet=True), before=tmp_path / "before")
 
 
 def test_a_campaign_finds_a_nondeterministic_program_if_asked(tmp_path: Path) -> None:

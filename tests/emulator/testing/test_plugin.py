@@ -374,3 +374,16 @@ def test_the_plugin_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_program_that_ends_the_process_late_does_not_make_it_a_success(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        f"""
+import atexit, os
+async def test_ends(vnet_emulation):
+    async with vnet_emulation({str(BEACON)!r}, vehicles=2, duration=2, settle=0.5) as emu:
+        await emu.run_until(1.0)
+    atexit.register(os._exit, 0)
+"""
+    )
+    assert session_of_its_own(pytester, "-p", "no:xdist").returncode == 71
