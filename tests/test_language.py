@@ -215,3 +215,20 @@ def test_names_that_are_given_are_seen() -> None:
 )
 def test_fragments_are_seen(code: str, count: int) -> None:
     assert sum(bool(FRAGMENT.match(text)) for _, text in language_of(code).docstrings) == count
+
+
+PROSE = [path for path in (ROOT / "docs").rglob("*.md") if path.parent.name != "reference"]
+PROSE += [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+COLUMNS = 120
+
+
+def test_no_line_of_prose_is_longer_than_the_page_is_wide() -> None:
+    long = []
+    for path in PROSE:
+        in_code = False
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            in_code ^= line.lstrip().startswith(("```", "~~~"))
+            breakable = " " in re.sub(r"`[^`]*`", "", line).strip()
+            if len(line) > COLUMNS and breakable and not in_code and not line.lstrip().startswith("|"):
+                long.append(f"{relative(path)}:{number}")
+    assert long == []
