@@ -58,7 +58,9 @@ def _is_nobodys(event: Event, recorded: RecordedRun) -> bool:
     """Return whether an event is of no kind, of no node of the run, or of no time in it."""
     if event.kind not in KINDS or event.time_ns < 0:
         return True
-    of_vehicle = KINDS[event.kind].node_is == "vehicle"
+    of_vehicle = (
+        KINDS[event.kind].node_is == "vehicle" and event.kind != EventKind.refused
+    )  # whoever claims to be one
     if event.node is not None and of_vehicle and event.node not in recorded.number:
         return bool(recorded.number)
     return recorded.scenario.run.pacing == "lockstep" and event.time_ns > recorded.scenario.duration_ns

@@ -270,7 +270,12 @@ EDITS = [
     Edit("a figure is halved", verdict(set_in("figures", "position_rmse_m", to=lambda f: f / 2)), "verdict_file"),
     Edit("the seed is another", verdict(set_in("seed", to=99)), "verdict_file"),
     Edit("there is one vehicle more", verdict(set_in("vehicles", to=lambda count: count + 1)), "verdict_file"),
-    Edit("a check of the user's own is invented", verdict(add_own_check), "verdict_file"),
+    Edit(
+        "a check of the user's own is invented",
+        verdict(add_own_check),
+        "",
+        "the program declares checks, whose names only their code gives; found where it declares none",
+    ),
     Edit("a check says something else", verdict(deny_a_check), "verdict_file"),
     Edit(
         "more was delivered", verdict(set_in("frames_by_outcome", "delivered", to=lambda n: n + 9)), "verdict_file"

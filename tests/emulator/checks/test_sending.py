@@ -133,4 +133,4 @@ def badly_acknowledged(recorded: RecordedRun) -> int:
 
 
 def with_trace(of: RecordedRun, trace: pa.Table) -> RecordedRun:
-    return RecordedRun(of.scenario, trace, of.states, of.metrics, of.events, more=of.more)
+    return RecordedRun(of.scenario, trace, of.states, of.metrics, of.events)

@@ -154,7 +154,9 @@ def test_a_task_in_an_empty_context_ends_with_its_program() -> None:
     assert ticked == [0, 100_000_000, 200_000_000]
 
 
-def test_names_of_asyncio_stand_for_others_only_while_programs_run() -> None:
+def test_names_of_asyncio_stand_for_others_only_while_programs_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_asyncio, "_users", 0)  # runs of other tests may not have been closed
+    own_asyncio._set_names(0)
     during: list[tuple[Any, ...]] = []
 
     async def program(node: Node) -> None:
