@@ -53,14 +53,19 @@ class Local:
     apart: str | None = None
 
 
+def refuse_router_restart(scenario: Scenario) -> None:
+    """Raise ScenarioError for the fault `router_restart`, where there is no router of its own."""
+    if any(fault.kind == "router_restart" for fault in scenario.fault):
+        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+
+
 def over_zenoh(emulation: Emulation) -> LiveOptions:
     """Return the options of a run with a process for each vehicle, or each group of them, on this machine.
 
     Raises ScenarioError for a fault that this cannot show.
     """
     scenario = emulation.scenario
-    if any(fault.kind == "router_restart" for fault in scenario.fault):
-        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+    refuse_router_restart(scenario)
     groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
     return LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
 

@@ -25,7 +25,7 @@ from emulator.checks.judge import CheckResult, Judgement, Verdict
 from emulator.checks.own import PREFIX, Result, finding_of, load_checks
 from emulator.checks.properties import ANY, PERIOD, Effect, Predicate, always, eventually, leads_to, never
 from emulator.drivers.conclude import judge_further
-from emulator.drivers.session import Local, Session, over_zenoh
+from emulator.drivers.session import Local, Session, over_zenoh, refuse_router_restart
 from emulator.faults.plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.events import Event
@@ -49,8 +49,7 @@ class RunHarness:
     def __init__(self, scenario: Scenario, folder: Path, live: bool = False) -> None:
         if scenario.run.pacing != "lockstep":
             raise ScenarioError("run.pacing = 'realtime': a test steps a run in lockstep; for real time: vnet run")
-        if any(fault.kind == "router_restart" for fault in scenario.fault):
-            raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+        refuse_router_restart(scenario)
         load_checks(scenario.program)
         load_rules(scenario.fault, scenario.program)
         self.folder = folder
