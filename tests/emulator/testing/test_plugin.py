@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy  # noqa: F401 - once a process: a session within one forgets what it has imported
 import pytest
 
 from tests.support.forked_commands import VNET, run
