@@ -45,6 +45,9 @@ Reading = float | tuple[float, ...] | dict[str, str]
 NOTHING_SENSED: Mapping[str, Reading] = MappingProxyType({})
 """Readings of a vehicle without sensors of the scenario's own."""
 
+MOMENTS_OF_FAULTS = ("fault_started", "fault_ended")
+"""Names of the moments at which faults begin and end at a vehicle (`emulator.checks.properties`)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Fix:
@@ -263,10 +266,11 @@ class Node:
     def event(self, name: str, **details: NoteDetail) -> None:
         """Record that something happened, at the present time: event `event` of `events.jsonl`.
 
-        `details` are numbers, booleans or texts. Raise ValueError for any other value, or an empty name.
+        `details` are numbers, booleans or texts. Raise ValueError for any other value, an empty name, and a name by
+        which properties know the moments of faults.
         """
-        if not isinstance(name, str) or not name:
-            raise ValueError(f"event({name!r}): a name is expected")
+        if not isinstance(name, str) or not name or name in MOMENTS_OF_FAULTS:
+            raise ValueError(f"event({name!r}): a name is expected, other than {' and '.join(MOMENTS_OF_FAULTS)}")
         values = {key: checked_detail(key, value) for key, value in details.items()}
         self._transport.send_note(self.id, "event", "info", name, values)
 

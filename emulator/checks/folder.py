@@ -7,6 +7,7 @@ something there, the run is *unknown* and not *invalid*.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
@@ -28,7 +29,7 @@ from emulator.records.period_figures import PeriodFigures
 from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
-from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
+from emulator.records.run_folder import MANIFEST_FILE, SCENARIO_FILE, VERDICT_FILE
 from emulator.records.tables import BACKBONE, DRIVEN, PAYLOADS
 from emulator.records.verdicts import (
     MOST_ROWS,
@@ -140,6 +141,8 @@ def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
         for each, value in computed.items()
         for path, ours, theirs in differences(kept_figures[each], _plain(value), each)
     ]
+    if record.format >= 3:
+        wrong += [each for each in _wrong_commands(recorded) if each["kept"] != each["computed"]]
     wrong += _wrong_counts(recorded)
     wrong += _wrong_checks(recorded, judgement)
     if record.verdict is not (summed := record.judgement.verdict):
@@ -162,6 +165,18 @@ def _of_the_course(recorded: OpenedRun) -> Iterator[tuple[str, Any]]:
         factor = recorded.record.emulated_s / seconds
         rounding = ROUNDED_S * factor / seconds + ROUNDED_S
         yield "real_time_factor", told if told is not None and abs(told - factor) <= rounding else round(factor, 3)
+
+
+def _wrong_commands(recorded: OpenedRun) -> Iterator[dict[str, Any]]:
+    """Yield what verdict.json says of the scenario's order of events, and the command that runs it again."""
+    run, order = recorded.scenario.run, recorded.record.order
+    told = (order or {}).get("kind", "fifo"), (order or {}).get("seed", run.order_seed)
+    due = "tape" if run.tape is not None else run.order, run.order_seed
+    yield {"figure": "order", "kept": told, "computed": due}
+    scenario, kept = shlex.quote(str(recorded.folder.absolute() / SCENARIO_FILE)), recorded.record.reproduce
+    commands = [f"vnet {command} {scenario}" for command in ("simulate", "run")]
+    if kept.removesuffix(" --program MODULE:FUNCTION") not in commands:
+        yield {"figure": "reproduce", "kept": kept, "computed": commands[0]}
 
 
 def _wrong_counts(recorded: OpenedRun) -> list[dict[str, Any]]:

@@ -43,6 +43,9 @@ def check_row_order(recorded: RecordedRun) -> Finding:
         "trace": _disordered(recorded),
     }
     columns["events"] = np.array([_is_nobodys(event, recorded) for event in recorded.events], dtype=bool)
+    kinds = [event.kind for event in recorded.events]
+    if EventKind.started in kinds and EventKind.ended in kinds[: kinds.index(EventKind.started)]:
+        columns["events"][0] = True
     wrong = {what: np.flatnonzero(mask) for what, mask in columns.items() if mask.any()}
     rows = [{"table": what, "row": int(where[0]), "count": len(where)} for what, where in wrong.items()]
     total = sum(map(len, wrong.values()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -45,6 +46,7 @@ class Record:
     backbone: dict[str, int] = field(default_factory=dict)
     roadside_units: int = 0
     cost: RunCost | None = None
+    order: dict[str, Any] | None = None
     versions: dict[str, str] = field(default_factory=dict)
 
     @property

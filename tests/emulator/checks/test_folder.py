@@ -90,6 +90,36 @@ def test_most_edits_are_found_and_the_page_has_the_table() -> None:
     assert listing() in (ROOT / "docs" / "checks.md").read_text()
 
 
+def says(key: str, value: object) -> Callable[[Path], None]:
+    """Return what gives a key of verdict.json another value."""
+
+    def apply(folder: Path) -> None:
+        path = folder / "verdict.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+
+    return apply
+
+
+def reverse_events(folder: Path) -> None:
+    path = folder / "events.jsonl"
+    path.write_text("".join(reversed(path.read_text().splitlines(keepends=True))))
+
+
+@pytest.mark.parametrize(
+    ("edit", "name"),
+    [
+        (says("reproduce", "rm -rf ~; vnet simulate x"), "verdict_file"),
+        (says("order", {"kind": "pct", "seed": 1, "deviations": 2, "left": None}), "verdict_file"),
+        (reverse_events, "row_order"),
+    ],
+    ids=["another command", "another order", "events reversed"],
+)
+def test_further_forgeries_are_found(copy: Path, edit: Callable[[Path], None], name: str) -> None:
+    edit(copy)
+    forge(copy)
+    assert name in broken(check_run(copy))
+
+
 def without_manifest(folder: Path) -> None:
     (folder / "manifest.json").unlink()
 

@@ -167,7 +167,9 @@ def test_wrong_levels_and_details_are_refused(node: Node) -> None:
         ValueError, match=r"^log\(level='loud'\): allowed are debug, info, warning, error, critical$"
     ):
         node.log("x", level="loud")
-    with pytest.raises(ValueError, match=r"^event\(''\): a name is expected$"):
+    with pytest.raises(ValueError, match=r"^event\(''\): a name is expected"):
         node.event("")
+    with pytest.raises(ValueError, match=r"^event\('fault_started'\): a name is expected, other than fault_started"):
+        node.event("fault_started")  # for properties it would be a fault
     with pytest.raises(ValueError, match=r"^event\(y=\[1\]\): a number, a boolean or a text is expected$"):
         node.event("x", y=[1])  # type: ignore[arg-type]
