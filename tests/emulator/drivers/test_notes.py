@@ -169,7 +169,7 @@ def test_wrong_levels_and_details_are_refused(node: Node) -> None:
         node.log("x", level="loud")
     with pytest.raises(ValueError, match=r"^event\(''\): a name is expected"):
         node.event("")
-    with pytest.raises(ValueError, match=r"^event\('fault_started'\): a name is expected, other than fault_started"):
+    with pytest.raises(ValueError, match=r"^event\('fault_started'\): a name is expected, other"):
         node.event("fault_started")  # for properties it would be a fault
     with pytest.raises(ValueError, match=r"^event\(y=\[1\]\): a number, a boolean or a text is expected$"):
         node.event("x", y=[1])  # type: ignore[arg-type]
