@@ -10,8 +10,8 @@ import zenoh
 
 from vnet.errors import WireError
 from vnet.transport import keys, wire
-from vnet.transport.backbone import MessageRef, WireMessage
 from vnet.transport.backbone_keys import Contents, Sent, decode_arrived, encode, split_frames, split_yield
+from vnet.transport.wire import MessageRef, WireMessage
 
 
 class UnitKeys:

@@ -20,7 +20,7 @@ from emulator.scenario.random_streams import Draws
 from emulator.scenario.roadside import Backbone
 from emulator.scenario.scenario import Scenario
 from vnet.backbone import UnitAbilities
-from vnet.transport.backbone import MessageRef, SentMessage, WireMessage, sent_in_full
+from vnet.transport.wire import MessageRef, SentMessage, WireMessage, sent_in_full
 from vnet.units import NS_PER_MS
 
 

@@ -32,7 +32,7 @@ from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.programs import Programs, error_line
 from vnet.runtime.running_node import RunningNode
 from vnet.transport import wire
-from vnet.transport.backbone import MessageRef
+from vnet.transport.wire import MessageRef
 
 
 class Ended(NamedTuple):

@@ -11,12 +11,11 @@ from emulator.records.node_logs import NodeLogs
 from emulator.records.run_folder import RunFolder
 from vnet.node import Node
 from vnet.runtime import running_node
-from vnet.runtime.cpu_meter import CpuMeter
-from vnet.runtime.disks import Disks
-from vnet.runtime.host import Host
-from vnet.runtime.mail import Mail
+from vnet.runtime.arrivals import Mail
+from vnet.runtime.host import Disks, Host
 from vnet.runtime.process_end import caught
 from vnet.runtime.programs import Programs
+from vnet.runtime.ready_queue import CpuMeter
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
 

@@ -30,7 +30,7 @@ from emulator.scenario.lookahead import lookahead_ns
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import Fix
 from vnet.radio import Packet
-from vnet.runtime.mail import Mail
+from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 
 

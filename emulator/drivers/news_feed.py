@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from emulator.drivers.emulation import Emulation
-from vnet.runtime.news import NewsItem
-from vnet.transport.backbone import WireMessage
-from vnet.transport.send_results import WireSendResult
+from vnet.runtime.arrivals import NewsItem
+from vnet.transport.wire import WireMessage, WireSendResult
 
 
 class NewsFeed:

@@ -15,9 +15,9 @@ from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import check_ownership, wire_packet
 from emulator.radio.engine import Delivery
 from emulator.records.events import EventKind
-from vnet.runtime.news import NewsItem
-from vnet.transport import lateness, wire
-from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.runtime.arrivals import NewsItem
+from vnet.transport import wire
+from vnet.transport.wire import SentMessage, WireMessage
 from vnet.units import NS_PER_S
 
 KEPT_NS = 10 * NS_PER_S
@@ -153,7 +153,7 @@ class RealTime:
     def _delay(self, deliveries: Sequence[Delivery], arrived_ns: int) -> None:
         """Correct the arrivals of those deliveries of a batch that came over 20 ms late."""
         for delivery in deliveries:
-            if arrived_ns - delivery.packet.received_ns >= lateness.LATENESS_LIMIT_NS:
+            if arrived_ns - delivery.packet.received_ns >= wire.LATENESS_LIMIT_NS:
                 self._emulation.engine.delay(delivery, arrived_ns)
 
     def _lose(self, deliveries: Sequence[Delivery]) -> None:
@@ -280,7 +280,7 @@ class RealTime:
 
 def _late(counts: Sequence[int]) -> int:
     """Number of deliveries of a lateness histogram over the limit."""
-    return sum(counts[lateness.lateness_bin(lateness.LATENESS_LIMIT_NS) :])
+    return sum(counts[wire.lateness_bin(wire.LATENESS_LIMIT_NS) :])
 
 
 def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
@@ -293,7 +293,7 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
         index = next(i for i, c in enumerate(cumulative) if c >= share * total)
         below = cumulative[index] - counts[index]
         inside = (share * total - below) / counts[index]
-        low_ms, high_ms = lateness.lateness_edge_ms(index - 1), lateness.lateness_edge_ms(index)
+        low_ms, high_ms = wire.lateness_edge_ms(index - 1), wire.lateness_edge_ms(index)
         return low_ms + inside * (high_ms - low_ms)
 
     return {

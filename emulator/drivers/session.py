@@ -34,8 +34,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import load_program
+from vnet.runtime.programs import load_program, search_programs_in
 from vnet.transport.access import Access
 from vnet.transport.session import quiet_zenoh
 

@@ -29,8 +29,7 @@ from emulator.drivers.signals import signals_handled, tell_from_handler
 from emulator.records.events import EventKind
 from vnet.errors import VnetError
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import load_programs
+from vnet.runtime.programs import load_programs, search_programs_in
 from vnet.transport import wire
 
 if TYPE_CHECKING:

@@ -24,13 +24,12 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.runtime.ahead import RunAhead
-from vnet.runtime.disks import Disks
-from vnet.runtime.host import Host
+from vnet.runtime.host import Disks, Host
 from vnet.runtime.programs import load_programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import backbone_keys, wire
-from vnet.transport.backbone import SentMessage, WireMessage
 from vnet.transport.backbone_keys import Contents
+from vnet.transport.wire import SentMessage, WireMessage
 
 _folders = TemporaryDirectory(prefix="vnet-apart-")
 atexit.register(_folders.cleanup)

@@ -17,8 +17,8 @@ from emulator.drivers.live.supervisor import Supervisor
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.drivers.protocol import check_ownership
 from vnet.transport import wire
-from vnet.transport.backbone import MessageRef, SentMessage
 from vnet.transport.backbone_keys import Contents
+from vnet.transport.wire import MessageRef, SentMessage
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.errors import WireError
 from vnet.transport import keys, wire
-from vnet.transport.backbone import SentMessage
 from vnet.transport.backbone_keys import decode_sent
+from vnet.transport.wire import SentMessage
 
 Handler = Callable[[str, Any], None]
 """Takes a message of one type from a node. Raises ProtocolError to refuse it."""

@@ -17,8 +17,8 @@ from emulator.drivers.lockstep import Lockstep
 from emulator.records.events import EventKind
 from vnet.counted import counted
 from vnet.transport import wire
-from vnet.transport.backbone import SentMessage
 from vnet.transport.backbone_keys import join_yield, refs_of
+from vnet.transport.wire import SentMessage
 
 FINAL_WAIT_S = 1.0
 """Seconds for which the last message of a process that a fault ends is awaited."""

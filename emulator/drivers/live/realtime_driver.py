@@ -12,7 +12,7 @@ from emulator.drivers.live.driver import Driver, Parts
 from emulator.drivers.live.supervisor import ProcessState
 from emulator.drivers.realtime import RealTime
 from vnet.transport import wire
-from vnet.transport.backbone import MessageRef, SentMessage
+from vnet.transport.wire import MessageRef, SentMessage
 
 LATE_WAIT_S = 1.0
 """Seconds for which messages of the backbone are awaited at the end: they and frames come by keys of their own."""

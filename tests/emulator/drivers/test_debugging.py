@@ -19,8 +19,7 @@ from tests.support.multi_loop_driver import emulation_of, run_together, scenario
 from vnet.errors import VnetError
 from vnet.node import Node
 from vnet.runtime.debug_target import DebugTarget, resolve
-from vnet.runtime.debugger import NodeDebugger
-from vnet.runtime.remote_terminal import RemoteTerminal
+from vnet.runtime.debugger import NodeDebugger, RemoteTerminal
 
 HERE = f"{__name__}:"
 THIS_FILE = Path(__file__)

@@ -15,8 +15,8 @@ from emulator.drivers.live.reconnection import Reconnection
 from emulator.drivers.live.waiting import Stalled
 from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
 from vnet.transport import backbone_keys, wire
-from vnet.transport.backbone import MessageRef, SentMessage
 from vnet.transport.backbone_keys import Sent
+from vnet.transport.wire import MessageRef, SentMessage
 
 MS = 1_000_000
 RUN = {"duration_s": 0.6, "settle_s": 0.1, "stall_timeout_s": 1.0, "join_timeout_s": 1.0}
