@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.news_feed import NewsFeed
-from emulator.drivers.protocol import check_ownership, wire_packet
+from emulator.drivers.processes import check_ownership
 from emulator.radio.engine import Delivery
 from emulator.records.events import EventKind
 from vnet.runtime.arrivals import NewsItem
@@ -236,7 +236,7 @@ class RealTime:
         self._batch_seq[process_id] = seq + 1
         deliveries, fixes = self._packets.pop(process_id, []), self._fixes.pop(process_id, [])
         node_ids = self._emulation.world.node_ids
-        packets = [wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
+        packets = [wire.WirePacket.of(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
         clocks, self._clocks[process_id] = self._clocks[process_id], []
         lost, self._lost[process_id] = self._lost[process_id], []
         held = process_id in self._was_paused

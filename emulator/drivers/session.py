@@ -24,7 +24,7 @@ from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude, judge_unkept
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
-from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.lockstep import Lockstep, no_horizon
 from emulator.drivers.process_count import Processes, process_count
 from emulator.drivers.program_check import program_check
 from emulator.drivers.simulate import simulate
@@ -152,7 +152,7 @@ class Session:
         if self.live is None:
             where = self._local
             self.wall_s, self.interrupted = simulate(
-                self.emulation, None, stop, on_interrupt, where.debug, self._processes, where.apart
+                self.emulation, no_horizon, stop, on_interrupt, where.debug, self._processes, where.apart
             )
         else:
             from emulator.drivers.live import run_live  # slow to import, and simulations do without
@@ -206,7 +206,7 @@ class Session:
             self.over = True
             self._stand()
 
-    def _hold(self, lockstep: Lockstep) -> None:
+    async def _hold(self, lockstep: Lockstep) -> None:
         self._stand()
         lockstep.horizon_ns = self._horizons.get()
 

@@ -2,7 +2,7 @@
 
 A grant brings packets and fixes (`Mail`), results of sends and messages of the backbone (`News`), and busy ratios.
 In lockstep a `Window` keeps what lies ahead; `MailDelivery` puts what is due into the mailboxes, with the times
-that the nodes' clocks show. Nothing here knows the event loop.
+that the nodes' clocks show.
 """
 
 from __future__ import annotations
@@ -76,6 +76,11 @@ class Mail(NamedTuple):
         for packet in packets:
             by_node.setdefault(packet.node, []).append(packet.packet())
         return cls(by_node, [(fix.node, fix.fix()) for fix in fixes])
+
+    def within(self, grant: wire.Grant) -> wire.Grant:
+        """Return a grant that holds this mail, in its form on the wire."""
+        packets = [wire.WirePacket.of(node, packet) for node, some in self.packets.items() for packet in some]
+        return replace(grant, packets=packets, fixes=[wire.WireFix.of(*each) for each in self.fixes])
 
 
 NewsItem = WireSendResult | WireMessage

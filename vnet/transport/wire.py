@@ -154,6 +154,12 @@ class WirePacket(msgspec.Struct, frozen=True, array_like=True):
     rssi_dbm: float | None = None
     snr_db: float | None = None
 
+    @classmethod
+    def of(cls, node: str, packet: Packet) -> WirePacket:
+        """Return the packet in its form on the wire, for its receiver `node`."""
+        sender, sent_ns, received_ns, payload = packet.sender, packet.sent_ns, packet.received_ns, packet.payload
+        return cls(node, sender, sent_ns, received_ns, payload, packet.rssi_dbm, packet.snr_db)
+
     def packet(self) -> Packet:
         """Return the packet as the program sees it."""
         return Packet(self.sender, self.sent_ns, self.received_ns, self.payload, self.rssi_dbm, self.snr_db)

@@ -15,7 +15,7 @@ from emulator.drivers.live.inbox import Inbox
 from emulator.drivers.live.reconnection import Reconnection
 from emulator.drivers.live.supervisor import Supervisor
 from emulator.drivers.live.waiting import ChangeSignal
-from emulator.drivers.protocol import check_ownership
+from emulator.drivers.processes import check_ownership
 from vnet.transport import wire
 from vnet.transport.backbone_keys import Contents
 from vnet.transport.wire import MessageRef, SentMessage

@@ -21,7 +21,7 @@ from emulator.drivers.hosts.retrieval import Retrieval
 from emulator.drivers.launch import Exit
 from emulator.drivers.live.supervisor import DEATH_GRACE_S
 from emulator.drivers.live.waiting import ChangeSignal
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.processes import ProtocolError
 from emulator.records.code_digest import entries_of, vnet_digest
 from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder

@@ -15,7 +15,7 @@ import zenoh
 
 from emulator.drivers.join import Membership
 from emulator.drivers.live.waiting import ChangeSignal
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.processes import ProtocolError
 from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.errors import WireError

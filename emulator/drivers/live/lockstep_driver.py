@@ -8,12 +8,12 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Awaitable, Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 
 from emulator.drivers.live.driver import Driver, Parts
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ProcessState
 from emulator.drivers.live.waiting import Stalled
-from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon
 from emulator.records.events import EventKind
 from vnet.counted import counted
 from vnet.transport import wire
@@ -26,13 +26,6 @@ STACKS_WAIT_S = 1.0
 """Seconds after which the emulator looks whether processes that do not yield have sent their stacks."""
 STACKS_LOOKS = 5
 """Number of looks after which it does without what is missing."""
-
-HorizonCallback = Callable[[Lockstep], Awaitable[None]]
-"""Sets the barrier's horizon: called before time 0, and whenever the run is held there."""
-
-
-async def no_horizon(lockstep: Lockstep) -> None:
-    """Leave the run without a horizon: nothing holds it."""
 
 
 class LockstepDriver(Driver):
@@ -100,7 +93,7 @@ class LockstepDriver(Driver):
                 await self._apply_process_faults(actions)
             self._reached_ns = {process_id: grant.time_ns for process_id, grant in grants.items()}
             for process_id, grant in grants.items():
-                self._send(process_id, grant)
+                self._send(process_id, lockstep.take_mail(process_id).within(grant))
             await self._all_yielded()
             grants = lockstep.step()
             while lockstep.held:

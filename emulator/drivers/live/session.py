@@ -28,12 +28,13 @@ from emulator.drivers.live.driver import Driver, Parts
 from emulator.drivers.live.fleet import Fleet
 from emulator.drivers.live.inbox import Inbox, Refusals
 from emulator.drivers.live.joining import RECORDER, Joining
-from emulator.drivers.live.lockstep_driver import HorizonCallback, LockstepDriver, no_horizon
+from emulator.drivers.live.lockstep_driver import LockstepDriver
 from emulator.drivers.live.observer_feed import ObserverFeed
 from emulator.drivers.live.realtime_driver import RealTimeDriver
 from emulator.drivers.live.reconnection import Reconnection
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, Supervisor
 from emulator.drivers.live.waiting import ChangeSignal, Stalled
+from emulator.drivers.lockstep import HorizonCallback, no_horizon
 from emulator.drivers.memory import MemoryWatch, first_over
 from emulator.drivers.signals import cancelled_by_signals
 from emulator.drivers.status import Course

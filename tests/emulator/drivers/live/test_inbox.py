@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.live.inbox import Inbox, Refusals
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.processes import ProtocolError
 from tests.emulator.drivers.live.fakes import Stage, hello
 from vnet.transport import wire
 
