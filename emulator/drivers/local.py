@@ -56,7 +56,7 @@ Swap = Callable[[wire.Yield | None], Turn]
 
 
 class Ended(NamedTuple):
-    """What a process says when the run is over: the end of its programs, and what they have cost.
+    """The answer of a process when the run is over: what its programs left to tell, and their costs.
 
     `final` are exceptions and notes of programs as they were ended; the others are by node. `order_steps` are
     decisions, where orders of events are tried.
@@ -84,7 +84,7 @@ class LocalProcesses(Processes):
         """True once a process holds more than `run.memory_limit_mb`."""
         self.pids = {nodes[0]: os.getpid() for nodes in groups}
         self.endings: list[Ended] = []
-        """What the processes have said at the end of the run."""
+        """Answers of the processes at the end of the run."""
         self.no_signal_raises: Callable[[], bool] = lambda: False
         """Tells whether a KeyboardInterrupt can only be the programs' own."""
         if emulation.scenario.run.memory_limit_mb is not None:
@@ -225,7 +225,7 @@ class HostedPrograms:
 
     @property
     def ended(self) -> Ended:
-        """What the process says at the end, once it has run."""
+        """The answer at the end of the run."""
         return Ended(self._final, self.meter.cpu_ns, self.meter.wake_ups, self._order_steps)
 
     def _owns(self, node: Node) -> bool:
