@@ -6,12 +6,13 @@ The loop of the pacing and that of the programs take turns: the one waits where 
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import sys
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Coroutine, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import coroutine
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +21,7 @@ from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, PeriodView, ProcessActions
 from emulator.drivers.memory import first_over
-from emulator.drivers.processes import NOBODY_OWES, Heard, Processes
+from emulator.drivers.processes import Heard, Processes
 from emulator.drivers.signals import signals_handled
 from emulator.records.node_logs import NodeLogs
 from emulator.records.run_folder import RunFolder
@@ -156,7 +157,7 @@ class InLoop(LocalProcesses):
         assert isinstance(message, wire.Grant)
         self._turn = self._take_calls(process_id), message, mail
 
-    async def receive(self, owing: Collection[str] = NOBODY_OWES, timeout_s: float | None = None) -> Heard:
+    async def receive(self, timeout_s: float = math.inf) -> Heard:
         """Let the programs run until they yield. Raises KeyboardInterrupt if the run is to end."""
         while self._said is None:
             await _programs_run()

@@ -488,7 +488,7 @@ async def _all_yielded(lockstep: Lockstep, processes: Processes) -> None:
     while owed := lockstep.owed:
         for process_id, details in processes.ended(owed.keys()).items():
             lockstep.died(process_id, **details)
-        if owed and (heard := await processes.receive(owed.keys())) is not None:
+        if owed and (heard := await processes.receive()) is not None:
             assert isinstance(heard.message, wire.Yield)
             try:
                 lockstep.receive(heard.process_id, heard.message)

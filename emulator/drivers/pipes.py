@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import io
+import math
 import os
 import pickle
 import signal
@@ -27,7 +28,7 @@ from msgspec.structs import replace
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit
 from emulator.drivers.local import Call, Ended, HostedPrograms, LocalProcesses, RunOverError, Turn
-from emulator.drivers.processes import NOBODY_OWES, Heard
+from emulator.drivers.processes import Heard
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.runtime import running_node
@@ -156,7 +157,7 @@ class Pipes(LocalProcesses):
         self._processes[process_id].give(self._take_calls(process_id), mail.within(message))
         self._granted.append(process_id)
 
-    async def receive(self, owing: Collection[str] = NOBODY_OWES, timeout_s: float | None = None) -> Heard | None:
+    async def receive(self, timeout_s: float = math.inf) -> Heard | None:
         """Wait for the yields of all processes. Raises KeyboardInterrupt if the run is to end."""
         if self._granted:
             granted, self._granted = self._granted, []

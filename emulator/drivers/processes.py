@@ -6,6 +6,7 @@ in processes forked from it (`pipes.py`); those of a live run are processes on t
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
@@ -15,8 +16,6 @@ from vnet.errors import VnetError
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 from vnet.transport.wire import SentMessage
-
-NOBODY_OWES: Collection[str] = ()
 
 
 class Heard(NamedTuple):
@@ -42,10 +41,10 @@ class Processes(ABC):
         """Give a process a window or a batch; `mail` has the packets and fixes of a window."""
 
     @abstractmethod
-    async def receive(self, owing: Collection[str] = NOBODY_OWES, timeout_s: float | None = None) -> Heard | None:
-        """Wait for the next message of a process; None if something else has come up, or after the timeout.
+    async def receive(self, timeout_s: float = math.inf) -> Heard | None:
+        """Return the next message of a process; None if something else has come up, or after the timeout.
 
-        In lockstep these processes owe a yield each. Raises Stalled if none of them makes progress.
+        In lockstep there is no timeout: raises Stalled if no process that owes a yield makes progress.
         """
 
     def ended(self, among: Collection[str] | None = None) -> dict[str, dict[str, Any]]:

@@ -6,10 +6,11 @@ pass through the wire's encoding, a kill leaves a loop where it stands, and an e
 
 import asyncio
 import atexit
+import math
 import queue
 import threading
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -122,7 +123,7 @@ class _Apart(Processes):
         self.processes[process_id].put_grant(mail.within(message))
         self._owing.append(process_id)
 
-    async def receive(self, owing: Collection[str] = (), timeout_s: float | None = None) -> Heard:
+    async def receive(self, timeout_s: float = math.inf) -> Heard:
         process_id = self._owing.popleft()
         return Heard(process_id, self.processes[process_id].take_yield())
 
