@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, PeriodView, ProcessActions
-from emulator.drivers.memory import first_over
 from emulator.drivers.processes import Heard, Processes
 from emulator.drivers.signals import signals_handled
+from emulator.drivers.usage import first_over
 from emulator.records.node_logs import NodeLogs
 from emulator.records.run_folder import RunFolder
 from vnet.node import Node

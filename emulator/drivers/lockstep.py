@@ -23,7 +23,6 @@ import numpy as np
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.processes import Processes, ProtocolError, check_yield
 from emulator.scenario.lookahead import lookahead_ns
 from vnet.mailbox import INBOX_LIMIT
@@ -100,7 +99,7 @@ class Lockstep:
         """Nodes (N,) that an arrival wakes."""
         self._yielded: list[LockstepProcess] = []
         self._deaths: list[tuple[LockstepProcess, dict[str, Any]]] = []
-        self._news = NewsFeed(emulation)
+        self._news = emulation.news
         self._crowded: set[str] = set()
         """Nodes for which more packets wait than a mailbox holds."""
         self._end_ns = 0

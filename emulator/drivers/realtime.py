@@ -13,7 +13,6 @@ from itertools import accumulate
 from typing import Any, NamedTuple
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.processes import Processes, ProtocolError, check_ownership
 from emulator.radio.engine import Delivery
 from emulator.records.events import EventKind
@@ -69,7 +68,7 @@ class RealTime:
         self._actions: list[ProcessActions] = []
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
-        self._news = NewsFeed(emulation)
+        self._news = emulation.news
         self._shown: dict[tuple[str, int], tuple[int, WireMessage]] = {}
         """Messages of the backbone that went out within `KEPT_NS`, and when, by unit and number."""
         self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}

@@ -7,22 +7,25 @@ same trace, and a test holds them to it.
 
 from __future__ import annotations
 
+import gc
+import os
 import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
+from operator import index
+from typing import Literal
 
-from emulator.drivers.collector import rare_collections
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.local import InLoop, LocalProcesses
 from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
 from emulator.drivers.pipes import Pipes
-from emulator.drivers.process_count import split_evenly
 from emulator.drivers.signals import tell_from_handler
 from emulator.records.events import EventKind
-from vnet.errors import VnetError
+from vnet.errors import VnetError, shown
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.programs import search_programs_in
 
@@ -129,3 +132,56 @@ def _ending_between_windows(
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+OBJECTS_A_VEHICLE = 100
+"""Allocations a vehicle, less what is freed, between two collections: more than a vehicle keeps of a period."""
+
+
+@contextmanager
+def rare_collections(vehicles: int) -> Iterator[None]:
+    """Let the collector run once in some periods, and not several times within each, while a simulation runs.
+
+    What a period allocates grows with the number of vehicles, and so does what each collection looks at: with a
+    fixed threshold their product takes a quarter of the time of a run of 1000 vehicles. A collector that is
+    switched off stays so.
+    """
+    before = gc.get_threshold()
+    if before[0]:
+        gc.set_threshold(max(before[0], OBJECTS_A_VEHICLE * vehicles), *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+
+
+ProcessCount = int | Literal["auto"]
+"""Number of processes that run programs, or "auto": as many as this process may use cores."""
+VEHICLES_A_PROCESS = 10
+"""Least number of vehicles for each process of "auto": with fewer the exchanges cost more than is gained."""
+
+
+def process_count(asked: ProcessCount | str, vehicles: int) -> int:
+    """Return the number of processes for so many vehicles. Raises VnetError for what is neither N nor "auto"."""
+    if asked == "auto":
+        return max(1, min(_usable_cores(), vehicles // VEHICLES_A_PROCESS))
+    try:
+        count = int(asked) if isinstance(asked, str) else index(asked)
+    except (TypeError, ValueError):
+        count = 0
+    if count < 1 or isinstance(asked, bool):
+        raise VnetError(f"processes = {shown(asked)}: a whole number from 1, or auto, is expected")
+    return min(count, vehicles)
+
+
+def _usable_cores() -> int:
+    """Return the number of cores that this process may use; elsewhere than on Linux all there are."""
+    usable = getattr(os, "sched_getaffinity", None)
+    return len(usable(0)) if usable else os.cpu_count() or 1
+
+
+def split_evenly(node_ids: Sequence[str], processes: int) -> list[list[str]]:
+    """Split nodes into consecutive parts of nearly equal size, one for each process, and none of them empty."""
+    processes = min(processes, len(node_ids))
+    ends = [len(node_ids) * part // processes for part in range(processes + 1)]
+    return [list(node_ids[start:end]) for start, end in pairwise(ends)]

@@ -19,8 +19,7 @@ import pytest
 from emulator.drivers import pipes
 from emulator.drivers.conclude import conclude
 from emulator.drivers.pipes import ForkedPrograms
-from emulator.drivers.process_count import process_count, split_evenly
-from emulator.drivers.simulate import simulate
+from emulator.drivers.simulate import process_count, simulate, split_evenly
 from emulator.radio.outcomes import Outcome
 from emulator.records.costs import read_cost
 from tests.emulator.drivers.test_status import emulate
