@@ -280,8 +280,9 @@ def write_line(node: str, line: str) -> None:
 
 
 class UnitKeys:
-    """Keys of the roadside units of a process, for messages of the backbone. `on_arrived` is called on Zenoh's thread when a message has come.
+    """Keys of the roadside units of a process, for messages of the backbone.
 
+    `on_arrived` is called on Zenoh's thread when a message has come.
     What has come is kept until a grant or a batch refers to it.
     """
 
