@@ -18,7 +18,7 @@ from vnet.errors import ProgramError, VnetError
 from vnet.runtime import interrupts
 from vnet.runtime.die_with_parent import STARTED_BY_VNET, signal_at_parent_death
 from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_same_arithmetic
-from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import search_programs_in
 
 if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
@@ -84,7 +84,7 @@ def agent(
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     from agents.host import run_agent  # these import numpy, before which `main` sets its number of threads
-    from vnet.runtime.disks import Disks
+    from vnet.runtime.host import Disks
     from vnet.transport.credentials import Credentials
     from vnet.transport.keys import is_segment
     from vnet.transport.session import quiet_zenoh
@@ -124,8 +124,10 @@ def _check_timeout(option: str, timeout_s: float) -> None:
 def _debugger(target: str, socket: Path) -> NodeDebugger:
     """Return a debugger whose user answers at `socket`."""
     from vnet.runtime.debug_target import DebugTarget
-    from vnet.runtime.debugger import NodeDebugger  # pdb, which few agents need
-    from vnet.runtime.remote_terminal import RemoteTerminal
+    from vnet.runtime.debugger import (
+        NodeDebugger,  # pdb, which few agents need
+        RemoteTerminal,
+    )
 
     terminal = RemoteTerminal(socket)
     return NodeDebugger(DebugTarget.parse(target), terminal.open, terminal.quit, terminal, terminal)

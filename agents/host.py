@@ -18,19 +18,16 @@ from agents.attachment import Attachment, Found, MessageCame, RunOverError, no_w
 from vnet.errors import ProgramError, TransportError, VnetError
 from vnet.runtime import interrupts
 from vnet.runtime.ahead import RunAhead
-from vnet.runtime.disks import Disks
-from vnet.runtime.forced_end import end_within
-from vnet.runtime.host import Host
-from vnet.runtime.mail import Mail
-from vnet.runtime.process_end import count_as_death
+from vnet.runtime.arrivals import Mail
+from vnet.runtime.host import Disks, Host
+from vnet.runtime.process_end import count_as_death, end_within
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
-from vnet.transport import lateness, wire
-from vnet.transport.backbone import MessageRef
+from vnet.transport import wire
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, never_preempt, set_time_slice
-from vnet.transport.send_results import WireSendResult
 from vnet.transport.session import open_client
+from vnet.transport.wire import MessageRef, WireSendResult
 
 if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
@@ -174,7 +171,7 @@ class _RealTimeAgent:
         self._seq = 0
         self._expected = 0
         self._missed: list[tuple[int, int]] = []
-        self._lateness = [0] * lateness.LATENESS_BINS
+        self._lateness = [0] * wire.LATENESS_BINS
         self._late: list[tuple[int, int]] = []
         """Batches with a late packet that the emulator has not been told of, and when they came."""
         self._sends: dict[tuple[str, int], int] = {}
@@ -275,8 +272,8 @@ class _RealTimeAgent:
         self._host.busy.add(batch.busy)
         late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
         for each_ns in late_ns:
-            self._lateness[lateness.lateness_bin(each_ns)] += 1
-        if max(late_ns, default=0) >= lateness.LATENESS_LIMIT_NS:
+            self._lateness[wire.lateness_bin(each_ns)] += 1
+        if max(late_ns, default=0) >= wire.LATENESS_LIMIT_NS:
             self._late.append((batch.seq, now_ns))
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
         self._take_results(batch)

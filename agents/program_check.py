@@ -14,8 +14,7 @@ from pathlib import Path
 
 from vnet.errors import ProgramError
 from vnet.runtime.die_with_parent import signal_at_parent_death
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import load_program
+from vnet.runtime.programs import load_program, search_programs_in
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -23,8 +23,8 @@ from emulator.cells.programs import (
     with_folder_of,
 )
 from emulator.cells.worker import Place, Worker, call_fitly, is_fit
-from emulator.drivers.process_count import Processes
 from emulator.drivers.session import Local, Session, over_zenoh
+from emulator.drivers.simulate import ProcessCount
 from emulator.report.notebook import Run
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.source import Source, hinting, scenario_of
@@ -41,7 +41,7 @@ def simulate(
     set: Mapping[str, Any] | None = None,
     checks: Sequence[str] = (),
     out: str | Path | None = None,
-    processes: Processes = 1,
+    processes: ProcessCount = 1,
 ) -> Run:
     """Simulate a scenario, in lockstep, and return the finished run: what `vnet simulate` does.
 
@@ -107,7 +107,7 @@ def simulate_into(
     out: Path | None,
     stop: threading.Event | None = None,
     replay: str = "",
-    processes: Processes = 1,
+    processes: ProcessCount = 1,
 ) -> Path:
     """Simulate from this process and judge the run; returns its folder. `replay` says why none is warranted."""
     session = Session(scenario, out, Local(processes)).open()

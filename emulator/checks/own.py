@@ -23,7 +23,7 @@ from emulator.scenario.declared import declared_checks
 from emulator.scenario.own_functions import in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
 from vnet.errors import VnetError, printable, shown
-from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import search_programs_in
 
 PREFIX = "own:"
 """Names of own checks begin with it, so that none is taken for one of vnet's."""

@@ -24,8 +24,7 @@ from emulator.terminal.console import one_line_errors
 from emulator.world.world import World, build_world
 from vnet.counted import counted
 from vnet.errors import TransportError
-from vnet.transport.access import Access, is_tls
-from vnet.transport.certificates import certifier
+from vnet.transport.access import Access, certifier, is_tls
 
 TlsNameOption = Annotated[
     list[str] | None,

@@ -19,8 +19,7 @@ from emulator.scenario.program import split_file
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import VnetError, did_you_mean, printable, shown
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import error_line
+from vnet.runtime.programs import error_line, search_programs_in
 from vnet.units import NS_PER_S
 
 COLUMNS = ("s", "sender", "frame", "bytes", "content", "receivers")

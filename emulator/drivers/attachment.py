@@ -16,7 +16,7 @@ import zenoh
 from emulator.drivers.router import SeparateRouter
 from emulator.viewer.sinks import Sinks
 from vnet.runtime.debug_target import DebugTarget
-from vnet.transport import backbone_keys, keys, wire
+from vnet.transport import keys, wire
 from vnet.transport.access import EMULATOR, Access
 from vnet.transport.session import open_client, open_router, router_endpoint
 
@@ -42,11 +42,7 @@ class LiveOptions:
 
 
 class Attachment:
-    """The emulator's end of the wire. The callbacks run on Zenoh's threads, with a name or a verb.
-
-    With hosts, `to_hosted` takes what is said to nodes, `to_hosted_unit` what is on keys of the backbone, and
-    `send_host` sends it to their hosts in bundles.
-    """
+    """The emulator's end of the wire. What comes is heard on Zenoh's threads: what it is, a name, and the item."""
 
     def __init__(
         self,
@@ -54,12 +50,7 @@ class Attachment:
         node_ids: tuple[str, ...],
         lease_ms: int,
         drops: bool,
-        on_tx: Callable[[str, bytes], None],
-        on_alive: Callable[[str, bool], None],
-        on_query: Callable[[str, zenoh.Query], None],
-        on_host_tx: Callable[[str, bytes], None] = lambda host, payload: None,
-        on_host_alive: Callable[[str, bool], None] = lambda host, alive: None,
-        on_backbone: Callable[[str, bytes], None] = lambda unit, payload: None,
+        hear: Callable[[str, str, Any], None],
     ) -> None:
         self._connect = options.connect if options.router is None else options.router.endpoint
         self.endpoint = self._connect or options.listen
@@ -68,14 +59,7 @@ class Attachment:
         self._node_ids = node_ids
         self._lease_ms = lease_ms
         self._drops = drops
-        self._on_tx = on_tx
-        self._on_alive = on_alive
-        self._on_query = on_query
-        self._on_host_tx = on_host_tx
-        self._on_host_alive = on_host_alive
-        self._on_backbone = on_backbone
-        self.to_hosted: Callable[[str, wire.EmulatorMessage], None] | None = None
-        self.to_hosted_unit: Callable[[str, bytes], None] | None = None
+        self._hear = hear
         self._stack = ExitStack()
         self._rx: dict[str, zenoh.Publisher] = {}
         self._unit_rx: dict[str, zenoh.Publisher] = {}
@@ -114,9 +98,9 @@ class Attachment:
             for stream in ("scene", "period", "end")
         }
         liveliness = session.liveliness()
-        stack.enter_context(session.declare_subscriber(keys.node_tx(self._run, "*"), self._take_tx))
+        stack.enter_context(session.declare_subscriber(keys.node_tx(self._run, "*"), self._payload_to("message")))
         alive = keys.node_alive(self._run, "*")
-        stack.enter_context(liveliness.declare_subscriber(alive, self._take_alive, history=True))
+        stack.enter_context(liveliness.declare_subscriber(alive, self._state_to("token"), history=True))
         stack.enter_context(session.declare_queryable(keys.control(self._run, "*"), self._take_query))
         stack.enter_context(liveliness.declare_token(keys.emulator_alive(self._run)))
 
@@ -136,7 +120,7 @@ class Attachment:
         }
         if units:
             tx = keys.backbone_tx(self._run, "*")
-            self._stack.enter_context(session.declare_subscriber(tx, self._take_backbone))
+            self._stack.enter_context(session.declare_subscriber(tx, self._payload_to("backbone")))
 
     def _open_hosts(self, session: zenoh.Session) -> None:
         """Declare the keys of hosts, if there are any. A host that cannot be reached is closed after a while."""
@@ -150,53 +134,38 @@ class Attachment:
             for host in hosts
         }
         if hosts:
-            stack.enter_context(session.declare_subscriber(keys.host_tx(self._run, "*"), self._take_host_tx))
+            stack.enter_context(
+                session.declare_subscriber(keys.host_tx(self._run, "*"), self._payload_to("host_message"))
+            )
             alive = keys.host_alive(self._run, "*")
             liveliness = session.liveliness()
-            stack.enter_context(liveliness.declare_subscriber(alive, self._take_host_alive, history=True))
+            stack.enter_context(liveliness.declare_subscriber(alive, self._state_to("host_token"), history=True))
 
     def close(self) -> None:
         """Close everything."""
         self._stack.close()
 
-    def _take_tx(self, sample: zenoh.Sample) -> None:
-        self._on_tx(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
+    def _payload_to(self, what: str) -> Callable[[zenoh.Sample], None]:
+        return lambda sample: self._hear(what, keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
 
-    def _take_backbone(self, sample: zenoh.Sample) -> None:
-        self._on_backbone(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _take_alive(self, sample: zenoh.Sample) -> None:
-        self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
-
-    def _take_host_tx(self, sample: zenoh.Sample) -> None:
-        self._on_host_tx(keys.host_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _take_host_alive(self, sample: zenoh.Sample) -> None:
-        self._on_host_alive(keys.host_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+    def _state_to(self, what: str) -> Callable[[zenoh.Sample], None]:
+        put = zenoh.SampleKind.PUT
+        return lambda sample: self._hear(what, keys.node_of(str(sample.key_expr)), sample.kind == put)
 
     def _take_query(self, query: zenoh.Query) -> None:
-        self._on_query(keys.verb_of(str(query.key_expr)), query)
+        self._hear("query", keys.verb_of(str(query.key_expr)), query)
 
     def knows(self, node: str) -> bool:
         """Return whether there is a key for this node."""
         return node in self._node_ids
 
     def send(self, node: str, message: wire.EmulatorMessage) -> None:
-        """Say something to a node, having put the messages of units in it on their keys."""
-        if isinstance(message, wire.Grant | wire.Batch) and message.messages:
-            message, contents = backbone_keys.split_grant(message)
-            for unit, content in contents:
-                self._put_content(unit, backbone_keys.encode(content))
-        if self.to_hosted is not None:
-            self.to_hosted(node, message)
-        else:
-            self._rx[node].put(wire.encode(message))
+        """Say something to a node."""
+        self._rx[node].put(wire.encode(message))
 
-    def _put_content(self, unit: str, payload: bytes) -> None:
-        if self.to_hosted_unit is not None:
-            self.to_hosted_unit(unit, payload)
-        else:
-            self._unit_rx[unit].put(payload)
+    def send_content(self, unit: str, payload: bytes) -> None:
+        """Put an encoded message on a unit's key of the backbone."""
+        self._unit_rx[unit].put(payload)
 
     def send_host(self, host: str, payload: bytes) -> None:
         """Put an encoded message on the `rx` of a host."""

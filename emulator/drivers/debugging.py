@@ -1,7 +1,7 @@
 """The user's terminal for the debugger of a live run, whose vehicle is another process.
 
 The vehicle connects to a Unix socket in a folder that is its user's alone, and what it asks is asked here
-(`vnet/runtime/remote_terminal.py`). The emulator's loop is blocked meanwhile: in lockstep all wait for that
+(`vnet/runtime/debugger.py`). The emulator's loop is blocked meanwhile: in lockstep all wait for that
 vehicle anyway.
 """
 

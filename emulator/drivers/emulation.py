@@ -1,32 +1,36 @@
 """Emulation: one run's engine, world and records, without any transport.
 
-The drivers (live over Zenoh, or simulated in one process) bring what nodes enqueue and take what is due;
-everything that must be the same in both happens here.
+The loops of both pacings bring what nodes enqueue and take what is due; everything that must be the same in both,
+live and simulated, happens here. `Presence` is the state of each node, `Driving` passes actions to vehicles,
+`BusyFeed` tells programs how busy the channel was, and `LogBook` writes down what programs say.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
-from emulator.drivers.backbone import BackboneNetwork
-from emulator.drivers.busy_feed import BusyFeed
-from emulator.drivers.driving import Driving
-from emulator.drivers.log_book import LogBook
+from emulator.drivers.backbone import BackboneNetwork, NewsFeed
 from emulator.drivers.orders import Orders
-from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import abilities_of
 from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
+from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
+from emulator.records.background_table import background_table
 from emulator.records.costs import Costs
+from emulator.records.driven_table import driven_table
 from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
@@ -37,14 +41,282 @@ from emulator.scenario.lookahead import least_latency_ns
 from emulator.scenario.program import Program
 from emulator.scenario.roadside import RoadsideUnit
 from emulator.scenario.scenario import Scenario
+from emulator.world.driven.stepped import SteppedWorld
+from emulator.world.driven.vehicles import Happening
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
 from emulator.world.own_sensors import SensorFailure
 from emulator.world.world import Instant, World, components
+from vnet.driving import Action
 from vnet.radio import SendOptions
 from vnet.reports import Report
 from vnet.transport import wire
+from vnet.transport.wire import BusyRatios
+from vnet.types import Array, IntArray
 from vnet.units import NS_PER_S
+
+
+class NodeState(StrEnum):
+    """State of a node, from before its vehicle enters to the end of its program."""
+
+    NEW = "new"
+    """Its vehicle has not entered the network yet, and its program has never been started."""
+    OUTSIDE = "outside"
+    """Its vehicle has left the network, or was stopped before it had entered."""
+    ENTERING = "entering"
+    """Its vehicle enters; its program has been started and is not up yet."""
+    UP = "up"
+    """Its program runs."""
+    DOWN = "down"
+    """A fault has stopped its program."""
+    RESTARTING = "restarting"
+    """The fault is over; its program has been started again and is not up yet."""
+    ENDED = "ended"
+    """Its program has returned, crashed or died: it is not started again."""
+    ENDED_OUTSIDE = "ended outside"
+    """As ENDED, and its vehicle has left the network since."""
+
+
+_S = NodeState
+_STOPPED = {_S.UP: _S.DOWN, _S.RESTARTING: _S.DOWN, _S.ENTERING: _S.OUTSIDE}
+"""State of a node after it is stopped, by its state before; nodes in other states cannot be stopped."""
+_LEFT = {_S.DOWN: _S.OUTSIDE, _S.ENDED: _S.ENDED_OUTSIDE}
+"""State of a node after its vehicle has left, by its state before. Its program is stopped first."""
+_STARTED = {_S.NEW: _S.ENTERING, _S.OUTSIDE: _S.ENTERING, _S.DOWN: _S.RESTARTING}
+"""State of a node after it is started, by its state before."""
+_OUTSIDE = {_S.NEW, _S.OUTSIDE, _S.ENTERING, _S.ENDED_OUTSIDE}
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Nodes that are stopped, have left and are to be started, in the order of their numbers."""
+
+    stopped: list[str]
+    left: list[str]
+    started: list[str]
+
+
+class Presence:
+    """The states of the nodes of a run. `up` and `incarnation` (starts before this one) are kept by node."""
+
+    def __init__(self, node_ids: Sequence[str], absent: Collection[str] = ()) -> None:
+        self._states = {node: _S.NEW if node in absent else _S.UP for node in node_ids}
+        self.up = {node: node not in absent for node in node_ids}
+        self.incarnation = dict.fromkeys(node_ids, 0)
+
+    def state(self, node: str) -> NodeState:
+        """State of a node."""
+        return self._states[node]
+
+    def is_outside(self, node: str) -> bool:
+        """Return whether a vehicle is not in the network: it has not entered yet, or has left."""
+        return self._states[node] in _OUTSIDE
+
+    def _put(self, node: str, state: NodeState) -> None:
+        self._states[node] = state
+        self.up[node] = state is _S.UP
+
+    def change(self, under_fault: Collection[str], absent: Collection[str]) -> Changes:
+        """From now on faults stop the programs of these nodes, and these vehicles are not in the network."""
+        down = {*under_fault, *absent}
+        stopped = [node for node, state in self._states.items() if node in down and state in _STOPPED]
+        for node in stopped:
+            self._put(node, _STOPPED[self._states[node]])
+        left = [node for node, state in self._states.items() if node in absent and state in _LEFT]
+        for node in left:
+            self._put(node, _LEFT[self._states[node]])
+        started = [node for node, state in self._states.items() if node not in down and state in _STARTED]
+        for node in started:
+            self.incarnation[node] += self._states[node] is not _S.NEW
+            self._put(node, _STARTED[self._states[node]])
+        return Changes(stopped, left, started)
+
+    def come_up(self, nodes: Iterable[str]) -> dict[str, bool]:
+        """Those of the nodes that were started are up; returns them, and whether their vehicles enter with that."""
+        entered = {
+            node: self._states[node] is _S.ENTERING
+            for node in nodes
+            if self._states[node] in (_S.ENTERING, _S.RESTARTING)
+        }
+        for node in entered:
+            self._put(node, _S.UP)
+        return entered
+
+    def end(self, node: str) -> bool:
+        """A program has ended by itself; returns False if it was not up, and so had ended before."""
+        if not self.up[node]:
+            return False
+        self._put(node, _S.ENDED)
+        return True
+
+    def has_ended(self, node: str) -> bool:
+        """Return whether a program has ended by itself: it is not started again."""
+        return self._states[node] in (_S.ENDED, _S.ENDED_OUTSIDE)
+
+
+class Driving:
+    """Vehicles of a run and their programs' actions; nothing in a world whose truth is known from the start."""
+
+    def __init__(self, world: World, folder: RunFolder, number: Mapping[str, int]) -> None:
+        self._world = world if isinstance(world, SteppedWorld) else None
+        self._node_ids = () if self._world is None else self._world.driven
+        self._drive = frozenset(self._node_ids)
+        self._folder = folder
+        self._number = number
+
+    @property
+    def next_ns(self) -> int | None:
+        """The next control instant within the run; None if there is none."""
+        return None if self._world is None else self._world.next_control_ns()
+
+    def control_ns(self, node: str) -> int:
+        """Return the time between two control instants; 0 for a node that its program does not drive."""
+        return 0 if self._world is None or node not in self._drive else self._world.vehicles.step_ns
+
+    @property
+    def versions(self) -> Mapping[str, str]:
+        """Versions of programs that move vehicles, by name."""
+        return {} if self._world is None else self._world.versions
+
+    def table(self) -> pa.Table | None:
+        """Return what vehicles did at each control instant; None where programs do not drive."""
+        return None if self._world is None else driven_table(self._world.vehicles.finished_log(), self._node_ids)
+
+    def background(self) -> pa.Table | None:
+        """Return where vehicles without programs were; None where there are none."""
+        return None if self._world is None else background_table(self._world.background)
+
+    def background_m(self, period: int) -> Array:
+        """Return the positions (k, 2) of vehicles without programs at the start of a period."""
+        background = None if self._world is None else self._world.background
+        return np.zeros((0, 2)) if background is None else background.position_m[period]
+
+    def take(self, time_ns: int, actions: Iterable[Action]) -> None:
+        """Take what programs of vehicles that are up ask for at `time_ns`."""
+        if self._world is not None:
+            for action in actions:
+                if action.node not in self._drive:  # a roadside unit
+                    continue
+                self._tell(self._world.vehicles.take(time_ns, self._number[action.node], action))
+
+    def release(self, time_ns: int, node: str) -> None:
+        """Leave the speed of a vehicle whose program has ended to the vehicle."""
+        self.take(time_ns, [Action(node, release=True)])
+
+    def advance_to(self, time_ns: int) -> bool:
+        """Let vehicles drive to the last control instant until `time_ns`; returns whether they have moved."""
+        moved = False
+        while self._world is not None and (next_ns := self.next_ns) is not None and next_ns <= time_ns:
+            self._tell(self._world.advance())
+            moved = True
+        return moved
+
+    def close(self) -> None:
+        """Let go of what moves the vehicles; the run is over."""
+        if self._world is not None:
+            self._world.close()
+
+    def detach(self) -> None:
+        """Let go of it in a process forked from the emulator's, which goes on with it."""
+        if self._world is not None:
+            self._world.detach()
+
+    def _tell(self, happened: Iterable[Happening]) -> None:
+        for each in happened:
+            self._folder.event(each.time_ns, KINDS[each.kind], self._node_ids[each.number], **each.details)
+
+
+MOST_KNOWN = 64
+"""Measurements that are kept: those of a window serve all processes that are granted it."""
+
+
+class BusyFeed:
+    """Measurements of the nodes `node_ids` of an engine, in its order, which are known `delay_ns` later."""
+
+    def __init__(self, engine: Engine, node_ids: Sequence[str], delay_ns: int) -> None:
+        self._engine = engine
+        self._number = {node: number for number, node in enumerate(node_ids)}
+        self._delay_ns = delay_ns
+        self._numbers: dict[tuple[str, ...], IntArray] = {}
+        self._known: dict[int, Array] = {}
+
+    def of(self, nodes: tuple[str, ...], time_ns: int, end_ns: int) -> Sequence[BusyRatios]:
+        """Return what `nodes` know from `time_ns` to just before `end_ns`; nothing if they share no medium.
+
+        All events of the medium more than the delay before `end_ns` have been processed.
+        """
+        if not self._engine.shares_medium:
+            return ()
+        if nodes not in self._numbers:
+            self._numbers[nodes] = np.array([self._number[node] for node in nodes])
+        first_ns = max(0, (time_ns - self._delay_ns) // SLICE_NS * SLICE_NS)
+        later_ns = range(first_ns + SLICE_NS, end_ns - self._delay_ns, SLICE_NS)
+        return [self._measured(nodes, measured_ns) for measured_ns in (first_ns, *later_ns)]
+
+    def _measured(self, nodes: tuple[str, ...], measured_ns: int) -> BusyRatios:
+        if measured_ns not in self._known:
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            self._known[measured_ns] = self._engine.busy_ratios_at(measured_ns)
+        ratios = self._known[measured_ns][self._numbers[nodes]]
+        return BusyRatios(measured_ns + self._delay_ns if measured_ns else 0, ratios.tolist())
+
+
+MOST_EXCEPTIONS = 20
+"""Unhandled exceptions of a node that are written down, with their tracebacks; further ones are counted."""
+MOST_NOTES = 1000
+"""Log lines of a node that are written down, and as many of its events; further ones are counted."""
+MOST = {"exception": MOST_EXCEPTIONS, "log": MOST_NOTES, "event": MOST_NOTES}
+LONGEST_TEXT = 4000
+"""Characters of a text that are written down."""
+MOST_DETAILS = 50
+"""Details of an event that are written down."""
+
+
+class LogBook:
+    """Writes what programs tell into the run's folder. `number` has the nodes in their order."""
+
+    def __init__(self, folder: RunFolder, number: Mapping[str, int]) -> None:
+        self._folder = folder
+        self._number = number
+        self._counts: Counter[tuple[str, str]] = Counter()
+
+    def tell(self, time_ns: int, notes: Iterable[wire.Note], unhandled: Iterable[wire.Unhandled]) -> None:
+        """Write down what came at `time_ns`, each at its own instant."""
+        for note in sorted(notes, key=lambda note: (note.time_ns, self._number[note.node])):
+            if self._fits(note.node, note.kind):
+                self._write(min(time_ns, note.time_ns), note)
+        raised = [(time_ns if each.time_ns is None else min(time_ns, each.time_ns), each) for each in unhandled]
+        for raised_ns, each in sorted(raised, key=lambda pair: (pair[0], self._number[pair[1].node])):
+            if self._fits(each.node, EventKind.exception):
+                details = {"error": each.error[:LONGEST_TEXT], "place": each.place, "where": each.details}
+                self._folder.event(raised_ns, EventKind.exception, each.node, **details)
+
+    def _fits(self, node: str, kind: str) -> bool:
+        self._counts[node, kind] += 1
+        return self._counts[node, kind] <= MOST[kind]
+
+    def _write(self, time_ns: int, note: wire.Note) -> None:
+        text = note.text[:LONGEST_TEXT]
+        if note.kind == "log":
+            self._folder.event(time_ns, EventKind.log, note.node, level=note.level, text=text)
+            return
+        details = {key: _plain(value) for key, value in list(note.details.items())[:MOST_DETAILS]}
+        self._folder.event(time_ns, EventKind.event, note.node, name=text, details=details)
+
+    def tell_left_out(self, time_ns: int) -> None:
+        """Write down how much of each kind is missing of each node, because there was too much."""
+        for (node, kind), count in sorted(self._counts.items(), key=lambda item: self._number[item[0][0]]):
+            if count > MOST[kind]:
+                self._folder.event(time_ns, EventKind.left_out, node, what=kind, count=count - MOST[kind])
+
+
+def _plain(value: bool | int | float | str) -> bool | int | float | str:
+    """A value that JSON has: bounded texts, finite numbers."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value[:LONGEST_TEXT] if isinstance(value, str) else value
+
 
 NO_CHOICES = None, None, None
 """Power, bit rate and addressee of a frame without any of its own."""
@@ -131,6 +403,7 @@ class Emulation:
         self.log_book = LogBook(folder, self.number)
         self.orders = Orders(scenario)
         self.backbone = BackboneNetwork(scenario, self.up)
+        self.news = NewsFeed(self.engine, self.backbone, self.up)
         self.busy = BusyFeed(self.engine, world.node_ids, least_latency_ns(scenario.radio))
 
     def _nodes_at(self, period: int) -> Nodes:

@@ -19,10 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from emulator.drivers.cpu_watch import cpu_time_ns
 from emulator.drivers.debugging import DebugPoint
-from emulator.drivers.process_group import GroupProcess
-from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, Process, Zygote, ZygoteGoneError
+from emulator.drivers.usage import cpu_time_ns
+from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, GroupProcess, Process, Zygote, ZygoteGoneError
 from vnet.errors import VnetError
 from vnet.runtime import forking
 from vnet.runtime.environment import SAME_ARITHMETIC

@@ -1,8 +1,8 @@
 """The barrier of a run in lockstep, without any transport.
 
 Lockstep is a conservative discrete-event simulation whose entities are event loops: it is told what each process
-yields and says which processes to grant which window of time. The live driver moves these messages over Zenoh,
-`vnet simulate` by calling; so both give the same trace.
+yields and says which processes to grant which window of time. `run_in_lockstep` is the one loop that moves these
+messages, wherever the processes are; so a live run and its simulation give the same trace.
 
 No frame arrives sooner than L, `lookahead_ns`, after it was sent. So what arrives in a window [T, T + L) was
 sent before T, the next instant at which anything happens: each process may pass through the window by itself.
@@ -14,7 +14,7 @@ nobody could notice, and has the fixes of the next period for that (`vnet/runtim
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import count
 from typing import Any
@@ -23,15 +23,52 @@ import numpy as np
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.drivers.lockstep_process import LockstepProcess
-from emulator.drivers.news_feed import NewsFeed
-from emulator.drivers.protocol import ProtocolError, check_yield, wire_packet
+from emulator.drivers.processes import Processes, ProtocolError, check_yield
 from emulator.scenario.lookahead import lookahead_ns
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import Fix
 from vnet.radio import Packet
-from vnet.runtime.mail import Mail
+from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
+
+
+class LockstepProcess:
+    """One event loop at the barrier: its nodes, what they last said, and what waits for its next wake-up.
+
+    `order` is its place among all processes. `plan` numbers its planned wake-up: earlier ones are void.
+    """
+
+    def __init__(self, nodes: Sequence[str], order: int) -> None:
+        self.id = nodes[0]
+        self.nodes = tuple(nodes)
+        self.order = order
+        self.plan = -1
+        self.seq = 0
+        self.granted_ns = 0
+        self.next_timer_ns: int | None = None
+        self.waiting_radio: Sequence[str] = ()
+        self.waiting_gnss: Sequence[str] = ()
+        self.steps: Sequence[wire.Step] = ()
+        self.packets: dict[str, list[Packet]] = {node: [] for node in self.nodes}
+        self.next_fix = dict.fromkeys(self.nodes, 0)
+        self.paused: set[str] = set()
+        self.affected: set[str] = set()
+        self.clocks: list[wire.ClockError] = []
+
+    @property
+    def running(self) -> list[str]:
+        """Nodes that are not paused."""
+        return [node for node in self.nodes if node not in self.paused]
+
+    def take_packets(self) -> dict[str, list[Packet]]:
+        """Return the packets of nodes that run, and have any."""
+        due = {node: self.packets[node] for node in self.running if self.packets[node]}
+        self.packets.update({node: [] for node in due})
+        return due
+
+    def take_clocks(self) -> list[wire.ClockError]:
+        changed, self.clocks = self.clocks, []
+        return changed
 
 
 class Lockstep:
@@ -62,13 +99,13 @@ class Lockstep:
         """Nodes (N,) that an arrival wakes."""
         self._yielded: list[LockstepProcess] = []
         self._deaths: list[tuple[LockstepProcess, dict[str, Any]]] = []
-        self._news = NewsFeed(emulation)
+        self._news = emulation.news
         self._crowded: set[str] = set()
         """Nodes for which more packets wait than a mailbox holds."""
         self._end_ns = 0
         self._quiet_ns = 0
         """Instant before which processes that run ahead may pass through quiet instants."""
-        self._mail: Mail | None = None
+        self._mail: dict[str, Mail] = {}
         self.ahead: Collection[str] = ()
         """Processes that run ahead."""
         self._lookahead_ns = lookahead_ns(emulation.scenario) if emulation.scenario.run.windows else 1
@@ -102,10 +139,9 @@ class Lockstep:
         actions, self._actions = self._actions, []
         return actions
 
-    def take_mail(self) -> Mail | None:
-        """Return what belongs to the grant of the one process of a simulation, which needs no form for the wire."""
-        mail, self._mail = self._mail, None
-        return mail
+    def take_mail(self, process_id: str) -> Mail:
+        """Return the packets and fixes that belong to the grant of a process."""
+        return self._mail.pop(process_id)
 
     def receive(self, process_id: str, message: wire.Yield) -> None:
         """A process has yielded.
@@ -380,11 +416,7 @@ class Lockstep:
         grant = wire.Grant(
             process.seq, time_ns, self._end_ns, clocks=clocks, busy=busy, results=results, messages=messages
         )
-        if self._permanent and len(self._groups) == 1:
-            self._mail = Mail(packets, fixes)
-        else:
-            encoded = [wire_packet(node, packet) for node, some in packets.items() for packet in some]
-            grant = replace(grant, packets=encoded, fixes=[wire.WireFix.of(*each) for each in fixes])
+        self._mail[process.id] = Mail(packets, fixes)
         if process.id in self.ahead and self._lookahead_ns > 1 and not process.paused:
             grant = self._quiet_grant(process, grant)
         self.owed[process.id] = process.seq
@@ -417,3 +449,47 @@ class Lockstep:
         process.next_fix.update(dict.fromkeys(nodes, period + 1))
         fixes = [wire.WireFix.of(node, fix) for node in nodes for fix in self._fixes(node, [period])]
         return replace(grant, quiet_ns=self._quiet_ns, next_fixes=fixes, next_fixes_ns=due_ns)
+
+
+HorizonCallback = Callable[[Lockstep], Awaitable[None]]
+"""Sets the barrier's horizon: called before time 0, and whenever the run is held there."""
+
+
+async def no_horizon(lockstep: Lockstep) -> None:
+    """Leave the run without a horizon: nothing holds it."""
+
+
+async def run_in_lockstep(
+    lockstep: Lockstep, processes: Processes, before_horizon: HorizonCallback = no_horizon
+) -> None:
+    """Run from time 0 to the end: give the barrier's grants to the processes and take their yields."""
+    try:
+        await before_horizon(lockstep)
+        grants = lockstep.start()
+        while grants:
+            for actions in lockstep.take_actions():
+                await processes.act(actions)
+            for process_id, grant in grants.items():
+                processes.send(process_id, grant, lockstep.take_mail(process_id))
+            await _all_yielded(lockstep, processes)
+            grants = lockstep.step()
+            while lockstep.held:
+                await before_horizon(lockstep)
+                grants = lockstep.step()
+        for process_id, details in processes.ended().items():
+            lockstep.died(process_id, **details)
+    finally:
+        lockstep.tell_deaths()
+
+
+async def _all_yielded(lockstep: Lockstep, processes: Processes) -> None:
+    """Take the yields of all processes that were granted a window, or their ends."""
+    while owed := lockstep.owed:
+        for process_id, details in processes.ended(owed.keys()).items():
+            lockstep.died(process_id, **details)
+        if owed and (heard := await processes.receive()) is not None:
+            assert isinstance(heard.message, wire.Yield)
+            try:
+                lockstep.receive(heard.process_id, heard.message)
+            except ProtocolError as error:
+                processes.refuse(heard.process_id, error)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from emulator.records.tape import MediumOrder, TapeEntry, first_left, parse_tape, read_tape
 from emulator.scenario.scenario import Scenario
-from vnet.transport.orders import Deviation, Order
+from vnet.transport.wire import Deviation, Order
 
 
 class Orders:

@@ -1,27 +1,30 @@
-"""A run in real time, without any transport: the engine on a clock that the driver reads.
+"""A run in real time, without any transport: the engine on the monotonic clock.
 
-Traffic is taken when it comes, and what is due goes out in batches.
+Traffic is taken when it comes, and what is due goes out in batches; `run_in_real_time` is the loop that moves both.
 """
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections import Counter
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.drivers.news_feed import NewsFeed
-from emulator.drivers.protocol import check_ownership, wire_packet
+from emulator.drivers.processes import Processes, ProtocolError, check_ownership
 from emulator.radio.engine import Delivery
 from emulator.records.events import EventKind
-from vnet.runtime.news import NewsItem
-from vnet.transport import lateness, wire
-from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.runtime.arrivals import NewsItem
+from vnet.transport import wire
+from vnet.transport.wire import SentMessage, WireMessage
 from vnet.units import NS_PER_S
 
 KEPT_NS = 10 * NS_PER_S
 """Nanoseconds for which messages of the backbone are kept for processes that have not seen them."""
+LEAST_WAIT_S = 1e-9
+"""Seconds for which messages are awaited in each round, so that they can come at all."""
 WORST_PROCESSES = 8
 """Number of processes, those with the most late deliveries, that an event names."""
 WORST_SECONDS = 20
@@ -65,7 +68,7 @@ class RealTime:
         self._actions: list[ProcessActions] = []
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
-        self._news = NewsFeed(emulation)
+        self._news = emulation.news
         self._shown: dict[tuple[str, int], tuple[int, WireMessage]] = {}
         """Messages of the backbone that went out within `KEPT_NS`, and when, by unit and number."""
         self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
@@ -73,9 +76,29 @@ class RealTime:
         """First and last of the ranges of frames that have not come, and of which their process is to know."""
         self._affected: set[str] = set()
         self._next_period = 0
-        self._origin_ns = 0
+        self._origin_ns = time.monotonic_ns()
         self._collected_ns = 0
         self.gaps = 0
+
+    @property
+    def now_ns(self) -> int:
+        """Emulated time: the time since the start, which is negative before."""
+        return time.monotonic_ns() - self._origin_ns
+
+    def since_start_ns(self, monotonic_ns: int) -> int:
+        """Return the emulated time of an instant of the monotonic clock, at least 0."""
+        return max(monotonic_ns - self._origin_ns, 0)
+
+    @property
+    def wait_s(self) -> float:
+        """Seconds until `due` must be called next, or until the end."""
+        duration_ns = self._emulation.duration_ns
+        return (min(self.next_time_ns() or duration_ns, duration_ns) - self.now_ns) / NS_PER_S
+
+    @property
+    def is_over(self) -> bool:
+        """True from the end of the run on."""
+        return self.now_ns >= self._emulation.duration_ns
 
     def start(self, origin_ns: int) -> dict[str, wire.Batch]:
         """The batches that start every process that is there; time 0 is `origin_ns` on the monotonic clock."""
@@ -153,7 +176,7 @@ class RealTime:
     def _delay(self, deliveries: Sequence[Delivery], arrived_ns: int) -> None:
         """Correct the arrivals of those deliveries of a batch that came over 20 ms late."""
         for delivery in deliveries:
-            if arrived_ns - delivery.packet.received_ns >= lateness.LATENESS_LIMIT_NS:
+            if arrived_ns - delivery.packet.received_ns >= wire.LATENESS_LIMIT_NS:
                 self._emulation.engine.delay(delivery, arrived_ns)
 
     def _lose(self, deliveries: Sequence[Delivery]) -> None:
@@ -236,7 +259,7 @@ class RealTime:
         self._batch_seq[process_id] = seq + 1
         deliveries, fixes = self._packets.pop(process_id, []), self._fixes.pop(process_id, [])
         node_ids = self._emulation.world.node_ids
-        packets = [wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
+        packets = [wire.WirePacket.of(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
         clocks, self._clocks[process_id] = self._clocks[process_id], []
         lost, self._lost[process_id] = self._lost[process_id], []
         held = process_id in self._was_paused
@@ -280,7 +303,7 @@ class RealTime:
 
 def _late(counts: Sequence[int]) -> int:
     """Number of deliveries of a lateness histogram over the limit."""
-    return sum(counts[lateness.lateness_bin(lateness.LATENESS_LIMIT_NS) :])
+    return sum(counts[wire.lateness_bin(wire.LATENESS_LIMIT_NS) :])
 
 
 def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
@@ -293,7 +316,7 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
         index = next(i for i, c in enumerate(cumulative) if c >= share * total)
         below = cumulative[index] - counts[index]
         inside = (share * total - below) / counts[index]
-        low_ms, high_ms = lateness.lateness_edge_ms(index - 1), lateness.lateness_edge_ms(index)
+        low_ms, high_ms = wire.lateness_edge_ms(index - 1), wire.lateness_edge_ms(index)
         return low_ms + inside * (high_ms - low_ms)
 
     return {
@@ -303,3 +326,37 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
         "p99_ms": percentile_ms(0.99),
         "max_ms": percentile_ms(1.0),
     }
+
+
+async def run_in_real_time(realtime: RealTime, processes: Processes) -> None:
+    """Start all processes at one instant, send what is due and take what comes, until the end."""
+    for process_id, batch in realtime.start(time.monotonic_ns() + wire.HEAD_START_NS).items():
+        processes.send(process_id, batch)
+    await asyncio.sleep(wire.HEAD_START_NS / NS_PER_S)
+    while not realtime.is_over:
+        batches = realtime.due(realtime.now_ns)
+        for actions in realtime.take_actions():
+            await processes.act(actions)
+        for process_id, batch in batches.items():
+            processes.send(process_id, batch)
+        for process_id in processes.returned():
+            processes.send(process_id, realtime.returned(realtime.now_ns, process_id))
+        await take_what_comes(realtime, processes, max(realtime.wait_s, LEAST_WAIT_S))
+
+
+async def take_what_comes(realtime: RealTime, processes: Processes, timeout_s: float) -> None:
+    """Wait for something to come, at most so long, and take all that has."""
+    heard = await processes.receive(timeout_s)
+    while heard is not None:
+        now_ns = realtime.since_start_ns(heard.arrived_ns)
+        try:
+            if isinstance(heard.message, SentMessage):
+                realtime.take_messages(now_ns, [heard.message])
+            else:
+                assert isinstance(heard.message, wire.Frames)
+                realtime.receive(now_ns, heard.process_id, heard.message)
+        except ProtocolError as error:
+            processes.refuse(heard.process_id, error)
+        heard = await processes.receive(0.0)
+    for process_id, details in processes.ended().items():
+        realtime.died(realtime.now_ns, process_id, **details)

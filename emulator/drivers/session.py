@@ -7,11 +7,14 @@ programs are (`Local`, or `LiveOptions` for processes over Zenoh), in the files 
 from __future__ import annotations
 
 import asyncio
+import os
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import nullcontext, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -24,18 +27,19 @@ from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude, judge_unkept
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
-from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.process_count import Processes, process_count
-from emulator.drivers.program_check import program_check
-from emulator.drivers.simulate import simulate
+from emulator.drivers.launch import Exit
+from emulator.drivers.lockstep import Lockstep, no_horizon
+from emulator.drivers.simulate import ProcessCount, process_count, simulate
+from emulator.drivers.zygote import AGENT_ENVIRONMENT
 from emulator.records.code_digest import entries_of
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world
-from vnet.errors import ScenarioError
+from vnet.errors import ProgramError, ScenarioError
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import load_program
+from vnet.runtime.environment import SAME_ARITHMETIC
+from vnet.runtime.own_packages import foreign_on_path
+from vnet.runtime.programs import load_program, search_programs_in
 from vnet.transport.access import Access
 from vnet.transport.session import quiet_zenoh
 
@@ -48,7 +52,7 @@ class Local:
     ended the process of an earlier attempt.
     """
 
-    processes: Processes | str = 1
+    processes: ProcessCount | str = 1
     debug: DebugTarget | None = None
     apart: str | None = None
 
@@ -153,7 +157,7 @@ class Session:
         if self.live is None:
             where = self._local
             self.wall_s, self.interrupted = simulate(
-                self.emulation, None, stop, on_interrupt, where.debug, self._processes, where.apart
+                self.emulation, no_horizon, stop, on_interrupt, where.debug, self._processes, where.apart
             )
         else:
             from emulator.drivers.live import run_live  # slow to import, and simulations do without
@@ -207,7 +211,7 @@ class Session:
             self.over = True
             self._stand()
 
-    def _hold(self, lockstep: Lockstep) -> None:
+    async def _hold(self, lockstep: Lockstep) -> None:
         self._stand()
         lockstep.horizon_ns = self._horizons.get()
 
@@ -247,3 +251,65 @@ def with_order_steps(scenario: Scenario) -> Scenario:
         raise KeyboardInterrupt
     steps = max([1, *session.emulation.orders.steps.values()])
     return scenario.model_copy(update={"run": run.model_copy(update={"order_steps": steps})})
+
+
+_LONGEST_REASON = 1 << 16
+"""Bytes of a reason, which fit into a pipe."""
+
+
+class ProgramCheck:
+    """One process that imports the programs of `scenario`; made by `program_check`."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._entries = entries_of(scenario)
+        self._limit_s = scenario.run.join_timeout_s
+        self._reason, write_end = os.pipe()
+        folders = [word for folder in scenario.program.folders for word in ("--path", str(folder))]
+        arguments = ["-P", "-m", "agents.program_check", str(write_end), *folders, *self._entries]
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                pass_fds=[write_end],
+                process_group=0,  # Ctrl-C in the terminal is the emulator's
+                env={**SAME_ARITHMETIC, **os.environ, **AGENT_ENVIRONMENT},
+            )
+        finally:
+            os.close(write_end)
+
+    def wait(self) -> None:
+        """Wait for its end. Raises ProgramError if a program cannot be loaded."""
+        entries = ", ".join(map(repr, self._entries))
+        try:
+            status = self._process.wait(self._limit_s)
+        except subprocess.TimeoutExpired:
+            raise ProgramError(
+                f"program.entry = {entries}: not imported within run.join_timeout_s = {self._limit_s:g}"
+            ) from None
+        if status == 0:
+            return
+        if foreign := foreign_on_path("agents"):
+            raise ProgramError(foreign)
+        os.set_blocking(self._reason, False)
+        reason = os.read(self._reason, _LONGEST_REASON).decode() if status == 2 else ""
+        raise ProgramError(
+            reason or f"program.entry = {entries}: importing it ended the process ({Exit(status, '').how})"
+        )
+
+    def close(self) -> None:
+        """End the process if it is still there."""
+        self._process.kill()
+        self._process.wait()
+        os.close(self._reason)
+
+
+@contextmanager
+def program_check(scenario: Scenario) -> Iterator[ProgramCheck]:
+    """Import the programs in the background; `wait` within the block says whether they can be loaded."""
+    check = ProgramCheck(scenario)
+    try:
+        yield check
+    finally:
+        check.close()

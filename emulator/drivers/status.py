@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from emulator.drivers.emulation import Emulation, PeriodView
-from emulator.drivers.memory import resident_kb
+from emulator.drivers.usage import resident_kb
 from emulator.faults.plan import PlannedFault
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import MEASURED, SAID, Event

@@ -33,7 +33,7 @@ from emulator.scenario.own_functions import load_function
 from emulator.scenario.program import Program
 from emulator.scenario.random_streams import Draws, frame_stream
 from vnet.errors import shown
-from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import search_programs_in
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 

@@ -14,7 +14,7 @@ from emulator.records.events import SAMPLES, Event
 from emulator.records.recorded_run import OpenedRun
 from emulator.records.reported import value_columns
 from emulator.records.tape import TAPE_FILE, TapeEntry, described, read_tape
-from vnet.transport.orders import Deviation
+from vnet.transport.wire import Deviation
 from vnet.units import NS_PER_S
 
 FRAME = ("sent_ns", "sender", "seq", "size_bytes", "payload_digest")

@@ -14,7 +14,7 @@ from typing import Annotated
 import msgspec
 
 from vnet.errors import VnetError, printable
-from vnet.transport.orders import Count, Deviation, TimeNs
+from vnet.transport.wire import Count, Deviation, TimeNs
 from vnet.units import NS_PER_S
 
 TAPE_FILE = "tape.jsonl"

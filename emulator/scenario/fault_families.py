@@ -12,7 +12,7 @@ draws it, and which law it follows. The layers above act on families:
 | `SenderFault` | `radio/sender_faults.py` | `checks/senders.py` |
 | `OwnRule` | `radio/own_rules.py` | `checks/own_rules.py` |
 | `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/senders.py`, `checks/fault_effects.py` |
-| `Infrastructure` | `drivers/live/reconnection.py` | `checks/fault_effects.py` |
+| `Infrastructure` | `drivers/live/processes.py` | `checks/fault_effects.py` |
 """
 
 from __future__ import annotations

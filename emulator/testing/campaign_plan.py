@@ -20,8 +20,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.schedules import LEAST_TIME_S, Ranges, ScheduleConstraints, draw_fault, known_kinds
 from vnet.errors import ScenarioError
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import load_program
+from vnet.runtime.programs import load_program, search_programs_in
 
 LONGEST_S = 20.0
 MOST_FAULTS = 4

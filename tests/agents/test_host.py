@@ -14,8 +14,7 @@ from agents.host import UNSEEN_NS, _RealTimeAgent
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import TransportError
 from vnet.transport import wire
-from vnet.transport.backbone import MessageRef
-from vnet.transport.send_results import WireSendResult
+from vnet.transport.wire import MessageRef, WireSendResult
 
 
 def attachment() -> Attachment:

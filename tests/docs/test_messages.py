@@ -25,10 +25,8 @@ from vnet.driving import Action
 from vnet.errors import WireError
 from vnet.reports import Report
 from vnet.transport import backbone_keys, keys, wire
-from vnet.transport.backbone import MessageRef
 from vnet.transport.backbone_keys import Arrived, Sent
-from vnet.transport.orders import Deviation, Order
-from vnet.transport.send_results import WireSendResult
+from vnet.transport.wire import Deviation, MessageRef, Order, WireSendResult
 
 PAGE = Layouts()
 OF_AGENTS = {kind.__name__: kind for kind in (wire.Hello, wire.Yield, wire.Frames, wire.Final, wire.StackDump)}

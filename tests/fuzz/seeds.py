@@ -13,7 +13,7 @@ from emulator.drivers.hosts import messages
 from emulator.scenario.faults import KINDS
 from tests.support import maps
 from vnet.reports import Report
-from vnet.transport import lateness, wire
+from vnet.transport import wire
 from vnet.transport.backbone_keys import Sent
 
 OVERRIDE = b"\n--set "
@@ -52,7 +52,7 @@ TX: tuple[wire.AgentMessage, ...] = (
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", True, None, 2),
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import", 2),
     wire.Yield(b"n" * 16, 3, 100, ["v01"], [], [wire.Step(50, TRAFFIC)], 1),
-    wire.Frames(b"n" * 16, 3, 3, [(1, 2)], TRAFFIC, wire.Lateness([1] * lateness.LATENESS_BINS), True),
+    wire.Frames(b"n" * 16, 3, 3, [(1, 2)], TRAFFIC, wire.Lateness([1] * wire.LATENESS_BINS), True),
     wire.Final(b"n" * 16, TRAFFIC),
     wire.StackDump(b"n" * 16, "File …", 5),
 )

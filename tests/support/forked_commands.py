@@ -142,7 +142,7 @@ if __name__ == "__main__":
     import emulator.cli
     import emulator.cli.commands
     import emulator.cli.execution
-    import emulator.drivers.live.driver
+    import emulator.drivers.live.processes
 
     gc.collect()
     gc.freeze()

@@ -6,9 +6,11 @@ pass through the wire's encoding, a kill leaves a loop where it stands, and an e
 
 import asyncio
 import atexit
+import math
 import queue
 import threading
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,21 +18,22 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from emulator.drivers.emulation import Emulation
+from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.join import split_into_processes
-from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.lockstep import Lockstep, run_in_lockstep
+from emulator.drivers.processes import Heard, Processes
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.runtime.ahead import RunAhead
-from vnet.runtime.disks import Disks
-from vnet.runtime.host import Host
+from vnet.runtime.arrivals import Mail
+from vnet.runtime.host import Disks, Host
 from vnet.runtime.programs import load_programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import backbone_keys, wire
-from vnet.transport.backbone import SentMessage, WireMessage
 from vnet.transport.backbone_keys import Contents
+from vnet.transport.wire import SentMessage, WireMessage
 
 _folders = TemporaryDirectory(prefix="vnet-apart-")
 atexit.register(_folders.cleanup)
@@ -88,29 +91,41 @@ def run_apart(scenario: Scenario) -> Emulation:
     }
     lockstep = Lockstep(emulation, list(groups.values()))
     lockstep.ahead = () if emulation.orders.explores else set(groups)
-    processes = {
-        process_id: _Process(emulation, nodes) for process_id, nodes in groups.items() if emulation.up[process_id]
-    }
+    apart = _Apart(emulation, groups)
     try:
-        grants = lockstep.start()
-        while grants:
-            for actions in lockstep.take_actions():
-                for process_id, nodes in groups.items():
-                    killed = [actions.stop[node] for node in nodes if node in actions.stop]
-                    if killed:
-                        traffic = processes.pop(process_id).end(killed=any(killed))
-                        emulation.take_final(actions.time_ns, traffic)
-                    if any(node in actions.start for node in nodes):
-                        processes[process_id] = _Process(emulation, nodes)
-            for process_id, grant in grants.items():
-                processes[process_id].put_grant(grant)
-            for process_id in grants:
-                lockstep.receive(process_id, processes[process_id].take_yield())
-            grants = lockstep.step()
+        asyncio.run(run_in_lockstep(lockstep, apart))
     finally:
-        finals = [traffic for process in processes.values() for traffic in process.end(killed=False)]
+        finals = [traffic for process in apart.processes.values() for traffic in process.end(killed=False)]
         emulation.take_final(emulation.duration_ns, finals)
     return emulation
+
+
+class _Apart(Processes):
+    """Processes that come and go with faults."""
+
+    def __init__(self, emulation: Emulation, groups: Mapping[str, Sequence[str]]) -> None:
+        self._emulation, self._groups = emulation, groups
+        there = {process_id: nodes for process_id, nodes in groups.items() if emulation.up[process_id]}
+        self.processes = {process_id: _Process(emulation, nodes) for process_id, nodes in there.items()}
+        self._owing: deque[str] = deque()
+
+    async def act(self, actions: ProcessActions) -> None:
+        for process_id, nodes in self._groups.items():
+            killed = [actions.stop[node] for node in nodes if node in actions.stop]
+            if killed:
+                traffic = self.processes.pop(process_id).end(killed=any(killed))
+                self._emulation.take_final(actions.time_ns, traffic)
+            if any(node in actions.start for node in nodes):
+                self.processes[process_id] = _Process(self._emulation, nodes)
+
+    def send(self, process_id: str, message: wire.Grant | wire.Batch, mail: Mail | None = None) -> None:
+        assert isinstance(message, wire.Grant) and mail is not None
+        self.processes[process_id].put_grant(mail.within(message))
+        self._owing.append(process_id)
+
+    async def receive(self, timeout_s: float = math.inf) -> Heard:
+        process_id = self._owing.popleft()
+        return Heard(process_id, self.processes[process_id].take_yield())
 
 
 class _Process:

@@ -17,8 +17,7 @@ from emulator.viewer.sinks import Sinks
 from emulator.world.world import build_world
 from tests.support.paths import ROOT
 from tests.system.conftest import running_agents
-from vnet.transport.access import Access
-from vnet.transport.certificates import certifier
+from vnet.transport.access import Access, certifier
 from vnet.transport.credentials import KeyPair
 from vnet.transport.session import open_router
 

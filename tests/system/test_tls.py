@@ -17,9 +17,8 @@ from tests.system.by_hand import OPTIONS, ROUTER, SCENARIO, finish, start_agents
 from tests.system.conftest import TIMEOUT_S, Vnet
 from vnet.errors import TransportError
 from vnet.transport import keys, session
-from vnet.transport.access import Access, node_user
+from vnet.transport.access import Access, certifier, node_user
 from vnet.transport.authority import issue_certificates
-from vnet.transport.certificates import certifier
 from vnet.transport.credentials import Certificates, Credentials, Identity
 from vnet.transport.session import open_client, open_router, router_endpoint
 

@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from vnet.errors import VirtualTimeError
 from vnet.node import Node
+from vnet.runtime.arrivals import Mail
 from vnet.runtime.host import Host
-from vnet.runtime.mail import Mail
 from vnet.transport import wire
 
 Swap = Callable[[int | None], int]

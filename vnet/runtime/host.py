@@ -10,11 +10,17 @@ import asyncio
 import contextlib
 import contextvars
 import logging
+import shutil
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import count
+from pathlib import Path
+from tempfile import mkdtemp
 from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
@@ -27,31 +33,21 @@ from vnet.radio import RadioAbilities, SendOptions
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
-from vnet.runtime.busy_ratios import MeasuredBusyRatios
-from vnet.runtime.current_node import current_node, present_node
-from vnet.runtime.disks import Disks
-from vnet.runtime.event_order import Chooser, chooser_of
-from vnet.runtime.log_handler import LONGEST_NOTE, NodeLines, NodeLogHandler
-from vnet.runtime.mail import Mail
-from vnet.runtime.mail_delivery import MailDelivery
-from vnet.runtime.news import News
-from vnet.runtime.node_clocks import NodeClocks
-from vnet.runtime.outbox import Outbox
-from vnet.runtime.own_asyncio import Task
+from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, NodeClocks, Window
+from vnet.runtime.own_asyncio import Task, current_node, present_node
 from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
-from vnet.runtime.ready_queue import node_of
+from vnet.runtime.ready_queue import Chooser, chooser_of, node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap
 from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
-from vnet.runtime.window import Window
 from vnet.transport import wire
-from vnet.transport.backbone import SentMessage, arrived_in_full
-from vnet.transport.orders import Deviation, Order
+from vnet.transport.wire import Deviation, Order, SentMessage, arrived_in_full
 from vnet.units import NS_PER_S
 
-if TYPE_CHECKING:  # pdb, which few runs need
+if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
+
 
 COLLECTION_NS = NS_PER_S
 """Emulated time between two collections of garbage, at the nearest multiple of the period of fixes."""
@@ -543,3 +539,123 @@ class Host:
     def _new_task(self, task: Task) -> None:
         self._tasks[task] = task.node
         self._unhandled.watch(task, task.node)
+
+
+@dataclass
+class Outbox:
+    """Traffic in the order in which it was made, by kind."""
+
+    frames: list[wire.Frame] = field(default_factory=list)
+    reports: list[Report] = field(default_factory=list)
+    endings: list[wire.Ending] = field(default_factory=list)
+    notes: list[wire.Note] = field(default_factory=list)
+    deviations: list[Deviation] = field(default_factory=list)
+    actions: list[Action] = field(default_factory=list)
+    messages: list[SentMessage] = field(default_factory=list)
+    numbers: Iterator[int] = field(default_factory=count)
+    """Numbers of messages of the backbone, of which no two are equal."""
+
+    @property
+    def has_any(self) -> bool:
+        """True if there is anything that the emulator must be told at this instant."""
+        return bool(self.frames or self.reports or self.endings or self.notes or self.actions or self.messages)
+
+    def take(self, unhandled: Sequence[wire.Unhandled]) -> wire.Traffic:
+        """Remove and return all of it, with exceptions that nobody handled."""
+        frames, reports, endings, notes = self.frames, self.reports, self.endings, self.notes
+        deviations, actions, messages = self.deviations, self.actions, self.messages
+        self.frames, self.reports, self.endings, self.notes = [], [], [], []
+        self.deviations, self.actions, self.messages = [], [], []
+        return wire.Traffic(frames, reports, endings, unhandled, notes, deviations, actions, messages)
+
+
+class Disks:
+    """The folders of nodes: `root/NODE`, or folders that end with this process where `root` is None.
+
+    What lies below `root` is there again after a restart.
+    """
+
+    def __init__(self, root: Path | None = None) -> None:
+        self._root = None if root is None else root.absolute()
+
+    def of(self, node: str) -> Path:
+        """Return the folder of `node`, which exists then. Raises OSError where the disk refuses."""
+        if self._root is None:
+            self._root = Path(mkdtemp(prefix="vnet-disks-"))
+            weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
+        folder = self._root / node
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+LONGEST_NOTE = 4000
+"""Characters of a line that are told to the emulator."""
+MOST_LINES = 100_000
+"""Lines of a node's log that are written by one process, so that a flood fills no disk."""
+
+
+class NodeLogHandler(logging.Handler):
+    """Hands records to `write`, with the node on whose behalf they are made and their level.
+
+    Records on nobody's behalf, and asyncio's own, go the way of `logging.lastResort`, as without this handler.
+    """
+
+    def __init__(self, write: Callable[[Node, str, str], None]) -> None:
+        super().__init__()
+        self._write = write
+
+    def createLock(self) -> None:
+        """Make no lock: `write` needs none, and may wait for the emulator while others log."""
+        self.lock = None
+
+    def handle(self, record: logging.LogRecord) -> Any:
+        """Take a record unless a filter refuses it; from Python 3.13 on logging's own method needs a lock."""
+        kept = self.filter(record)
+        if kept:
+            self.emit(kept if isinstance(kept, logging.LogRecord) else record)
+        return kept
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Take a record."""
+        node = present_node()
+        if node is None or record.name == "asyncio":
+            last = logging.lastResort
+            alone = logging.getLogger().handlers == [self]
+            if alone and last is not None and record.levelno >= last.level:
+                last.handle(record)
+        else:
+            try:
+                self._write(node, level_name(record.levelno), f"{record.name}: {self.format(record)}")
+            except Exception:
+                self.handleError(record)
+
+
+class NodeLines:
+    """Lines of nodes' logs, with their emulated time, up to `MOST_LINES` of each node."""
+
+    def __init__(self, write: Callable[[str, str], None]) -> None:
+        self._write = write
+        self._count: Counter[str] = Counter()
+
+    def add(self, node: str, time_ns: int, kind: str, level: str, text: str, details: Mapping[str, object]) -> None:
+        """Write a line of a program, or an event with its details, to a node's log, unless there were too many."""
+        said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
+        line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip().replace("\n", "\n    ")
+        self._count[node] += 1
+        if self._count[node] <= MOST_LINES:
+            self._write(node, f"{time_ns / NS_PER_S:.6f} {node} {level}: {line}")
+        elif self._count[node] == MOST_LINES + 1:
+            self._write(node, f"(further lines of {node} are left out after {MOST_LINES:,})")
+
+
+_NAMES = (
+    (logging.CRITICAL, "critical"),
+    (logging.ERROR, "error"),
+    (logging.WARNING, "warning"),
+    (logging.INFO, "info"),
+)
+
+
+def level_name(number: int) -> str:
+    """Return the level that `Node.log` has for one of `logging`."""
+    return next((name for least, name in _NAMES if number >= least), "debug")

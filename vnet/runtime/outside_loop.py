@@ -20,7 +20,7 @@ from functools import partial, wraps
 from typing import Any
 
 from vnet.node import Node
-from vnet.runtime import current_node, own_asyncio
+from vnet.runtime import own_asyncio
 
 Taker = Callable[[Node, BaseException, str, "Job | None"], bool]
 """Takes an exception of a node, the place where it was raised, and the job that failed with it, if it was one.
@@ -202,7 +202,7 @@ def _job_done(owner: Node, job: Future[Any]) -> None:
 
 def present_node() -> Node | None:
     """Return the node on whose behalf the present code runs: that of its callback, its context, or its thread."""
-    return current_node.present_node() or _started_by.get(threading.current_thread())
+    return own_asyncio.present_node() or _started_by.get(threading.current_thread())
 
 
 def _unraisable(ignored: sys.UnraisableHookArgs) -> None:

@@ -6,12 +6,17 @@ the node did before, and on nothing else: not on which other nodes share its loo
 
 Programs also make tasks and futures past their loop, and ask for all tasks of it. So while programs run, some names
 of the package `asyncio` are others. On other loops of the same process all of them do what asyncio's own do.
+
+A node travels with asyncio's contexts into tasks, callbacks and jobs (`current_node`). A program may run code in a
+context of its own, which does not have the variable. So a loop in virtual time knows by itself to which node the
+callback belongs that runs.
 """
 
 from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextvars
 import inspect
 import threading
 from abc import ABCMeta
@@ -22,10 +27,23 @@ from types import FunctionType
 from typing import TYPE_CHECKING, Any, cast
 
 from vnet.runtime import asyncio_internals
-from vnet.runtime.current_node import current_node, present_node
 
 if TYPE_CHECKING:
     from vnet.node import Node
+
+
+current_node: contextvars.ContextVar[Node | None] = contextvars.ContextVar("vnet_node", default=None)
+"""A node, in one of its incarnations; None outside programs."""
+NOBODY = contextvars.Context()
+"""Context of callbacks that vnet itself sets while programs run."""
+NOBODY.run(current_node.set, None)
+
+
+def present_node() -> Node | None:
+    """Return the node on whose behalf the present code runs, whatever its context."""
+    node: Node | None = getattr(asyncio._get_running_loop(), "running_node", None)
+    return current_node.get() if node is None else node
+
 
 _STANDS_FOR: dict[type, type] = {}
 _numbers_of_nobody = count()

@@ -6,12 +6,14 @@ further. In a process of their own (`count_as_death`) it ends, with a status oth
 
 from __future__ import annotations
 
+import atexit
+import faulthandler
 import os
 import posix
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from functools import wraps
 from typing import Any, NoReturn
 
@@ -100,3 +102,37 @@ def _end_as_death(node: Node | None, call: str, status: int) -> NoReturn:
     sys.stderr.write(f"vnet-agent: the program of {'a vehicle' if node is None else node.id} called {call}\n")
     sys.stderr.flush()
     exit_now(status or DEATH_STATUS)
+
+
+ENDING_S = 60.0
+"""Seconds for an agent, or a separate router, to end: Zenoh gives a connection up after ten."""
+
+
+def end_within(seconds: float = ENDING_S) -> None:
+    """Have this process end after so many seconds at the latest, with status 1 and its stacks on standard error."""
+    if sys.__stderr__ is not None:
+        faulthandler.dump_traceback_later(seconds, exit=True, file=sys.__stderr__)
+
+
+# The end of a process that was forked from a zygote.
+#
+# An interpreter that ends takes all of its objects apart, and so writes to memory that it has shared with the
+# zygote so far: at the end of a run all agents at once would need several times the memory that they ran in.
+
+
+def end_forked(status: int, shared: Collection[str]) -> NoReturn:
+    """End this process with `status`, and leave the objects of the modules named in `shared` as they are.
+
+    As when an interpreter ends, threads are awaited and functions of `atexit` called, and what the other modules
+    hold is discarded, so that files which they have left open are written.
+    """
+    threading._shutdown()  # type: ignore[attr-defined]  # as multiprocessing does, and `_exit` below
+    atexit._run_exitfuncs()
+    for name in [name for name in reversed(sys.modules) if name not in shared]:
+        module = sys.modules.pop(name)
+        with suppress(AttributeError, TypeError):  # what a program has put in a module's place
+            vars(module).clear()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):  # closed, none, or without a reader
+            stream.flush()
+    exit_now(status)

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 from vnet.errors import ProgramError, did_you_mean
 from vnet.runtime.own_packages import name_clash
 
-if TYPE_CHECKING:  # the check of a program before a run loads no more than the program itself needs
+if TYPE_CHECKING:
     from types import ModuleType
 
     from vnet.node import Node
     from vnet.transport import wire
+
 
 Program = Callable[["Node"], Awaitable[None]]
 Programs = Mapping[str, Program]
@@ -112,3 +113,19 @@ def leaves(error: BaseException) -> list[BaseException]:
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
     """The program of each node that is welcome. Raises ProgramError."""
     return {welcome.node: load_program(welcome.entry) for welcome in welcomes}
+
+
+_added: list[str] = []
+"""The folders that were added last: those of another run give way."""
+
+
+def search_programs_in(folders: Iterable[Path]) -> None:
+    """Have modules looked for in `folders`, in this order, and then in the current one.
+
+    They come last on `sys.path`, so that they shadow nothing. Folders of an earlier call are looked in no more.
+    """
+    sys.path[:] = [path for path in sys.path if path not in _added]
+    wanted = dict.fromkeys(str(folder) for folder in [*folders, Path.cwd()])
+    _added[:] = [path for path in wanted if path not in sys.path]
+    sys.path.extend(_added)
+    importlib.invalidate_caches()

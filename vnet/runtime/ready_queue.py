@@ -1,7 +1,7 @@
 """The queues of callbacks that are ready to run, which take the place of the event loop's own.
 
 `ReadyQueue` puts aside what belongs to programs that are paused. `OrderedQueue` also puts the rounds of callbacks
-together: what happens at one instant comes in the order that a chooser decides (event_order.py).
+together: what happens at one instant comes in the order that a chooser decides (see below).
 
 How an event loop of asyncio works, as far as it matters here: a round begins with what callbacks of the last round
 have registered, in that order; behind it come the events that the selector has found and the timers that are due;
@@ -12,18 +12,20 @@ later, and an order of events is one that a machine can show. What one callback 
 from __future__ import annotations
 
 import asyncio
+import random
+import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 from weakref import WeakKeyDictionary
 
 from vnet.errors import printable
 from vnet.runtime.asyncio_internals import NumberedTimer
-from vnet.runtime.event_order import GO_ON, Chooser, Option
-from vnet.transport.orders import Deviation
+from vnet.runtime.running_node import RunningNode
+from vnet.transport.wire import Deviation, Order
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -312,3 +314,143 @@ def _distinct(options: list[Option]) -> list[Option]:
         seen[option.label] = number = seen.get(option.label, 0) + 1
         distinct.append(option if number == 1 else Option(f"{option.label} ({number})", option.source))
     return distinct
+
+
+# In which order a node is shown what happens to it at one instant: FIFO, or another that a machine can show.
+#
+# Packets, a fix, timers and results of executor jobs that come at the same instant come in a fixed order in virtual
+# time (FIFO). On a machine each may be a little earlier or later, and the event loop may have run callbacks in
+# between. At each *decision* one of these is next: one of the events that are due, or the round itself ("go on"). A
+# `Chooser` makes a node's decisions; it knows nothing of other nodes, so the division of nodes into processes does
+# not matter. What differs from FIFO is a *deviation*, and the deviations of a run are its *tape*.
+#
+# PCT: Burckhardt, Kothari, Musuvathi and Nagarakatte, "A randomized scheduler with probabilistic guarantees of
+# finding bugs", ASPLOS 2010.
+
+GO_ON = "go on"
+"""The choice to run what is ready before anything else happens."""
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """An option of a decision: `label` names it among the others, `source` is what it belongs to."""
+
+    label: str
+    source: str
+
+
+class Chooser(Protocol):
+    """Interface of what makes the decisions of one node."""
+
+    def choose(self, time_ns: int, decision: int, options: Sequence[Option]) -> int:
+        """Return the number of the option that comes next; 0 is FIFO's. `decision` counts from 0 each instant."""
+        ...
+
+
+class Shuffle:
+    """Any option, each as likely as the others."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+
+    def choose(self, time_ns: int, decision: int, options: Sequence[Option]) -> int:
+        """Draw an option."""
+        return int(self._random.random() * len(options))
+
+
+class Pct:
+    """The option whose source has the highest priority, where `depth` - 1 times the highest becomes the lowest.
+
+    A source is a task, the radio, the receiver or a job. Priorities are drawn when a source is first seen, and the
+    decisions at which one falls among the first `steps`. A bug that `depth` events in the right order show is found
+    with a probability of at least 1 / (sources · steps^(depth - 1)).
+    """
+
+    def __init__(self, seed: int, depth: int, steps: int) -> None:
+        self._random = random.Random(seed)
+        self._priority: dict[str, float] = {}
+        self._falls = {self._random.randrange(max(steps, 1)): number for number in range(1, depth)}
+        self._step = 0
+
+    def choose(self, time_ns: int, decision: int, options: Sequence[Option]) -> int:
+        """Take the highest priority, after it has fallen if this is the decision for it."""
+        for option in options:
+            if option.source not in self._priority:
+                self._priority[option.source] = self._random.random()
+        fall = self._falls.get(self._step)
+        self._step += 1
+        if fall is not None:
+            self._priority[options[self._highest(options)].source] = -float(fall)
+        return self._highest(options)
+
+    def _highest(self, options: Sequence[Option]) -> int:
+        return max(range(len(options)), key=lambda number: (self._priority[options[number].source], -number))
+
+
+class Taped:
+    """FIFO but for the deviations of a tape, as far as they fit: an option of that label at that decision."""
+
+    def __init__(self, tape: Sequence[Deviation]) -> None:
+        self._labels = {(each.time_ns, each.decision): each.label for each in tape}
+
+    def choose(self, time_ns: int, decision: int, options: Sequence[Option]) -> int:
+        """Return what the tape says for this decision, else FIFO's choice."""
+        label = self._labels.get((time_ns, decision))
+        return next((number for number, option in enumerate(options) if option.label == label), 0)
+
+
+def chooser_of(order: Order) -> Chooser:
+    """Return what makes the decisions of a node whose welcome has this order."""
+    if order.kind == "shuffle":
+        return Shuffle(order.seed)
+    if order.kind == "pct":
+        return Pct(order.seed, order.depth, order.steps)
+    return Taped(order.tape)
+
+
+class CpuMeter:
+    """CPU time that the callbacks of each node take, and the instants at which each is woken.
+
+    `clock` gives the CPU time of the loop's thread in ns; what programs compute on other threads, as in executors,
+    is not in it. A callback belongs to the node in whose context it runs; one of nobody's is not counted. The
+    node whose callback runs is written down in `shown`.
+    """
+
+    def __init__(self, clock: Callable[[], int] = time.thread_time_ns, shown: RunningNode | None = None) -> None:
+        self._clock = clock
+        self._running: str | None = None
+        self._since_ns = 0
+        self._awake: set[str] = set()
+        self._shown = shown or RunningNode()
+        self.cpu_ns: Counter[str] = Counter()
+        self.wake_ups: Counter[str] = Counter()
+
+    def begin(self, handle: asyncio.Handle) -> None:
+        """A callback begins, and the one before it is over."""
+        now_ns = self._clock()
+        self._charge(now_ns)
+        node = node_of(handle)
+        if node is not None:
+            self._running, self._since_ns = node.id, now_ns
+            self._awake.add(node.id)
+            self._shown.show(node.id)
+
+    def end(self) -> None:
+        """The loop looks for callbacks: none is running."""
+        if self._running is not None:
+            self._charge(self._clock())
+        self._shown.show("")
+
+    def wait_for(self, node: Node | None) -> None:
+        """The loop waits for a job of this node, on another thread."""
+        self._shown.show("" if node is None else node.id)
+
+    def end_instant(self) -> None:
+        """Nothing is left to do at this instant: count a wake-up of each node that has run."""
+        self.wake_ups.update(self._awake)
+        self._awake.clear()
+
+    def _charge(self, now_ns: int) -> None:
+        if self._running is not None:
+            self.cpu_ns[self._running] += now_ns - self._since_ns
+            self._running = None

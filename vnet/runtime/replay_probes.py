@@ -16,7 +16,7 @@ from vnet.driving import Action
 from vnet.reports import Report
 from vnet.runtime.unhandled import NOT_THE_PROGRAM
 from vnet.transport import wire
-from vnet.transport.backbone import SentMessage
+from vnet.transport.wire import SentMessage
 
 CALLS_VARIABLE = "VNET_CALLS"
 """Folder to which each node writes its calls, a file a node."""

@@ -30,14 +30,10 @@ from weakref import WeakKeyDictionary
 from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NodeHandle, NumberedTimer
-from vnet.runtime.cpu_meter import CpuMeter
-from vnet.runtime.current_node import current_node, present_node
-from vnet.runtime.event_order import Chooser
 from vnet.runtime.outside_loop import collected_by_schedule, collector
-from vnet.runtime.own_asyncio import Future, Task
-from vnet.runtime.ready_queue import OrderedQueue, ReadyQueue
-from vnet.transport.orders import Deviation
-from vnet.transport.wire import ClockError
+from vnet.runtime.own_asyncio import Future, Task, current_node, present_node
+from vnet.runtime.ready_queue import Chooser, CpuMeter, OrderedQueue, ReadyQueue
+from vnet.transport.wire import ClockError, Deviation
 from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:

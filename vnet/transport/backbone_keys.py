@@ -13,8 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from vnet.transport import wire
-from vnet.transport.backbone import MessageRef, SentMessage, WireMessage, arrived_in_full, sent_in_full
-from vnet.transport.orders import Count, TimeNs
+from vnet.transport.wire import Count, MessageRef, SentMessage, TimeNs, WireMessage, arrived_in_full, sent_in_full
 
 
 class Sent(wire.Message, frozen=True):

@@ -79,10 +79,5 @@ def verb_of(key: str) -> str:
 
 
 def node_of(key: str) -> str:
-    """Return the node id in one of the `node/` or `backbone/` keys above."""
-    return key.split("/")[3]
-
-
-def host_of(key: str) -> str:
-    """Return the host's name in one of the `host/` keys above."""
+    """Return the id in one of the `node/`, `backbone/` or `host/` keys above."""
     return key.split("/")[3]

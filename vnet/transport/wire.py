@@ -3,27 +3,130 @@
 `tx` carries an agent's messages (`Hello`, `Yield`, `Frames`, `Final`, `StackDump`), `rx` the emulator's (`Welcome`,
 `Grant`, `Batch`, `StackRequest`, `Await`, `End`). Decoding checks every type and bound; a violation is a
 `WireError`. All times are integer nanoseconds from the start of the run.
+
+Within a process a yield or a grant holds the messages of the backbone themselves. On Zenoh it holds references, and
+the messages are on keys of the units' own (`vnet/transport/backbone_keys.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
-from vnet.backbone import UnitAbilities
+from vnet.backbone import BackboneMessage, UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError, printable
 from vnet.node import NOTHING_SENSED, Fix, Reading
-from vnet.radio import Packet
+from vnet.radio import Packet, SendResult
 from vnet.reports import Report
-from vnet.transport.backbone import MessageRef
-from vnet.transport.lateness import LATENESS_BINS
-from vnet.transport.orders import Count, Deviation, Order, TimeNs
-from vnet.transport.send_results import WireSendResult
+
+TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+
+class Deviation(msgspec.Struct, frozen=True, array_like=True):
+    """A decision of `node` that is not FIFO's: at `time_ns`, of what happened, `label` came before `first`.
+
+    `decision` counts the decisions of the instant from 0.
+    """
+
+    node: str
+    incarnation: Count
+    time_ns: TimeNs
+    decision: Count
+    label: Annotated[str, msgspec.Meta(max_length=256)]
+    first: Annotated[str, msgspec.Meta(max_length=256)]
+
+
+class Order(msgspec.Struct, frozen=True, array_like=True):
+    """In which order a node is shown what happens at one instant (lockstep), if not FIFO.
+
+    `depth` and `steps` are those of `pct`; `tape` has the deviations from FIFO of a `tape`.
+    """
+
+    kind: Literal["shuffle", "pct", "tape"]
+    seed: int = 0
+    depth: Count = 1
+    steps: Count = 0
+    tape: Sequence[Deviation] = ()
+
+
+class WireSendResult(msgspec.Struct, frozen=True, array_like=True):
+    """The result of frame `number` that `node` has sent to another one, which it learns at `time_ns`."""
+
+    node: str
+    number: Count
+    time_ns: TimeNs
+    delivered: bool
+    attempts: Count
+
+    def result(self) -> SendResult:
+        """Return the result as the program sees it."""
+        return SendResult(self.delivered, self.attempts)
+
+
+LATENESS_LIMIT_NS = 20_000_000
+"""Deliveries later than this count against a real-time run."""
+LATENESS_BINS = 80
+"""Number of bins."""
+_LATENESS_LIMIT_BIN = 44
+"""Bin whose lower edge is `LATENESS_LIMIT_NS`."""
+
+
+def lateness_bin(late_ns: int) -> int:
+    """Return the bin of a delay: four bins for each factor of two; bin 44 begins at the bound of 20 ms."""
+    if late_ns <= 0:
+        return 0
+    position = _LATENESS_LIMIT_BIN + math.floor(4 * math.log2(late_ns / LATENESS_LIMIT_NS))
+    return min(max(position, 0), LATENESS_BINS - 1)
+
+
+def lateness_edge_ms(index: int) -> float:
+    """Return the upper edge of a lateness bin in milliseconds."""
+    return LATENESS_LIMIT_NS / 1e6 * float(2 ** ((index + 1 - _LATENESS_LIMIT_BIN) / 4))
+
+
+class MessageRef(msgspec.Struct, frozen=True, array_like=True):
+    """Reference to a message on one of the keys of the unit `node`: no two there have the same `number`."""
+
+    node: str
+    number: Count
+
+
+class SentMessage(MessageRef, frozen=True, array_like=True):
+    """A message that `node` sends `to` one unit, or to all others."""
+
+    to: str | None
+    payload: bytes
+
+
+class WireMessage(MessageRef, frozen=True, array_like=True):
+    """A message of `sender` that reaches `node` at `time_ns`."""
+
+    sender: str
+    sent_ns: TimeNs
+    time_ns: TimeNs
+    payload: bytes
+
+    def message(self) -> BackboneMessage:
+        """Return the message as the program sees it."""
+        return BackboneMessage(self.sender, self.sent_ns, self.time_ns, self.payload)
+
+
+def sent_in_full(messages: Iterable[MessageRef]) -> list[SentMessage]:
+    """Return the messages of a yield whose references have been resolved."""
+    return [message for message in messages if isinstance(message, SentMessage)]
+
+
+def arrived_in_full(messages: Iterable[MessageRef]) -> list[WireMessage]:
+    """Return the messages of a grant whose references have been resolved."""
+    return [message for message in messages if isinstance(message, WireMessage)]
+
 
 VERSION = 2
 """Version of the messages. 2: a grant is for a window, and a yield has steps."""
@@ -50,6 +153,12 @@ class WirePacket(msgspec.Struct, frozen=True, array_like=True):
     payload: bytes
     rssi_dbm: float | None = None
     snr_db: float | None = None
+
+    @classmethod
+    def of(cls, node: str, packet: Packet) -> WirePacket:
+        """Return the packet in its form on the wire, for its receiver `node`."""
+        sender, sent_ns, received_ns, payload = packet.sender, packet.sent_ns, packet.received_ns, packet.payload
+        return cls(node, sender, sent_ns, received_ns, payload, packet.rssi_dbm, packet.snr_db)
 
     def packet(self) -> Packet:
         """Return the packet as the program sees it."""

@@ -8,32 +8,214 @@ from __future__ import annotations
 
 import os
 import queue
+import secrets
 import signal
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from emulator.drivers.cpu_watch import CpuWatch
+import zenoh
+
 from emulator.drivers.hosts import messages
-from emulator.drivers.hosts.down import Down
-from emulator.drivers.hosts.messages import HostHello, HostWelcome, Item, Order
-from emulator.drivers.hosts.relay import Relay
-from emulator.drivers.hosts.up import Up
+from emulator.drivers.hosts.messages import FromNode, FromUnit, HostHello, HostWelcome, Item, News, Order, encode
 from emulator.drivers.launch import Launcher
-from emulator.drivers.memory import MemoryWatch, first_over
 from emulator.drivers.signals import signals_handled
+from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
 from emulator.drivers.zygote import Zygote
 from emulator.records.code_digest import vnet_digest
 from vnet.errors import TransportError, VnetError, WireError
+from vnet.transport import keys, wire
 from vnet.transport.access import Access
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import PROMPT_SLICE_NS, set_time_slice
+from vnet.transport.session import open_client, open_router, router_endpoint
+
+# What a host's agents say is bundled, and put on the way to the emulator. In lockstep the emulator waits for all
+# that it has granted, so the yields of a host can wait for each other; everything else must not wait.
+
+FULL_BYTES = 8 * 2**20
+"""Bytes of agents' messages after which a bundle goes at once, so that none comes near the largest message."""
+
+
+class Relay:
+    """Items for the emulator in the order in which they came, and the processes that owe a yield."""
+
+    def __init__(self) -> None:
+        self._items: list[Item] = []
+        self._size_bytes = 0
+        self._is_urgent = False
+        self._awaited: set[str] = set()
+
+    def granted(self, process_id: str) -> None:
+        """Note that a process owes a yield."""
+        self._awaited.add(process_id)
+
+    def ended(self, process_id: str) -> None:
+        """Note that a process owes nothing any more."""
+        self._awaited.discard(process_id)
+
+    def hurry(self) -> None:
+        """Let what there is go at once: the emulator waits for more than yields."""
+        self._is_urgent = True
+
+    def take(self, node: str, payload: bytes) -> None:
+        """Take a message of an agent, which is on the `tx` of `node`; yields are on that of their process."""
+        self._items.append(FromNode(node, payload))
+        self._size_bytes += len(payload)
+        if wire.is_yield(payload):
+            self._awaited.discard(node)
+        else:
+            self._is_urgent = True
+
+    def take_unit(self, unit: str, payload: bytes) -> None:
+        """Take a message of a unit on its key of the backbone: it waits for the yield that refers to it."""
+        self._items.append(FromUnit(unit, payload))
+        self._size_bytes += len(payload)
+
+    def add(self, item: Item) -> None:
+        """Take news of the host itself, which goes at once."""
+        self._items.append(item)
+        self._is_urgent = True
+
+    @property
+    def awaited(self) -> Collection[str]:
+        """The processes that owe a yield."""
+        return self._awaited
+
+    def take_bundle(self) -> list[Item]:
+        """Return what is to go now: nothing while all that there is are yields, and one is owed."""
+        is_due = self._is_urgent or not self._awaited or self._size_bytes >= FULL_BYTES
+        if not is_due:
+            return []
+        bundle, self._items, self._size_bytes, self._is_urgent = self._items, [], 0, False
+        return bundle
+
+
+LISTEN = "tcp/127.0.0.1:0"
+"""Agents are on the same host."""
+LEASE_MS = 3_600_000
+"""Milliseconds. A paused or starved agent must not look like a dead one: a closed connection is seen at once, and
+silence of a host is judged by the emulator, which knows what it waits for."""
+
+
+class Down:
+    """The connection of a host to its agents. The callbacks run on Zenoh's threads, with a node's id."""
+
+    def __init__(
+        self,
+        access: Access,
+        realtime: bool,
+        on_tx: Callable[[str, bytes], None],
+        on_alive: Callable[[str, bool], None],
+        on_backbone: Callable[[str, bytes], None],
+    ) -> None:
+        self.access = access
+        self._on_tx = on_tx
+        self._on_alive = on_alive
+        self._on_backbone = on_backbone
+        # As at the emulator's router: in real time one frozen agent must not stall all others.
+        self._control = zenoh.CongestionControl.DROP if realtime else zenoh.CongestionControl.BLOCK
+        self._rx: dict[str, zenoh.Publisher] = {}
+        self._unit_rx: dict[str, zenoh.Publisher] = {}
+        self._emulator_token: zenoh.LivelinessToken | None = None
+
+    def open(self, stack: ExitStack) -> None:
+        """Listen until `stack` is closed. Raises TransportError."""
+        session = self._session = stack.enter_context(open_router(LISTEN, self.access, LEASE_MS))
+        self.endpoint = router_endpoint(session)
+        run = self.access.run
+        for node in (node for nodes in self.access.processes for node in nodes):
+            self._rx[node] = stack.enter_context(
+                session.declare_publisher(keys.node_rx(run, node), congestion_control=self._control, express=True)
+            )
+        for unit in self.access.units:
+            rx = keys.backbone_rx(run, unit)
+            self._unit_rx[unit] = stack.enter_context(
+                session.declare_publisher(rx, congestion_control=self._control, express=True)
+            )
+        if self.access.units:  # before `tx` of nodes, as at the emulator's router
+            stack.enter_context(session.declare_subscriber(keys.backbone_tx(run, "*"), self._take_backbone))
+        stack.enter_context(session.declare_subscriber(keys.node_tx(run, "*"), self._take_tx))
+        alive = keys.node_alive(run, "*")
+        stack.enter_context(session.liveliness().declare_subscriber(alive, self._take_alive, history=True))
+        self.show_emulator(True)
+        stack.callback(self.show_emulator, False)
+
+    def show_emulator(self, there: bool) -> None:
+        """Let agents see that the emulator is there, or that it is gone."""
+        if there and self._emulator_token is None:
+            token_key = keys.emulator_alive(self.access.run)
+            self._emulator_token = self._session.liveliness().declare_token(token_key)
+        elif not there and self._emulator_token is not None:
+            self._emulator_token.undeclare()  # type: ignore[no-untyped-call]
+            self._emulator_token = None
+
+    def put(self, node: str, payload: bytes) -> None:
+        """Pass a message on to a node; one for a node that is not on this host is dropped."""
+        if node in self._rx:
+            self._rx[node].put(payload)
+
+    def put_unit(self, unit: str, payload: bytes) -> None:
+        """Pass a message of the backbone on to a unit; one for a unit that is not on this host is dropped."""
+        if unit in self._unit_rx:
+            self._unit_rx[unit].put(payload)
+
+    def _take_backbone(self, sample: zenoh.Sample) -> None:
+        self._on_backbone(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
+
+    def _take_tx(self, sample: zenoh.Sample) -> None:
+        self._on_tx(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
+
+    def _take_alive(self, sample: zenoh.Sample) -> None:
+        self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+
+
+class Up:
+    """The keys of a host. The callbacks run on Zenoh's threads."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        run: str,
+        host: str,
+        credentials: Credentials | None,
+        on_rx: Callable[[bytes], None],
+        on_emulator: Callable[[bool], None],
+        stack: ExitStack,
+    ) -> None:
+        """Connect until `stack` is closed. Raises TransportError."""
+        self.nonce = secrets.token_bytes(16)
+        session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS))
+        self._tx = stack.enter_context(
+            session.declare_publisher(
+                keys.host_tx(run, host), congestion_control=zenoh.CongestionControl.BLOCK, express=True
+            )
+        )
+        rx = keys.host_rx(run, host)
+        stack.enter_context(session.declare_subscriber(rx, lambda sample: on_rx(sample.payload.to_bytes())))
+        stack.enter_context(session.liveliness().declare_token(keys.host_alive(run, host)))
+        stack.enter_context(
+            session.liveliness().declare_subscriber(
+                keys.emulator_alive(run),
+                lambda sample: on_emulator(sample.kind == zenoh.SampleKind.PUT),
+                history=True,
+            )
+        )
+
+    def say_hello(self, hello: HostHello) -> None:
+        """Put a hello."""
+        self._tx.put(encode(hello))
+
+    def put(self, items: Sequence[Item]) -> None:
+        """Put a bundle."""
+        self._tx.put(encode(News(self.nonce, items)))
+
 
 HELLO_PERIOD_S = 0.5
 READY_POLL_S = 0.005

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from emulator.drivers.hosts.messages import PART_BYTES, Item, LeftOut, Part
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.processes import ProtocolError
 from emulator.records.events import EventKind
 from emulator.records.node_files import DEEPEST, MOST_FILES, collect
 from emulator.records.run_folder import FILES, RunFolder

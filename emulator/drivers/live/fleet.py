@@ -15,17 +15,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from emulator.drivers.emulation import Emulation
 from emulator.drivers.hosts import messages
 from emulator.drivers.hosts.messages import HostHello, HostWelcome, Order
 from emulator.drivers.hosts.retrieval import Retrieval
 from emulator.drivers.launch import Exit
-from emulator.drivers.live.supervisor import DEATH_GRACE_S
-from emulator.drivers.live.waiting import ChangeSignal
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.live.supervisor import DEATH_GRACE_S, ChangeSignal
+from emulator.drivers.processes import ProtocolError
 from emulator.records.code_digest import entries_of, vnet_digest
 from emulator.records.events import EventKind
-from emulator.records.run_folder import RunFolder
-from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, WireError, printable
 from vnet.transport import keys, wire
 from vnet.transport.access import Access
@@ -57,7 +55,7 @@ class _Host:
 
 
 class Fleet:
-    """See the module's text. What comes of agents is passed to the callables `on_…`, which the session sets.
+    """See the module's text. What comes of agents is told: what it is, a name, and the item.
 
     `is_reconnecting` is true while the emulator itself is disconnected, and lost connections mean nothing.
     """
@@ -65,20 +63,20 @@ class Fleet:
     def __init__(
         self,
         access: Access,
-        folder: RunFolder,
-        scenario: Scenario,
-        duration_ns: int,
+        emulation: Emulation,
         send: Callable[[str, bytes], None],
+        tell: Callable[[str, str, Any], None],
         time_ns: Callable[[], int],
         is_reconnecting: Callable[[], bool],
         changes: ChangeSignal,
     ) -> None:
         self._access = access
-        self._folder = folder
-        self._scenario = scenario
+        self._folder = emulation.folder
+        self._scenario = scenario = emulation.scenario
         self._digest = vnet_digest()
-        self._duration_ns = duration_ns
+        self._duration_ns = emulation.duration_ns
         self._send = send
+        self._tell = tell
         self._time_ns = time_ns
         self._is_reconnecting = is_reconnecting
         self._changes = changes
@@ -86,7 +84,9 @@ class Fleet:
         self._hosts = {}
         for name in access.hosts:
             processes = access.processes_on(name)
-            self._hosts[name] = _Host(name, processes, Retrieval(folder, processes, scenario.run.files_max_mb))
+            self._hosts[name] = _Host(
+                name, processes, Retrieval(self._folder, processes, scenario.run.files_max_mb)
+            )
         self._host_of = {node: host for host in self._hosts.values() for node in host.nodes}
         self._serials: dict[str, int] = {}
         self._last_serial = 0
@@ -96,12 +96,6 @@ class Fleet:
         self._refused: Counter[str] = Counter()
         self.cpu_ns: Counter[str] = Counter()
         """CPU time of the agents' processes in ns, once it has been handed in."""
-        self.on_message: Callable[[str, bytes], None] = lambda node, payload: None
-        self.on_backbone: Callable[[str, bytes], None] = lambda unit, payload: None
-        self.on_token: Callable[[str, bool], None] = lambda node, alive: None
-        self.on_ended: Callable[[str, Exit], None] = lambda process_id, how: None
-        self.on_memory: Callable[[str, float], None] = lambda process_id, memory_mb: None
-        self.on_lost: Callable[[Sequence[str], str], None] = lambda process_ids, how: None
 
     # In the place of a launcher.
 
@@ -269,18 +263,18 @@ class Fleet:
         match item:
             case messages.FromNode(node, payload):
                 self._check_node(host, node)
-                self.on_message(node, payload)
+                self._tell("message", node, payload)
             case messages.FromUnit(node, payload):
                 self._check_node(host, node)
-                self.on_backbone(node, payload)
+                self._tell("backbone", node, payload)
             case messages.Token(node, alive):
                 self._check_node(host, node)
-                self.on_token(node, alive)
+                self._tell("token", node, alive)
             case messages.Ended(process_id, serial, status, log_tail, overdue_s):
                 self._check_node(host, process_id)
                 if self._serials.get(process_id) == serial:
                     del self._serials[process_id]
-                    self.on_ended(process_id, Exit(status, log_tail, overdue_s))
+                    self._tell("ended", process_id, Exit(status, log_tail, overdue_s))
             case messages.LogTail(process_id, text):
                 self._check_node(host, process_id)
                 self._log_tails[process_id] = text
@@ -293,7 +287,7 @@ class Fleet:
                 self._take_figures(host, cpu_ns, memory)
             case messages.MemoryExceeded(process_id, memory_mb):
                 self._check_node(host, process_id)
-                self.on_memory(process_id, memory_mb)
+                self._tell("memory", process_id, memory_mb)
             case messages.HandingIn():
                 host.is_handing_in = True
                 self._changes.set()
@@ -335,8 +329,8 @@ class Fleet:
         for process_id in process_ids:
             self._serials.pop(process_id, None)
         for node in host.nodes:
-            self.on_token(node, False)
-        self.on_lost(process_ids, f"the connection of host {host.name} closed")
+            self._tell("token", node, False)
+        self._tell("lost", f"the connection of host {host.name} closed", process_ids)
         self._changes.set()
 
     # The end.

@@ -1,4 +1,4 @@
-"""One live run: `run_live` joins its parts and drives it to the end.
+"""One live run: `run_live` opens it to the world and drives it to the end.
 
 It opens the emulator's session (an embedded router, or a client of a separate one), starts the agents or waits for
 those started by hand, runs the pacing to the end, and leaves no process and no signal handler behind.
@@ -12,41 +12,32 @@ import json
 import sys
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from typing import Any
 
 import zenoh
 
-from emulator.drivers.attachment import Attachment, LiveOptions
+from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.control import answer, control_endpoint
-from emulator.drivers.cpu_watch import CpuWatch
 from emulator.drivers.debugging import debug_point
 from emulator.drivers.emulation import Emulation, PeriodView
-from emulator.drivers.join import Membership
 from emulator.drivers.launch import Launcher
-from emulator.drivers.live.driver import Driver, Parts
-from emulator.drivers.live.fleet import Fleet
-from emulator.drivers.live.inbox import Inbox, Refusals
-from emulator.drivers.live.joining import RECORDER, Joining
-from emulator.drivers.live.lockstep_driver import HorizonCallback, LockstepDriver, no_horizon
-from emulator.drivers.live.observer_feed import ObserverFeed
-from emulator.drivers.live.realtime_driver import RealTimeDriver
-from emulator.drivers.live.reconnection import Reconnection
-from emulator.drivers.live.supervisor import SHUT_DOWN_S, Supervisor
-from emulator.drivers.live.waiting import ChangeSignal, Stalled
-from emulator.drivers.memory import MemoryWatch, first_over
+from emulator.drivers.live.processes import RECORDER, LiveProcesses
+from emulator.drivers.live.supervisor import SHUT_DOWN_S
+from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
+from emulator.drivers.observers import Messages
+from emulator.drivers.processes import Stalled
+from emulator.drivers.realtime import RealTime, run_in_real_time
 from emulator.drivers.signals import cancelled_by_signals
 from emulator.drivers.status import Course
+from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Zygote
 from emulator.records.code_digest import entries_of
 from emulator.records.events import EventKind
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
-from vnet.transport import wire
 from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, preempting_nobody, set_time_slice
 
-LEASE_MS = 60_000
-"""Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
 PATIENCE_S = 0.5
 """Seconds for which a run that did not come to its end waits for its processes to end by themselves."""
 FULL_PATIENCE_S = 5.0
@@ -55,6 +46,8 @@ END_LIMIT_S = 30.0
 """Seconds for which it waits for those that it has started. Long: one that has not ended by then never does."""
 RECORDER_WAIT_S = 20.0
 """Seconds for which a run that came to its end waits for its recorder to write all down."""
+SCENE_EVERY_PERIODS = 50
+"""Periods between two messages with the scene, for observers that come late."""
 MEMORY_LOOK_S = 0.2
 """Seconds of wall clock after which processes are compared with `run.memory_limit_mb` again."""
 
@@ -109,119 +102,43 @@ def _agent_environment(scenario: Scenario) -> Mapping[str, str]:
     return LOCKSTEP_ENVIRONMENT if scenario.run.pacing == "lockstep" else AGENT_ENVIRONMENT
 
 
-def _lease_ms(scenario: Scenario) -> int:
-    """Milliseconds without a message after which a connection ends; a planned pause must not end it."""
-    pauses_s = [fault.duration_s for fault in scenario.fault if fault.kind == "pause"]
-    return LEASE_MS + round(1000 * max(pauses_s, default=0.0))
-
-
 class LiveSession:
-    """The parts of one live run, and its course: join, drive, shut down."""
+    """One live run's course: join, drive, shut down."""
 
     def __init__(
-        self,
-        emulation: Emulation,
-        options: LiveOptions,
-        launcher: Launcher,
-        before_horizon: HorizonCallback,
+        self, emulation: Emulation, options: LiveOptions, launcher: Launcher, before_horizon: HorizonCallback
     ) -> None:
-        node_ids = emulation.world.node_ids
-        realtime = emulation.scenario.run.pacing == "realtime"
-        later = [node for node, up in emulation.up.items() if not up]
         self._emulation = emulation
-        self._in_lockstep = not realtime
         self._options = options
         self._launcher = launcher
         self._before_horizon = before_horizon
-        self._driver: Driver | None = None
+        self._pacing: Lockstep | RealTime | None = None
         self._status = Course(emulation)
         self._memory = MemoryWatch(emulation.duration_ns)
         self._cpu = CpuWatch()
-        self._changes = ChangeSignal()
-        self._members = Membership(node_ids, later, emulation.world.has_traffic)
-        self._refusals = Refusals(options.access.run, emulation.folder, self._time_ns)
-        self._inbox = Inbox(
-            self._members, self._refusals, self._changes, on_disconnected=self._disconnected, on_query=self._answer
-        )
-        self._attachment = Attachment(
-            options,
-            node_ids,
-            _lease_ms(emulation.scenario),
-            realtime,
-            self._inbox.put_message,
-            self._inbox.put_token,
-            self._inbox.put_query,
-            self._inbox.put_host_message,
-            self._inbox.put_host_token,
-            self._inbox.put_backbone,
-        )
-        self._fleet = self._make_fleet() if options.access.hosts else None
-        agents = self._fleet or launcher
-        self._feed = ObserverFeed(emulation, self._attachment)
-        self._supervisor = Supervisor(
-            launcher=launcher,
-            agents=agents,
-            members=self._members,
-            attachment=self._attachment,
-            options=options,
-            folder=emulation.folder,
-            time_ns=self._time_ns,
-            changes=self._changes,
-            realtime=realtime,
-        )
-        self._joining = Joining(
-            emulation=emulation,
-            members=self._members,
-            supervisor=self._supervisor,
-            launcher=launcher,
-            agents=agents,
-            attachment=self._attachment,
-            options=options,
-            refusals=self._refusals,
-            changes=self._changes,
-        )
-        self._inbox.handlers[wire.Hello] = self._joining.take_hello
-        if self._fleet is not None:
-            self._fleet.on_ended, self._fleet.on_lost = self._supervisor.child_ends, self._supervisor.host_lost
-        self._attachment.open()
-
-    def _make_fleet(self) -> Fleet:
-        """The hosts, between the attachment and the inbox."""
-        scenario, attachment, inbox = self._emulation.scenario, self._attachment, self._inbox
-        fleet = Fleet(
-            self._options.access,
-            self._emulation.folder,
-            scenario,
-            self._emulation.duration_ns,
-            attachment.send_host,
-            self._time_ns,
-            lambda: self._supervisor.reconnecting,
-            self._changes,
-        )
-        attachment.to_hosted, attachment.to_hosted_unit = fleet.send, fleet.send_content
-        inbox.on_host_message, inbox.on_host_token = fleet.take, fleet.take_token
-        fleet.on_message, fleet.on_token = inbox.take_message, inbox.take_token
-        fleet.on_backbone = inbox.take_backbone
-        return fleet
+        self._messages = Messages(emulation)
+        self._watched = True  # the run's own recorder watches from the first period on
+        self._processes = LiveProcesses(emulation, options, launcher, self._answer)
+        self._fleet = self._processes.fleet
 
     @property
     def endpoint(self) -> str:
         """Endpoint to which agents and operators connect."""
-        return self._attachment.endpoint
+        return self._processes.attachment.endpoint
 
     def close(self) -> None:
         """Close what is open to the world."""
-        self._attachment.close()
+        self._processes.attachment.close()
 
     async def run(
         self, on_state: Callable[[str], None], on_missing: Callable[[Sequence[str]], None]
     ) -> tuple[float, bool]:
         """Join, run, end. Returns the wall-clock seconds between time 0 and the end, and whether interrupted."""
-        with self._supervisor.watching_children():
+        with self._processes.supervisor.watching_children():
             try:
                 return await self._run(on_state, on_missing)
             finally:
-                self._inbox.close()
+                self._processes.close()
 
     async def _run(
         self, on_state: Callable[[str], None], on_missing: Callable[[Sequence[str]], None]
@@ -235,17 +152,15 @@ class LiveSession:
             on_missing(nodes)
 
         try:
-            processes = await self._joining.join(on_state, tell_missing)
+            groups = await self._processes.join(on_state, tell_missing)
             folder.event(0, EventKind.started, start_up_s=round(time.monotonic() - started_s, 3))
-            self._emulation.watch(self._feed.period)
+            self._emulation.watch(self._publish_period)
             self._emulation.watch(self._look_at_processes)
             self._measure_cpu()
             gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
             started_s = time.monotonic()
-            self._feed.begin()
-            self._driver = self._make_driver(processes)
-            with preempting_nobody() if self._in_lockstep else nullcontext():
-                await self._within_memory(self._driver.run())
+            self._processes.attachment.publish("scene", self._messages.scene())
+            await self._within_memory(self._drive(groups))
             completed = True
         except Stalled:
             self._emulation.finish(self._time_ns())
@@ -260,8 +175,23 @@ class LiveSession:
             in_all_ns = self._cpu.cpu_ns if self._fleet is None else self._cpu.cpu_ns + self._fleet.cpu_ns
             self._emulation.costs.take_processes(in_all_ns)
             self._memory.write(folder, self._time_ns())
-            self._refusals.write_totals()
+            self._processes.write_refused()
         return wall_s, interrupted
+
+    async def _drive(self, groups: Sequence[Sequence[str]]) -> None:
+        """Run the loop of the pacing."""
+        processes = self._processes
+        if self._emulation.scenario.run.pacing == "realtime":
+            self._pacing = realtime = RealTime(self._emulation, groups)
+            processes.begin(groups, self._time_ns)
+            await run_in_real_time(realtime, processes)
+            return
+        self._pacing = lockstep = Lockstep(self._emulation, groups)
+        if not self._emulation.orders.explores:  # where an order is tried, no instant is quiet
+            lockstep.ahead = processes.members.ahead
+        processes.begin(groups, self._time_ns)
+        with preempting_nobody():
+            await run_in_lockstep(lockstep, processes, self._before_horizon)
 
     async def _within_memory(self, running: Coroutine[Any, Any, None]) -> None:
         """Await the run; raise Stalled, with an event, as soon as a process exceeds `run.memory_limit_mb`."""
@@ -269,86 +199,55 @@ class LiveSession:
         if limit_mb is None:
             return await running
         run, nodes = asyncio.ensure_future(running), frozenset(self._emulation.world.node_ids)
-        exceeded: list[tuple[str, float]] = []
-        if self._fleet is not None:
-            self._fleet.on_memory = lambda *over: exceeded.append(over)
+        exceeded = self._processes.over_memory
         try:
             while not (await asyncio.wait([run], timeout=MEMORY_LOOK_S))[0]:
                 if self._fleet is not None:
                     self._fleet.look(self._time_ns())
                 pids = {name: pid for name, pid in self._launcher.pids.items() if name in nodes}
                 if over := exceeded[0] if exceeded else first_over(limit_mb, pids):
-                    self._emulation.memory_exceeded(self._time_ns(), *over, self._members.nodes_with(over[0]))
+                    over_nodes = self._processes.members.nodes_with(over[0])
+                    self._emulation.memory_exceeded(self._time_ns(), *over, over_nodes)
                     raise Stalled
         finally:
             run.cancel()
             await asyncio.wait([run])
         return run.result()
 
-    def _make_driver(self, processes: Sequence[Sequence[str]]) -> Driver:
-        reconnection = Reconnection(
-            emulation=self._emulation,
-            members=self._members,
-            supervisor=self._supervisor,
-            launcher=self._launcher,
-            attachment=self._attachment,
-            options=self._options,
-            inbox=self._inbox,
-            time_ns=self._time_ns,
-        )
-        parts = Parts(
-            emulation=self._emulation,
-            members=self._members,
-            supervisor=self._supervisor,
-            agents=self._fleet or self._launcher,
-            attachment=self._attachment,
-            inbox=self._inbox,
-            reconnection=reconnection,
-            changes=self._changes,
-            debugged=None if self._options.debug is None else self._options.debug.node,
-        )
-        if self._in_lockstep:
-            return LockstepDriver(parts, processes, self._before_horizon)
-        return RealTimeDriver(parts, processes)
-
     async def _shut_down(self, completed: bool) -> None:
         """Tell all that the run is over, take their last messages, and wait until every process has ended."""
-        self._supervisor.pause(())
-        for node in self._members.joined:
-            self._attachment.send(node, wire.End(None, "the run is over"))
-        self._supervisor.all_told_to_end()
+        processes = self._processes
+        processes.tell_to_end()
         patience_s = (END_LIMIT_S if self._options.launch else FULL_PATIENCE_S) if completed else PATIENCE_S
         deadline_s = time.monotonic() + (patience_s if completed else SHUT_DOWN_S)
-        if self._driver is not None:
-            await self._driver.finish(deadline_s)
-        if not self._options.launch:  # whoever closes at once may take the last messages along
-            while self._inbox.connected and await self._changes.wait(deadline_s - time.monotonic()):
-                pass
+        if isinstance(self._pacing, RealTime):
+            await processes.finish_real_time(self._pacing, deadline_s)
+        elif self._pacing is not None:
+            time_ns = self._emulation.duration_ns if completed else self._time_ns()
+            self._emulation.take_final(time_ns, await processes.last_traffic(deadline_s))
+        if not self._options.launch:
+            await processes.all_disconnected(deadline_s)
         if self._fleet is not None:
             await self._fleet.hand_in(patience_s)
-        self._feed.end()
+        processes.attachment.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if completed else PATIENCE_S)
         ends = self._launcher.stop(patience_s)
-        for process_id, details in self._supervisor.take_last_deaths(ends).items() if completed else ():
-            for node in self._members.nodes_with(process_id):
-                self._emulation.folder.event(self._emulation.duration_ns, EventKind.died, node, **details)
+        for node, details in processes.last_deaths(ends).items() if completed else ():
+            self._emulation.folder.event(self._emulation.duration_ns, EventKind.died, node, **details)
 
     def _time_ns(self) -> int:
         """Emulated time for events; 0 before the start."""
-        return 0 if self._driver is None else self._driver.time_ns
-
-    def _disconnected(self, node: str) -> None:
-        self._supervisor.disconnected(node)
+        return 0 if self._pacing is None else max(self._pacing.now_ns, 0)
 
     def _answer(self, verb: str, query: zenoh.Query) -> None:
         """Answer an operator, with an error in one line if need be."""
         payload = b"" if query.payload is None else query.payload.to_bytes()
         own_router = self._options.router is not None
+        decided_ns = self._pacing.decided_ns if isinstance(self._pacing, Lockstep) else self._time_ns()
         with query:
             try:
-                now_ns = 0 if self._driver is None else self._driver.decided_ns
-                answered = answer(self._emulation, self._status, verb, payload, now_ns, own_router)
+                answered = answer(self._emulation, self._status, verb, payload, decided_ns, own_router)
                 query.reply(query.key_expr, json.dumps(answered))
             except VnetError as error:
                 query.reply_err(str(error))
@@ -363,3 +262,16 @@ class LiveSession:
         if self._fleet is not None:
             self._fleet.look(view.instant.time_ns)
         self._memory.look(view.instant.time_ns, self._launcher.pids)
+
+    def _publish_period(self, view: PeriodView) -> None:
+        """Publish a period to observers, if there are any: a message is of a whole period."""
+        attachment = self._processes.attachment
+        was_watched, self._watched = self._watched, attachment.is_watched("period")
+        if not self._watched:
+            return
+        if not was_watched or view.instant.period % SCENE_EVERY_PERIODS == 0:
+            attachment.publish("scene", self._messages.scene())
+        if was_watched:
+            attachment.publish("period", self._messages.period(view))
+        else:
+            self._messages.begin()

@@ -15,12 +15,11 @@ from enum import StrEnum
 from typing import Any
 
 from emulator.drivers.attachment import Attachment, LiveOptions
+from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import Membership
 from emulator.drivers.launch import AgentProcesses, Exit, Launcher
-from emulator.drivers.live.waiting import ChangeSignal
 from emulator.drivers.signals import gets_signals, signals_handled
 from emulator.records.events import EventKind
-from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport import wire
@@ -34,6 +33,27 @@ CHILDREN_POLL_S = 0.05
 """Seconds between two looks for ended processes on a thread that gets no signals."""
 REALTIME_AGENT_NICE = 10
 """Niceness of agents in real time: on a full machine the emulator, which all wait for, comes first."""
+
+
+class ChangeSignal:
+    """Wakes the task that waits for a change. For use on the run's event loop, by one waiting task."""
+
+    def __init__(self) -> None:
+        self._changed = asyncio.Event()
+
+    def set(self) -> None:
+        """Say that something has changed."""
+        self._changed.set()
+
+    async def wait(self, timeout_s: float) -> bool:
+        """Wait for the next change; False if none came in time."""
+        self._changed.clear()
+        try:
+            async with asyncio.timeout(max(timeout_s, 0)):
+                await self._changed.wait()
+        except TimeoutError:
+            return False
+        return True
 
 
 class ProcessState(StrEnum):
@@ -69,39 +89,38 @@ class _Process:
 class Supervisor:
     """The processes of a run.
 
-    Before `begin` a process that ends is the reason why the run cannot start (`failure`). From then on each has a
-    state, and `on_death` is called when one has died: `take_deaths` says which. In `realtime` a paused process is
-    stopped with a signal, and nobody waits for one that has been told to end. `agents` starts and ends the agents:
-    the `launcher`, which starts all else, or hosts.
+    Before `begin` a process that ends is the reason why the run cannot start (`failure`). From then on each has
+    a state, and `take_deaths` says which have died. In real time a paused process is stopped with a signal, and
+    nobody waits for one that has been told to end. `agents` starts and ends the agents: the `launcher`, which has
+    started all else, or hosts. What is said to a node goes through `say`.
     """
 
     def __init__(
         self,
-        *,
+        emulation: Emulation,
+        options: LiveOptions,
         launcher: Launcher,
         agents: AgentProcesses,
         members: Membership,
         attachment: Attachment,
-        options: LiveOptions,
-        folder: RunFolder,
+        say: Callable[[str, wire.EmulatorMessage], None],
         time_ns: Callable[[], int],
         changes: ChangeSignal,
-        realtime: bool,
     ) -> None:
+        self._folder = emulation.folder
+        self._realtime = emulation.scenario.run.pacing == "realtime"
+        self._options = options
         self._launcher = launcher
         self._agents = agents
         self._members = members
         self._attachment = attachment
-        self._options = options
-        self._folder = folder
+        self._say = say
         self._time_ns = time_ns
         self._changes = changes
-        self._realtime = realtime
         self._processes: dict[str, _Process] = {}
         self._to_pause: Collection[str] = ()
         self._ending: set[asyncio.Task[None]] = set()
         self.failure: VnetError | None = None
-        self.on_death: Callable[[], None] = changes.set
         self.reconnecting = False
         """True while the emulator itself is disconnected: lost connections then mean nothing."""
         self._all_told_to_end = False
@@ -167,7 +186,7 @@ class Supervisor:
         if self.state(process_id) is ProcessState.PAUSED:
             self._resume(process_id)  # or it could not go
         self._change(process_id, ProcessState.AWAY)
-        self._attachment.send(process_id, wire.End(None, reason))
+        self._say(process_id, wire.End(None, reason))
         if self._options.launch:
             ending = asyncio.create_task(asyncio.to_thread(self._agents.detach(process_id), SHUT_DOWN_S))
             if self._realtime:
@@ -291,17 +310,18 @@ class Supervisor:
             return
         elif not self._processes:
             self._members.leave(node)
-        elif not self._options.launch and self._is_there(node):
+        elif not self._options.launch and self.is_there(node):
             process = self._members.describe(node)
             loop, told_to_end = asyncio.get_running_loop(), self._all_told_to_end
             loop.call_later(DEATH_GRACE_S, self._connection_closed, node, process, told_to_end)
 
-    def _is_there(self, node: str) -> bool:
+    def is_there(self, node: str) -> bool:
+        """Return whether the process of this name is there: it runs, or is paused."""
         there = (ProcessState.RUNNING, ProcessState.PAUSED)
         return node in self._processes and self.state(node) in there
 
     def _connection_closed(self, process_id: str, process: str, told_to_end: bool) -> None:
-        if self._is_there(process_id):
+        if self.is_there(process_id):
             self._ended(process_id, told_to_end, how="its connection closed", process=process)
 
     def _ended(self, process_id: str, told_to_end: bool, **details: Any) -> None:
@@ -313,7 +333,6 @@ class Supervisor:
         else:
             self._change(process_id, ProcessState.DEAD)
             self._processes[process_id].death = details
-            self.on_death()
         self._changes.set()
 
     def take_deaths(self, among: Collection[str] | None = None) -> dict[str, dict[str, Any]]:

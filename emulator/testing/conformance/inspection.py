@@ -9,7 +9,7 @@ from emulator.radio.unicast import MOST_ATTEMPTS
 from emulator.testing.conformance.findings import Findings
 from vnet.reports import Report
 from vnet.transport import wire
-from vnet.transport.send_results import WireSendResult
+from vnet.transport.wire import WireSendResult
 
 OF_TRAFFIC = ("own_node", "payload", "sends", "numbers", "report_time")
 OF_YIELDS = ("timers", "steps", "wakes", *OF_TRAFFIC)

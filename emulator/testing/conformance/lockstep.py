@@ -9,7 +9,7 @@ from emulator.scenario.lookahead import least_latency_ns
 from emulator.testing.conformance.joining import absence, ask_stack, orphan
 from emulator.testing.conformance.scene import QUIET_S, Scene, SceneOverError
 from vnet.transport import wire
-from vnet.transport.send_results import WireSendResult
+from vnet.transport.wire import WireSendResult
 from vnet.units import NS_PER_S
 
 DURATION_NS = NS_PER_S

@@ -16,8 +16,7 @@ from emulator.testing.conformance.findings import Findings
 from emulator.testing.conformance.scene import Scene, SceneOverError
 from emulator.world.world import build_world
 from vnet.errors import VnetError, did_you_mean
-from vnet.transport.access import Access, is_tls
-from vnet.transport.certificates import certifier
+from vnet.transport.access import Access, certifier, is_tls
 
 PATIENCE_S = 5.0
 """Time that an answer may take: as long as an emulator waits for a process to end."""

@@ -8,7 +8,7 @@ from emulator.testing.conformance.bench import Said
 from emulator.testing.conformance.joining import absence, ask_stack, orphan
 from emulator.testing.conformance.lockstep import PACKET_AFTER_NS, say_malformed
 from emulator.testing.conformance.scene import Scene
-from vnet.transport import lateness, wire
+from vnet.transport import wire
 from vnet.units import NS_PER_S
 
 ACKNOWLEDGE_S = 2.0
@@ -113,7 +113,7 @@ class Clock:
     def _take_lateness(self, counts: list[int], data: bytes) -> None:
         self.scene.findings.expect("lateness")
         pairs = zip(self._lateness or counts, counts, strict=False)
-        if len(counts) != lateness.LATENESS_BINS or any(before > now for before, now in pairs):
+        if len(counts) != wire.LATENESS_BINS or any(before > now for before, now in pairs):
             self.scene.findings.fail("lateness", f"{len(counts)} bins, or a count that has become less", data)
         elif sum(counts) > self._timed:
             self.scene.findings.fail("lateness", f"{sum(counts)} packets, where {self._timed} were sent", data)
@@ -136,7 +136,7 @@ class Clock:
             self.scene.findings.fail("acknowledges", came)
         elif self._missed:
             self.scene.findings.fail("missed", f"nothing of {list(map(list, self._missed))}")
-        if self._late_ns and not sum(self._lateness[lateness.lateness_bin(self._late_ns) :]):
+        if self._late_ns and not sum(self._lateness[wire.lateness_bin(self._late_ns) :]):
             late_ms = self._late_ns / 1e6
             self.scene.findings.fail("lateness", f"no packet {late_ms:g} ms late or more, where one was")
 

@@ -14,7 +14,7 @@ from emulator.scenario.own_functions import in_words, line_of, load_function, ou
 from emulator.scenario.program import Program
 from emulator.world.trips.samples import MOST_SAMPLES, Samples
 from vnet.errors import ScenarioError, shown
-from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import search_programs_in
 
 USAGE = "def {}(seed, vehicles, duration_s)"
 COLUMNS = ("time_s", "x_m", "y_m", "heading_rad")

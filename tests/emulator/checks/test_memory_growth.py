@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.checks.memory_growth import FLOOR_KIB, is_long_enough, steady_growth_kib_per_s
-from emulator.drivers.memory import SAMPLES
+from emulator.drivers.usage import SAMPLES
 
 BASE_KB = 60_000
 durations = st.sampled_from([30.0, 60.0, 600.0])

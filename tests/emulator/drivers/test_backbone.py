@@ -13,7 +13,7 @@ from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together
 from vnet.backbone import Backbone
 from vnet.errors import PayloadTooLargeError
-from vnet.transport.backbone import SentMessage
+from vnet.transport.wire import SentMessage
 
 NAMES = ("rsu01", "rsu02", "rsu03")
 COUNTS = "tests.support.roadside_programs:counts"

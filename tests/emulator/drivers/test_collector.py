@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from emulator.drivers.collector import OBJECTS_A_VEHICLE, rare_collections
+from emulator.drivers.simulate import OBJECTS_A_VEHICLE, rare_collections
 from tests.support.multi_loop_driver import run_together, scenario_of
 
 

@@ -6,13 +6,13 @@ import time
 
 import pytest
 
-from emulator.drivers import cpu_watch
-from emulator.drivers.cpu_watch import CpuWatch, cpu_time_ns
+from emulator.drivers import usage
+from emulator.drivers.usage import CpuWatch, cpu_time_ns
 
 
 def test_a_process_that_is_started_again_adds_to_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     clocks: dict[int, int | None] = {}
-    monkeypatch.setattr(cpu_watch, "cpu_time_ns", clocks.get)
+    monkeypatch.setattr(usage, "cpu_time_ns", clocks.get)
     watch = CpuWatch()
     clocks |= {7: 100, 8: 1000}
     watch.look({"v01": 7, "v02": 8})

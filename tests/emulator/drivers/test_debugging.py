@@ -10,17 +10,17 @@ from typing import Any
 
 import pytest
 
-from emulator.drivers import simulate as simulation
+from emulator.drivers import local
 from emulator.drivers.conclude import conclude
 from emulator.drivers.debugging import DebugPoint, debug_point
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
+from emulator.drivers.simulate import simulate
 from tests.support.multi_loop_driver import emulation_of, run_together, scenario_of
 from vnet.errors import VnetError
 from vnet.node import Node
 from vnet.runtime.debug_target import DebugTarget, resolve
-from vnet.runtime.debugger import NodeDebugger
-from vnet.runtime.remote_terminal import RemoteTerminal
+from vnet.runtime.debugger import NodeDebugger, RemoteTerminal
 
 HERE = f"{__name__}:"
 THIS_FILE = Path(__file__)
@@ -85,10 +85,10 @@ def debug(monkeypatch: pytest.MonkeyPatch) -> Debug:
             entered = io.StringIO("".join(f"{command}\n" for command in commands))
             return NodeDebugger(target, io.StringIO, on_quit, entered, said)
 
-        monkeypatch.setattr(simulation, "_debugger", debugger)
+        monkeypatch.setattr(local, "_debugger", debugger)
         emulation = emulation_of(scenario_of(faults, HERE + program))
         trace, hook = sys.gettrace(), sys.breakpointhook
-        _, interrupted = simulation.simulate(emulation, debug=DebugTarget.parse(target))
+        _, interrupted = simulate(emulation, debug=DebugTarget.parse(target))
         assert (sys.gettrace(), sys.breakpointhook) == (trace, hook), "all is as it was"
         return emulation, said.getvalue().splitlines(), interrupted
 

@@ -11,7 +11,7 @@ from emulator.records.node_files import DEEPEST, MOST_FILES, collect
 from emulator.records.run_folder import RunFolder
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.node import Node
-from vnet.runtime.disks import Disks
+from vnet.runtime.host import Disks
 
 FAULTS = [
     {"kind": "kill", "at_s": 0.5, "duration_s": 0.6, "nodes": ["v01"]},

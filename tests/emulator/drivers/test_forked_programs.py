@@ -16,11 +16,10 @@ from typing import Any, NoReturn
 
 import pytest
 
-from emulator.drivers import forked_programs
+from emulator.drivers import pipes
 from emulator.drivers.conclude import conclude
-from emulator.drivers.forked_programs import ForkedPrograms
-from emulator.drivers.process_count import process_count, split_evenly
-from emulator.drivers.simulate import simulate
+from emulator.drivers.pipes import ForkedPrograms
+from emulator.drivers.simulate import process_count, simulate, split_evenly
 from emulator.radio.outcomes import Outcome
 from emulator.records.costs import read_cost
 from tests.emulator.drivers.test_status import emulate
@@ -172,20 +171,20 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
     def has_no_room(*_: object) -> NoReturn:
         raise VnetError("no room for programs")
 
-    monkeypatch.setattr(forked_programs, "HostedPrograms", has_no_room)
+    monkeypatch.setattr(pipes, "HostedPrograms", has_no_room)
     emulation = emulate(tmp_path / "run")
     welcomes = [emulation.welcome("v01", b"")]
     process = ForkedPrograms(welcomes, {}, emulation.folder, [], lambda: None)
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     try:
-        process.give(None)
+        process.give((), None)
         with pytest.raises(VnetError, match="no room for programs"):
             process.take(30.0)
     finally:
         process.close()
 
 
-@pytest.mark.parametrize("name", ["os.fork", "emulator.drivers.forked_programs.Pipe"])
+@pytest.mark.parametrize("name", ["os.fork", "emulator.drivers.pipes.Pipe"])
 def test_a_process_that_cannot_be_started_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

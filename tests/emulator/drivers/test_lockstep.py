@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.protocol import ProtocolError, wire_packet
+from emulator.drivers.processes import ProtocolError
 from emulator.radio.outcomes import Outcome
 from tests.support.multi_loop_driver import emulation_of, scenario_of
+from vnet.radio import Packet
 from vnet.transport import wire
 
 IDS = ["v01", "v02", "v03", "v04"]
@@ -55,6 +55,14 @@ def yield_all(lockstep: Lockstep, grants: dict[str, wire.Grant], **timers_ns: in
 
 def times(grants: dict[str, wire.Grant]) -> dict[str, int]:
     return {process_id: grant.time_ns for process_id, grant in grants.items()}
+
+
+def packets_of(lockstep: Lockstep, node: str) -> list[Packet]:
+    return lockstep.take_mail(node).packets[node]
+
+
+def fixes_ns(lockstep: Lockstep, node: str) -> list[int]:
+    return [fix.time_ns for _, fix in lockstep.take_mail(node).fixes]
 
 
 # One rule at a time.
@@ -107,11 +115,11 @@ def test_a_task_that_waits_for_fixes_is_woken_by_each_and_gets_what_it_has_misse
         lockstep.receive(process_id, yielded(grant, 500 * MS if process_id == "v02" else None, gnss=gnss))
     grants = lockstep.step()
     assert times(grants) == {"v01": PERIOD_NS}
-    assert [fix.time_ns for fix in grants["v01"].fixes] == [PERIOD_NS]
+    assert fixes_ns(lockstep, "v01") == [PERIOD_NS]
     yield_all(lockstep, grants)
     grants = lockstep.step()
     assert times(grants) == {"v02": 500 * MS}
-    assert [fix.time_ns for fix in grants["v02"].fixes] == [200 * MS, 400 * MS]
+    assert fixes_ns(lockstep, "v02") == [200 * MS, 400 * MS]
 
 
 def test_a_frame_wakes_whoever_waits_for_it_when_it_arrives_and_waits_for_the_others() -> None:
@@ -123,13 +131,13 @@ def test_a_frame_wakes_whoever_waits_for_it_when_it_arrives_and_waits_for_the_ot
         lockstep.receive(process_id, yielded(grant, timer_ns, radio, frames=frames))
     grants = lockstep.step()
     assert list(grants) == ["v02"], "the sender does not hear itself"
-    (packet,) = grants["v02"].packets
+    (packet,) = packets_of(lockstep, "v02")
     assert (packet.sender, packet.payload, packet.sent_ns) == ("v01", b"hello", 0)
     assert 0 < packet.received_ns == grants["v02"].time_ns < 900 * MS
     yield_all(lockstep, grants)
     grants = lockstep.step()
     assert times(grants) == {"v03": 900 * MS}
-    assert [packet.payload for packet in grants["v03"].packets] == [b"hello"]
+    assert [packet.payload for packet in packets_of(lockstep, "v03")] == [b"hello"]
 
 
 @pytest.mark.parametrize(
@@ -285,7 +293,7 @@ def test_packets_of_a_window_are_shown_before_it_and_decided_after_it() -> None:
         lockstep.receive(process_id, yielded(grant, 30 * MS if process_id == "v01" else 31 * MS, frames=frames))
     grants = lockstep.step()
     assert window(grants) == (30, 60)
-    arrivals_ns = {node: grants[node].packets[0].received_ns for node in IDS[1:]}
+    arrivals_ns = {node: packets_of(lockstep, node)[0].received_ns for node in IDS[1:]}
     assert all(31 * MS < arrival_ns < 60 * MS for arrival_ns in arrivals_ns.values())
     assert [emulation.engine.counts[Outcome.delivered], emulation.engine.counts[Outcome.pending]] == [0, 3]
     # v02's program ends a nanosecond before its packet arrives, and v03's as it arrives.
@@ -330,11 +338,13 @@ def test_a_flood_that_nobody_takes_is_bounded_and_that_of_a_window_is_not(monkey
         timers_ns = {"v01": 100 * MS, "v02": 30 * MS, "v03": 110 * MS}
         lockstep.receive(process_id, yielded(grant, timers_ns.get(process_id), frames=frames))
     grants = lockstep.step()
-    assert [packet.payload[0] for packet in grants["v02"].packets] == list(range(20)), "it may take each in turn"
+    assert [each.payload[0] for each in packets_of(lockstep, "v02")] == list(range(20)), "it may take each in turn"
     yield_all(lockstep, grants)
     grants = lockstep.step()
     assert times(grants) == {"v01": 100 * MS, "v03": 110 * MS}
-    assert [packet.payload[0] for packet in grants["v03"].packets] == list(range(15, 20)), "of the past the newest"
+    assert [each.payload[0] for each in packets_of(lockstep, "v03")] == list(range(15, 20)), (
+        "of the past the newest"
+    )
 
 
 # All rules at once: vehicles that do something at random.
@@ -434,10 +444,7 @@ class Course:
         """Give a process its grant, let its vehicles pass through the window, and yield."""
         assert grant.seq == self.seqs.get(process_id, -1) + 1
         self.seqs[process_id] = grant.seq
-        if (mail := self.lockstep.take_mail()) is not None:
-            packets = [wire_packet(node, packet) for node, some in mail.packets.items() for packet in some]
-            fixes = [wire.WireFix.of(node, fix) for node, fix in mail.fixes]
-            grant = msgspec.structs.replace(grant, packets=packets, fixes=fixes)
+        grant = self.lockstep.take_mail(process_id).within(grant)
         for packet in grant.packets:
             assert self.sent_ns[packet.payload] == packet.sent_ns, "nothing is delivered that was not sent before"
             assert packet.sent_ns <= packet.received_ns < grant.end_ns

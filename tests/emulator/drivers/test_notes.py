@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.log_book import MOST_NOTES
+from emulator.drivers.emulation import MOST_NOTES, Emulation
 from emulator.records.node_logs import NodeLogs
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.states import COMMON_VALUES

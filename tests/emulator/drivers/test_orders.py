@@ -15,7 +15,7 @@ from emulator.scenario.scenario import Scenario
 from tests.emulator.drivers.test_windows import fingerprint, same, scenarios
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.errors import VnetError
-from vnet.transport.orders import Deviation
+from vnet.transport.wire import Deviation
 
 IMPROVISES = "tests.support.window_programs:improvises"
 

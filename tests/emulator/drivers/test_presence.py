@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.drivers.presence import NodeState, Presence
+from emulator.drivers.emulation import NodeState, Presence
 
 IDS = ["v01", "v02", "v03"]
 OUTSIDE = {NodeState.NEW, NodeState.OUTSIDE, NodeState.ENTERING, NodeState.ENDED_OUTSIDE}

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.program_output import output_kept
+from emulator.drivers.local import output_kept
 from emulator.records import node_logs
 from emulator.records.node_logs import NodeLogs
 from emulator.scenario.scenario import Scenario

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from emulator.drivers.realtime import lateness_figures
-from vnet.transport import lateness
+from vnet.transport import wire
 
 
 def test_percentiles_are_those_of_the_delays() -> None:
     delays_ms = np.random.default_rng(0).exponential(4.0, 20_000)
-    counts = [0] * lateness.LATENESS_BINS
+    counts = [0] * wire.LATENESS_BINS
     for delay_ms in delays_ms:
-        counts[lateness.lateness_bin(round(delay_ms * 1e6))] += 1
+        counts[wire.lateness_bin(round(delay_ms * 1e6))] += 1
     figures = lateness_figures(counts)
     assert figures["total"] == 20_000
     assert figures["count"] == np.sum(delays_ms >= 20)

@@ -11,7 +11,7 @@ from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.transport import wire
-from vnet.transport.backbone import MessageRef, SentMessage, arrived_in_full
+from vnet.transport.wire import MessageRef, SentMessage, arrived_in_full
 
 IDS = ["v01", "v02", "v03", "v04"]
 MS = 1_000_000

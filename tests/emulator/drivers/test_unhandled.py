@@ -15,8 +15,7 @@ import pytest
 from emulator.checks.judge import judge
 from emulator.checks.run import check_no_exceptions
 from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.log_book import MOST_EXCEPTIONS
+from emulator.drivers.emulation import MOST_EXCEPTIONS, Emulation
 from emulator.records.events import Event
 from emulator.records.failures import kinds_of
 from emulator.records.recorded_run import RecordedRun

@@ -206,7 +206,7 @@ def stepped(scenario: Scenario, windows: bool, stops_s: Sequence[float]) -> Emul
     stops_ns: list[int | None] = [*(round(stop_s * 1e9) for stop_s in stops_s), None]
     reached = iter(range(len(stops_ns)))
 
-    def before_horizon(lockstep: Lockstep) -> None:
+    async def before_horizon(lockstep: Lockstep) -> None:
         number = next(reached)
         now_ns = stops_ns[number - 1] if number else 0
         assert now_ns is not None

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.drivers.protocol import wire_packet
 from tests.support.radio import engine, line
 from vnet.transport import wire
 
@@ -86,7 +85,7 @@ def test_powers_travel_to_a_live_program_as_they_are() -> None:
     subject = engine(line(0, 60), path_loss=LOG_DISTANCE)
     subject.transmit(0, 0, [b"hello"])
     (delivery,) = subject.advance(10 * MS)
-    sent = wire.Grant(0, 0, 1, packets=[wire_packet("v1", delivery.packet)])
+    sent = wire.Grant(0, 0, 1, packets=[wire.WirePacket.of("v1", delivery.packet)])
     received = wire.decode_rx(wire.encode(sent))
     assert isinstance(received, wire.Grant)
     assert received.packets[0].packet() == delivery.packet

@@ -16,7 +16,7 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.testing.scenarios import make_scenario
 from vnet.errors import ScenarioError
-from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import search_programs_in
 
 SAY = """
 async def main(node):

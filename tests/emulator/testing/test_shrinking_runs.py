@@ -19,7 +19,7 @@ from emulator.testing.failure_page import FAILURE_PAGE
 from emulator.testing.regression_test import TEST_FILE
 from emulator.testing.shrinking_runs import fewest, order_text
 from tests.emulator.testing.test_campaign import said_by_pytest
-from vnet.transport.orders import Deviation
+from vnet.transport.wire import Deviation
 
 
 @given(st.sets(st.integers(0, 199), min_size=1, max_size=4))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from vnet.runtime.asyncio_internals import NodeHandle
-from vnet.runtime.cpu_meter import CpuMeter
+from vnet.runtime.ready_queue import CpuMeter
 
 
 def handle_of(node: str | None, loop: asyncio.AbstractEventLoop) -> asyncio.Handle:

@@ -8,7 +8,7 @@ from tests.support.paths import ROOT
 PROGRAM = """
 import threading
 
-from vnet.runtime.forced_end import end_within
+from vnet.runtime.process_end import end_within
 
 end_within(0.1)
 threading.Event().wait()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 PROGRAM = """
 import atexit, sys, threading, types
-from vnet.runtime.forked_exit import end_forked
+from vnet.runtime.process_end import end_forked
 shared = frozenset(sys.modules)
 
 own = sys.modules["own"] = types.ModuleType("own")

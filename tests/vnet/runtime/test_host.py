@@ -10,10 +10,10 @@ import pytest
 from vnet import Node
 from vnet.errors import PayloadTooLargeError, ProgramError
 from vnet.roads.lanes import LaneMap
+from vnet.runtime.arrivals import Window
 from vnet.runtime.host import Host
 from vnet.runtime.programs import Program, load_program
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
-from vnet.runtime.window import Window
 from vnet.transport import wire
 
 LANES = LaneMap(np.array([[0.0, 0.0]]), np.array([0.0]), 0.85)

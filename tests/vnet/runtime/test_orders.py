@@ -10,11 +10,11 @@ import pytest
 
 from tests.vnet.runtime.test_host import LANES
 from vnet import Node
-from vnet.runtime.event_order import Option, Pct, Shuffle, Taped
 from vnet.runtime.host import Host
+from vnet.runtime.ready_queue import Option, Pct, Shuffle, Taped
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
-from vnet.transport.orders import Deviation, Order
+from vnet.transport.wire import Deviation, Order
 
 END_NS = 10_000_000_000
 

@@ -12,7 +12,7 @@ import pytest
 from tests.vnet.runtime.test_host import World
 from vnet import Node
 from vnet.runtime import own_asyncio
-from vnet.runtime.current_node import present_node
+from vnet.runtime.own_asyncio import present_node
 
 OWN = asyncio.Future, asyncio.Task, asyncio.all_tasks, asyncio.as_completed, asyncio.wrap_future
 Program = Callable[[Node], Awaitable[None]]

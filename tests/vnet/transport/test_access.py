@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from vnet.errors import TransportError
-from vnet.transport.access import EMULATOR, OBSERVER, Access, node_user
-from vnet.transport.certificates import certifier, router_names
+from vnet.transport.access import EMULATOR, OBSERVER, Access, certifier, node_user, router_names
 from vnet.transport.credentials import Credentials, common_name
 from vnet.transport.session import open_client, open_router
 

@@ -9,11 +9,9 @@ from vnet.driving import Action
 from vnet.errors import WireError
 from vnet.node import Fix
 from vnet.reports import Report
-from vnet.transport import lateness, wire
-from vnet.transport.backbone import MessageRef
+from vnet.transport import wire
 from vnet.transport.backbone_keys import Arrived, Sent
-from vnet.transport.orders import Deviation
-from vnet.transport.send_results import WireSendResult
+from vnet.transport.wire import Deviation, MessageRef, WireSendResult
 
 times = st.integers(min_value=0, max_value=2**62)
 names = st.text(min_size=1, max_size=8)
@@ -72,7 +70,7 @@ traffic = st.builds(
     refs,
 )
 steps = st.builds(wire.Step, times, traffic)
-histograms = st.lists(times, min_size=lateness.LATENESS_BINS, max_size=lateness.LATENESS_BINS)
+histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
 agent_messages = st.one_of(
     st.builds(
         wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names, times
@@ -173,7 +171,7 @@ def test_times_are_integers_within_bounds(time_ns: object) -> None:
         wire.decode_rx(grant)
 
 
-@pytest.mark.parametrize("bins", [0, lateness.LATENESS_BINS - 1, lateness.LATENESS_BINS + 1])
+@pytest.mark.parametrize("bins", [0, wire.LATENESS_BINS - 1, wire.LATENESS_BINS + 1])
 def test_a_histogram_of_another_length_is_refused(bins: int) -> None:
     """The emulator adds up the histograms of all processes."""
     frames = wire.Frames(b"n", 0, 0, [], wire.Traffic(), wire.Lateness([0] * bins))
@@ -206,11 +204,11 @@ def test_a_fix_survives_the_wire_bit_by_bit() -> None:
 
 
 def test_lateness_bins_have_an_edge_at_the_limit() -> None:
-    at_limit = lateness.lateness_bin(lateness.LATENESS_LIMIT_NS)
-    assert lateness.lateness_bin(lateness.LATENESS_LIMIT_NS - 1) == at_limit - 1
-    assert lateness.lateness_edge_ms(at_limit - 1) == pytest.approx(20.0)
-    assert lateness.lateness_bin(-5) == 0
-    assert lateness.lateness_bin(2**62) == lateness.LATENESS_BINS - 1
+    at_limit = wire.lateness_bin(wire.LATENESS_LIMIT_NS)
+    assert wire.lateness_bin(wire.LATENESS_LIMIT_NS - 1) == at_limit - 1
+    assert wire.lateness_edge_ms(at_limit - 1) == pytest.approx(20.0)
+    assert wire.lateness_bin(-5) == 0
+    assert wire.lateness_bin(2**62) == wire.LATENESS_BINS - 1
 
 
 @settings(max_examples=100, deadline=None)

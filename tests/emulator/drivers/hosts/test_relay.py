@@ -1,8 +1,7 @@
 """The bundles of a host: yields wait for each other, and nothing else waits."""
 
-from emulator.drivers.hosts import relay
+from emulator.drivers.hosts.host import FULL_BYTES, Relay
 from emulator.drivers.hosts.messages import FromNode, FromUnit, Token
-from emulator.drivers.hosts.relay import Relay
 from vnet.transport import wire
 
 YIELD = wire.encode(wire.Yield(b"nonce", 0, None, [], [], [], 1))
@@ -63,7 +62,7 @@ def test_an_emulator_that_asks_does_not_wait_for_those_that_are_stuck() -> None:
 
 def test_a_bundle_does_not_grow_without_bound() -> None:
     host = granted("v01", "v02")
-    large = YIELD + bytes(relay.FULL_BYTES)
+    large = YIELD + bytes(FULL_BYTES)
     host.take("v01", large)
     assert host.take_bundle() == [FromNode("v01", large)]
 

@@ -7,7 +7,7 @@ import pytest
 from emulator.drivers.hosts import retrieval
 from emulator.drivers.hosts.messages import LeftOut, Part
 from emulator.drivers.hosts.retrieval import Retrieval, hand_in
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.processes import ProtocolError
 from emulator.records.node_files import collect
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
+from emulator.drivers import realtime
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.join import Membership
 from emulator.drivers.launch import Exit
-from emulator.drivers.live import fleet, lockstep_driver, realtime_driver, reconnection
+from emulator.drivers.live import fleet, processes
+from emulator.drivers.live.processes import LiveProcesses
 from emulator.drivers.live.supervisor import Supervisor
-from emulator.drivers.live.waiting import ChangeSignal
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
@@ -29,7 +29,7 @@ def in_virtual_time(main: Coroutine[Any, Any, None], monkeypatch: pytest.MonkeyP
     """Run `main` on a loop that skips all waiting; the drivers take their clock from it."""
     loop = VirtualTimeLoop(skip_to)
     clock = SimpleNamespace(monotonic_ns=lambda: loop.now_ns, monotonic=lambda: loop.now_ns / NS_PER_S)
-    for module in (fleet, lockstep_driver, realtime_driver, reconnection):
+    for module in (fleet, processes, realtime):
         monkeypatch.setattr(module, "time", clock)
     try:
         loop.run_until_complete(main)
@@ -105,6 +105,9 @@ class FakeAttachment:
         self.sent.append((node, message))
         self.on_send(node, message)
 
+    def send_content(self, unit: str, payload: bytes) -> None:
+        self.done.append(f"content of {unit}")
+
     def is_watched(self, stream: str) -> bool:
         return False
 
@@ -138,22 +141,21 @@ class Stage:
         scenario = scenario_of(list(faults), "agents.beacon:main", run=run, **sections)
         self.emulation: Emulation = emulation_of(scenario)
         self.processes = [list(nodes) for nodes in processes]
+        for node in later:
+            self.emulation.up[node] = False
         self.launcher = FakeLauncher()
-        self.attachment = FakeAttachment()
-        self.changes = ChangeSignal()
-        self.members = Membership(IDS, later)
         self.options = LiveOptions(Access.create("fake", self.processes), launch=launch)
-        self.supervisor = Supervisor(
-            launcher=self.launcher,  # type: ignore[arg-type]
-            agents=self.launcher,  # type: ignore[arg-type]
-            members=self.members,
-            attachment=self.attachment,  # type: ignore[arg-type]
-            options=self.options,
-            folder=self.emulation.folder,
-            time_ns=lambda: 0,
-            changes=self.changes,
-            realtime=pacing == "realtime",
+        self.queries: list[tuple[str, Any]] = []
+        self.live = LiveProcesses(
+            self.emulation,
+            self.options,
+            self.launcher,  # type: ignore[arg-type]
+            lambda verb, query: self.queries.append((verb, query)),
+            lambda *_: FakeAttachment(),  # type: ignore[arg-type]
         )
+        self.attachment: FakeAttachment = self.live.attachment  # type: ignore[assignment]
+        self.attachment.done.clear()
+        self.members, self.supervisor, self.changes = self.live.members, self.live.supervisor, self.live.changes
 
     @property
     def folder(self) -> Path:

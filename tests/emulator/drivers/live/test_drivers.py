@@ -7,16 +7,13 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from emulator.drivers.live.driver import Driver, Parts
-from emulator.drivers.live.inbox import Inbox, Refusals
-from emulator.drivers.live.lockstep_driver import LockstepDriver
-from emulator.drivers.live.realtime_driver import RealTimeDriver
-from emulator.drivers.live.reconnection import Reconnection
-from emulator.drivers.live.waiting import Stalled
+from emulator.drivers.lockstep import Lockstep, run_in_lockstep
+from emulator.drivers.processes import Stalled
+from emulator.drivers.realtime import RealTime, run_in_real_time
 from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
 from vnet.transport import backbone_keys, wire
-from vnet.transport.backbone import MessageRef, SentMessage
 from vnet.transport.backbone_keys import Sent
+from vnet.transport.wire import MessageRef, SentMessage
 
 MS = 1_000_000
 RUN = {"duration_s": 0.6, "settle_s": 0.1, "stall_timeout_s": 1.0, "join_timeout_s": 1.0}
@@ -24,37 +21,37 @@ Answer = Callable[[str, Any], wire.AgentMessage | None]
 
 
 class Play:
-    """A driver on a stage. What processes say to a message, by `answer`, comes in through the inbox."""
+    """A pacing on a stage. What processes say to a message, by `answer`, comes as from Zenoh's threads."""
 
-    def __init__(self, kind: type[Driver], answer: Answer, **stage: Any) -> None:
-        pacing = "lockstep" if kind is LockstepDriver else "realtime"
+    def __init__(self, pacing: str, answer: Answer, **stage: Any) -> None:
         stage["run"] = {**RUN, **stage.get("run", {})}
         self.stage = Stage(pacing=pacing, **stage)
         self.stage.join(begin=False)
-        self.refusals = Refusals("run", self.stage.emulation.folder, lambda: 0)
-        self.inbox = Inbox(
-            self.stage.members, self.refusals, self.stage.changes, lambda node: None, lambda verb, query: None
-        )
-        common: dict[str, Any] = {
-            "emulation": self.stage.emulation,
-            "members": self.stage.members,
-            "supervisor": self.stage.supervisor,
-            "attachment": self.stage.attachment,
-            "inbox": self.inbox,
-        }
-        launcher: Any = self.stage.launcher
-        reconnection = Reconnection(
-            **common, launcher=launcher, options=self.stage.options, time_ns=lambda: self.driver.time_ns
-        )
-        parts = Parts(**common, agents=launcher, reconnection=reconnection, changes=self.stage.changes)
-        self.driver = kind(parts, self.stage.members.processes())
+        self.live, self.emulation = self.stage.live, self.stage.emulation
+        groups = self.stage.members.processes()
+        kind = Lockstep if pacing == "lockstep" else RealTime
+        self.pacing = kind(self.emulation, groups)
+        self.live.begin(groups, lambda: max(self.pacing.now_ns, 0))
         self.answer = answer
         self.stage.attachment.on_send = self.respond
+
+    async def run(self) -> None:
+        if isinstance(self.pacing, Lockstep):
+            await run_in_lockstep(self.pacing, self.live)
+        else:
+            await run_in_real_time(self.pacing, self.live)
+
+    async def finish(self, deadline_s: float) -> None:
+        assert isinstance(self.pacing, RealTime)
+        await self.live.finish_real_time(self.pacing, deadline_s)
 
     def respond(self, node: str, message: wire.EmulatorMessage) -> None:
         said = self.answer(node, message)
         if said is not None:
-            self.inbox.put_message(node, wire.encode(said))
+            self.hear("message", node, wire.encode(said))
+
+    def hear(self, what: str, name: str, payload: bytes) -> None:
+        self.live.hear(what, name, payload)
 
     def sent(self, kind: type) -> list[tuple[str, Any]]:
         return [(node, message) for node, message in self.stage.attachment.sent if isinstance(message, kind)]
@@ -78,14 +75,14 @@ def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -
 
 def test_lockstep_runs_to_the_end_grant_by_grant(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
-        play = Play(LockstepDriver, yields)
-        await play.driver.run()
+        play = Play("lockstep", yields)
+        await play.run()
         grants = play.sent(wire.Grant)
         assert [node for node, _ in grants] == IDS * 6
         assert [grant.time_ns for node, grant in grants if node == "v02"] == [n * 100 * MS for n in range(6)]
         assert len(play.stage.emulation.metrics.rows) == 3
         assert len(play.stage.emulation.engine.trace) == 6 * 3
-        assert play.driver.time_ns == 500 * MS
+        assert play.pacing.now_ns == 500 * MS
 
     in_virtual_time(run(), monkeypatch)
 
@@ -100,8 +97,8 @@ def test_in_lockstep_a_death_is_told_at_the_barrier_that_the_process_does_not_an
                 return None
             return yields(node, message)
 
-        play = Play(LockstepDriver, answer)
-        await play.driver.run()
+        play = Play("lockstep", answer)
+        await play.run()
         (died,) = [event for event in play.stage.emulation.folder.events if event.kind == "died"]
         assert (died.node, died.time_ns, died.details["how"]) == ("v02", 200 * MS, "SIGSEGV")
         assert [node for node, _ in play.sent(wire.Grant)].count("v01") == 6
@@ -116,8 +113,8 @@ def test_in_lockstep_a_yield_after_the_death_of_its_process_is_refused(monkeypat
                 play.stage.launcher.dies(play.stage.supervisor, "v02")
             return yields(node, message)
 
-        play = Play(LockstepDriver, answer)
-        await play.driver.run()
+        play = Play("lockstep", answer)
+        await play.run()
         assert play.stage.events("died", "refused", "stalled") == [("refused", "v02"), ("died", "v02")]
         assert [node for node, _ in play.sent(wire.Grant)].count("v04") == 6
 
@@ -131,7 +128,7 @@ def test_in_lockstep_a_killed_process_is_awaited_before_time_goes_on(monkeypatch
         def answer(node: str, message: Any) -> wire.AgentMessage | None:
             return yields(node, message, b"2" if node == "v02" and returning else b"1")
 
-        play = Play(LockstepDriver, answer, faults=[fault("kill", 0.15, 0.2, "v02")])
+        play = Play("lockstep", answer, faults=[fault("kill", 0.15, 0.2, "v02")])
         start = play.stage.launcher.start_agents
 
         def start_and_join(*arguments: Any, **more: Any) -> None:
@@ -140,7 +137,7 @@ def test_in_lockstep_a_killed_process_is_awaited_before_time_goes_on(monkeypatch
             play.stage.members.hello("v02", hello("v02", nonce=b"2"))
 
         play.stage.launcher.start_agents = start_and_join  # type: ignore[method-assign]
-        await play.driver.run()
+        await play.run()
         times = [(grant.seq, grant.time_ns // MS) for node, grant in play.sent(wire.Grant) if node == "v02"]
         assert times == [(0, 0), (1, 100), (0, 350), (1, 450), (2, 550)]
         assert play.stage.launcher.done == [("kill", "v02"), ("start", "v02")]
@@ -150,9 +147,9 @@ def test_in_lockstep_a_killed_process_is_awaited_before_time_goes_on(monkeypatch
 
 def test_in_lockstep_a_process_that_does_not_come_back_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
-        play = Play(LockstepDriver, yields, faults=[fault("restart", 0.15, 0.2, "v02")])
+        play = Play("lockstep", yields, faults=[fault("restart", 0.15, 0.2, "v02")])
         with pytest.raises(Stalled):
-            await play.driver.run()
+            await play.run()
         (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
         assert (stalled.node, stalled.details["error"]) == ("v02", "has not come back within 1 s")
         assert play.sent(wire.End) == [("v02", wire.End(None, "restarted by a fault"))]
@@ -168,9 +165,9 @@ def test_in_lockstep_a_process_that_does_not_yield_ends_the_run_with_its_stack(
             stuck = isinstance(message, wire.Grant) and message.time_ns == 200 * MS
             return None if stuck and node in ("v02", "v03") else yields(node, message)
 
-        play = Play(LockstepDriver, answer)
+        play = Play("lockstep", answer)
         with pytest.raises(Stalled):
-            await play.driver.run()
+            await play.run()
         assert play.stage.events("stalled") == [("stalled", "v02"), ("stalled", "v03")]
         where = {e.node: e.details["where"] for e in play.stage.emulation.folder.events if e.kind == "stalled"}
         assert where == {"v02": "v02 is here", "v03": "v03 is here"}
@@ -187,9 +184,9 @@ def test_in_lockstep_a_refused_yield_is_told_with_its_reason(monkeypatch: pytest
                 return replace(said, seq=said.seq + 7)
             return said
 
-        play = Play(LockstepDriver, answer)
+        play = Play("lockstep", answer)
         with pytest.raises(Stalled):
-            await play.driver.run()
+            await play.run()
         (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
         (refused,) = [event for event in play.stage.emulation.folder.events if event.kind == "refused"]
         assert stalled.node == refused.node == "v02"
@@ -210,15 +207,15 @@ def test_in_lockstep_a_process_whose_instants_go_on_has_not_stalled(monkeypatch:
             if isinstance(message, wire.StackRequest):
                 asked.append(len(asked))
                 if len(asked) == 3:
-                    play.inbox.put_message(node, wire.encode(owed[0]))
+                    play.hear("message", node, wire.encode(owed[0]))
                 return wire.StackDump(b"1", "busy", 200 * MS + len(asked))
             return yields(node, message)
 
-        play = Play(LockstepDriver, answer)
-        await play.driver.run()
+        play = Play("lockstep", answer)
+        await play.run()
         assert len(asked) == 3, "asked each time that nothing has come for run.stall_timeout_s"
         assert play.stage.events("stalled") == []
-        assert play.driver.time_ns == 500 * MS
+        assert play.pacing.now_ns == 500 * MS
 
     in_virtual_time(run(), monkeypatch)
 
@@ -234,9 +231,9 @@ def test_in_lockstep_a_process_that_stays_at_its_instant_has_stalled(monkeypatch
             stuck = isinstance(message, wire.Grant) and message.time_ns == 200 * MS and node == "v02"
             return None if stuck else yields(node, message)
 
-        play = Play(LockstepDriver, answer)
+        play = Play("lockstep", answer)
         with pytest.raises(Stalled):
-            await play.driver.run()
+            await play.run()
         assert asked == ["v02", "v02"], "once more, as it had come from 200 ms to 201 ms"
         assert play.stage.events("stalled") == [("stalled", "v02")]
 
@@ -255,13 +252,13 @@ def test_in_lockstep_only_those_have_stalled_whose_yields_their_host_does_not_ke
                 return None
             if isinstance(message, wire.StackRequest):
                 if node == "v03":
-                    play.inbox.put_message(node, kept[node])
+                    play.hear("message", node, kept[node])
                 return wire.StackDump(b"1", "here", 200 * MS)
             return yields(node, message)
 
-        play = Play(LockstepDriver, answer)
+        play = Play("lockstep", answer)
         with pytest.raises(Stalled):
-            await play.driver.run()
+            await play.run()
         assert play.stage.events("stalled") == [("stalled", "v02")]
 
     in_virtual_time(run(), monkeypatch)
@@ -280,8 +277,8 @@ def test_a_restart_of_the_emulator_is_announced_and_ends_when_all_have_answered(
                     return None  # not connected yet
             return yields(node, message)
 
-        play = Play(LockstepDriver, answer, faults=[fault("emulator_restart", 0.2, 0.1, down_s=0.01)])
-        await play.driver.run()
+        play = Play("lockstep", answer, faults=[fault("emulator_restart", 0.2, 0.1, down_s=0.01)])
+        await play.run()
         assert [node for node, _ in play.sent(wire.Await)] == IDS
         assert play.stage.attachment.done == ["close", "open"]
         assert asked.count("v03") == 2
@@ -293,9 +290,9 @@ def test_a_restart_of_the_emulator_is_announced_and_ends_when_all_have_answered(
 
 def test_a_message_of_the_other_pacing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
-        play = Play(LockstepDriver, yields)
-        play.inbox.put_message("v01", wire.encode(wire.Frames(b"1", 0, 0, [], wire.Traffic())))
-        await play.driver.run()
+        play = Play("lockstep", yields)
+        play.hear("message", "v01", wire.encode(wire.Frames(b"1", 0, 0, [], wire.Traffic())))
+        await play.run()
         assert play.stage.events("refused") == [("refused", "v01")]
 
     in_virtual_time(run(), monkeypatch)
@@ -326,15 +323,15 @@ def test_a_yield_waits_for_the_messages_of_the_backbone_to_which_it_refers(
             step = wire.Step(message.time_ns, wire.Traffic(messages=[sent]))
             whole = wire.Yield(b"1", message.seq, message.time_ns + 100 * MS, (), (), [step], 1)
             said, contents = backbone_keys.split_yield(whole)
-            puts: list[tuple[Callable[[str, bytes], None], str, bytes]]
-            puts = [(play.inbox.put_message, "v03", wire.encode(said))]
-            puts += [(play.inbox.put_backbone, unit, backbone_keys.encode(each)) for unit, each in contents]
-            for put, name, payload in reversed(puts) if first == "message" else puts:
-                put(name, payload)
+            puts: list[tuple[str, str, bytes]]
+            puts = [("message", "v03", wire.encode(said))]
+            puts += [("backbone", unit, backbone_keys.encode(each)) for unit, each in contents]
+            for put in reversed(puts) if first == "message" else puts:
+                play.hear(*put)
             return None
 
-        play = Play(LockstepDriver, answer, **UNITS)
-        await play.driver.run()
+        play = Play("lockstep", answer, **UNITS)
+        await play.run()
         assert outcomes(play) == [(time_ns, "v03", "delivered") for time_ns in range(0, 600 * MS, 100 * MS)]
         assert play.stage.events("stalled", "refused") == []
 
@@ -359,16 +356,16 @@ def test_a_message_of_the_backbone_that_never_comes_is_named(
             if node != "v03" or not isinstance(message, wire.Grant):
                 return yields(node, message)
             if unit:
-                play.inbox.put_backbone(unit, backbone_keys.encode(Sent(nonce, 7, None, b"x")))
+                play.hear("backbone", unit, backbone_keys.encode(Sent(nonce, 7, None, b"x")))
             if unit == "v04":
                 other = wire.Step(message.time_ns, wire.Traffic(messages=[MessageRef(unit, 7)]))
-                play.inbox.put_message("v03", wire.encode(wire.Yield(b"1", message.seq, None, (), (), [other], 1)))
+                play.hear("message", "v03", wire.encode(wire.Yield(b"1", message.seq, None, (), (), [other], 1)))
             step = wire.Step(message.time_ns, wire.Traffic(messages=[MessageRef("v03", 7)]))
             return wire.Yield(b"1", message.seq, None, (), (), [step], 1)
 
-        play = Play(LockstepDriver, answer, **UNITS)
+        play = Play("lockstep", answer, **UNITS)
         with pytest.raises(Stalled):
-            await play.driver.run()
+            await play.run()
         (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
         expected = "yield 0 without 1 message of v03 on the backbone, to which it refers, within 1 s"
         assert stalled.node == "v03" and stalled.details["error"].startswith(expected)
@@ -391,15 +388,15 @@ def frames(node: str, message: Any) -> wire.AgentMessage | None:
 
 def test_real_time_sends_what_is_due_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
-        play = Play(RealTimeDriver, frames)
-        await play.driver.run()
+        play = Play("realtime", frames)
+        await play.run()
         batches = play.sent(wire.Batch)
         for node in IDS:
             seqs = [batch.seq for each, batch in batches if each == node]
             assert seqs == list(range(len(seqs)))
             fixes = [fix.time_ns for each, batch in batches if each == node for fix in batch.fixes]
             assert fixes == [0, 200 * MS, 400 * MS]
-        assert play.driver.time_ns >= play.stage.emulation.duration_ns
+        assert play.pacing.now_ns >= play.stage.emulation.duration_ns
         assert play.stage.events("died", "stalled", "refused") == []
 
     in_virtual_time(run(), monkeypatch)
@@ -414,17 +411,17 @@ def test_in_real_time_a_death_is_told_at_once_and_nobody_waits_for_last_words_of
                 play.stage.launcher.dies(play.stage.supervisor, "v02")
             return frames(node, message)
 
-        play = Play(RealTimeDriver, answer)
-        await play.driver.run()
+        play = Play("realtime", answer)
+        await play.run()
         assert play.stage.events("died") == [("died", "v02")]
         assert not play.stage.emulation.up["v02"]
         for node in ("v01", "v03", "v04"):
             seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
             last = wire.Frames(b"1", seq, seq, [], wire.Traffic(), None, final=True)
-            play.inbox.put_message(node, wire.encode(last))
-        before_ns = play.driver.time_ns
-        await play.driver.finish(3600.0)
-        assert play.driver.time_ns == before_ns
+            play.hear("message", node, wire.encode(last))
+        before_ns = play.pacing.now_ns
+        await play.finish(3600.0)
+        assert play.pacing.now_ns == before_ns
 
     in_virtual_time(run(), monkeypatch)
 
@@ -433,11 +430,11 @@ def test_in_real_time_a_process_that_says_no_last_words_is_waited_for_until_the_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def run() -> None:
-        play = Play(RealTimeDriver, frames)
-        await play.driver.run()
-        before_ns = play.driver.time_ns
-        await play.driver.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 1.0)
-        assert play.driver.time_ns - before_ns == 1000 * MS
+        play = Play("realtime", frames)
+        await play.run()
+        before_ns = play.pacing.now_ns
+        await play.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 1.0)
+        assert play.pacing.now_ns - before_ns == 1000 * MS
 
     in_virtual_time(run(), monkeypatch)
 
@@ -446,25 +443,25 @@ def test_in_real_time_processes_that_end_when_they_are_told_to_have_not_died_how
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def run() -> None:
-        play = Play(RealTimeDriver, frames)
-        await play.driver.run()
+        play = Play("realtime", frames)
+        await play.run()
         supervisor, loop = play.stage.supervisor, asyncio.get_running_loop()
         supervisor.all_told_to_end()
 
         def final(node: str) -> None:
             seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
             last = wire.Frames(b"1", seq, seq, [], wire.Traffic(), None, final=True)
-            play.inbox.put_message(node, wire.encode(last))
+            play.hear("message", node, wire.encode(last))
 
         for node in IDS[:2]:
             final(node)
             play.stage.launcher.ends_as_told(supervisor, node)
         play.stage.launcher.ends_as_told(supervisor, "v03")  # without a last message
         loop.call_later(2.0, final, "v04")
-        before_ns = play.driver.time_ns
-        await play.driver.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 5.0)
+        before_ns = play.pacing.now_ns
+        await play.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 5.0)
         assert play.stage.events("died") == []
-        assert play.driver.time_ns - before_ns == 2000 * MS, "it waits for v04, and for nobody else"
+        assert play.pacing.now_ns - before_ns == 2000 * MS, "it waits for v04, and for nobody else"
 
     in_virtual_time(run(), monkeypatch)
 
@@ -478,14 +475,14 @@ def test_in_real_time_a_message_of_the_backbone_may_come_after_its_frames_and_on
             if node != "v03" or not isinstance(said, wire.Frames):
                 return said
             refs = [MessageRef("v03", said.seq), MessageRef("v03", 1000)] if said.seq < 2 else []
-            play.inbox.put_message("v03", wire.encode(replace(said, traffic=wire.Traffic(messages=refs))))
+            play.hear("message", "v03", wire.encode(replace(said, traffic=wire.Traffic(messages=refs))))
             if said.seq < 2:
-                play.inbox.put_backbone("v03", backbone_keys.encode(Sent(b"1", said.seq, "v04", b"x")))
+                play.hear("backbone", "v03", backbone_keys.encode(Sent(b"1", said.seq, "v04", b"x")))
             return None
 
-        play = Play(RealTimeDriver, answer, **UNITS)
-        await play.driver.run()
-        await play.driver.finish(0.0)
+        play = Play("realtime", answer, **UNITS)
+        await play.run()
+        await play.finish(0.0)
         assert [outcome for _, _, outcome in outcomes(play)] == ["delivered"] * 2
         (gap,) = [event for event in play.stage.emulation.folder.events if event.kind == "transport_gap"]
         assert gap.details["count"] == 1
@@ -500,18 +497,18 @@ def test_in_real_time_a_message_of_the_backbone_may_come_after_the_last_frames(
     """If it was sent when the run was over, nobody misses it."""
 
     async def run() -> None:
-        play = Play(RealTimeDriver, frames, **UNITS)
+        play = Play("realtime", frames, **UNITS)
         if ended:
-            await play.driver.run()
+            await play.run()
         for node in IDS:
             refs = [MessageRef(node, 0)] if node == "v03" else []
             seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
             last = wire.Frames(b"1", seq, seq, [], wire.Traffic(messages=refs), final=True)
-            play.inbox.put_message(node, wire.encode(last))
+            play.hear("message", node, wire.encode(last))
         if not ended:
             content = backbone_keys.encode(Sent(b"1", 0, None, b"x"))
-            asyncio.get_running_loop().call_later(0.1, play.inbox.put_backbone, "v03", content)
-        await play.driver.finish(3600.0)
+            asyncio.get_running_loop().call_later(0.1, play.hear, "backbone", "v03", content)
+        await play.finish(3600.0)
         assert play.stage.events("transport_gap", "refused") == []
 
     in_virtual_time(run(), monkeypatch)

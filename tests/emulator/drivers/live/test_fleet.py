@@ -26,8 +26,7 @@ from emulator.drivers.hosts.messages import (
 )
 from emulator.drivers.launch import Exit
 from emulator.drivers.live.fleet import ANSWER_PATIENCE_S, Fleet
-from emulator.drivers.live.supervisor import DEATH_GRACE_S
-from emulator.drivers.live.waiting import ChangeSignal
+from emulator.drivers.live.supervisor import DEATH_GRACE_S, ChangeSignal
 from emulator.records.code_digest import vnet_digest
 from tests.emulator.drivers.live.fakes import in_virtual_time
 from tests.support.multi_loop_driver import emulation_of, scenario_of
@@ -55,18 +54,16 @@ class Play:
         self.emulation = emulation_of(scenario_of([], "agents.beacon:main"))
         self.fleet = Fleet(
             self.access,
-            self.emulation.folder,
-            self.emulation.scenario,
-            1000,
+            self.emulation,
             lambda host, payload: self.sent.append((host, messages.decode_to_host(payload))),
+            self.tell,
             lambda: 5,
             lambda: False,
             ChangeSignal(),
         )
-        self.fleet.on_message = lambda node, payload: self.came.append((node, payload))
-        self.fleet.on_token = lambda node, alive: self.came.append((node, alive))
-        self.fleet.on_ended = lambda process_id, how: self.came.append((process_id, how))
-        self.fleet.on_lost = lambda process_ids, how: self.came.append((list(process_ids), how))
+
+    def tell(self, what: str, name: str, item: Any) -> None:
+        self.came.append((list(item), name) if what == "lost" else (name, item))
 
     def join(self) -> None:
         """Both hosts join, and all processes are started."""

@@ -1,4 +1,4 @@
-"""The inbox: from Zenoh's threads to the loop, in order, by the type of the message, or refused."""
+"""Messages from Zenoh's threads: they come to the run's loop, in order, by their type, or are refused."""
 
 import asyncio
 import threading
@@ -6,38 +6,35 @@ from typing import Any
 
 import pytest
 
-from emulator.drivers.live.inbox import Inbox, Refusals
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.processes import Heard, ProtocolError
 from tests.emulator.drivers.live.fakes import Stage, hello
 from vnet.transport import wire
 
 
 class Post:
-    """An inbox, and all that comes out of it."""
+    """Programs in lockstep of which each owes a yield, and all that comes of them."""
 
     def __init__(self) -> None:
         self.stage = Stage()
-        self.stage.join()
-        self.came: list[Any] = []
-        self.refusals = Refusals("run", self.stage.emulation.folder, lambda: 5)
-        self.inbox = Inbox(
-            self.stage.members,
-            self.refusals,
-            self.stage.changes,
-            on_disconnected=lambda node: self.came.append(("gone", node)),
-            on_query=lambda verb, query: self.came.append((verb, query)),
-        )
-        self.inbox.handlers[wire.Yield] = self.take
-        self.inbox.handlers[wire.Hello] = self.take
+        self.stage.join(begin=False)
+        self.live = self.stage.live
+        self.live.begin(self.stage.members.processes(), lambda: 5)
+        for node in ("v01", "v02", "v03"):
+            self.live.send(node, wire.Grant(0, 0, 1))
 
-    def take(self, node: str, message: Any) -> None:
-        if isinstance(message, wire.Yield) and message.seq == 13:
-            raise ProtocolError("no yield is owed")
-        self.came.append((node, getattr(message, "seq", "hello")))
+    def hear(self, node: str, payload: bytes) -> None:
+        self.live.hear("message", node, payload)
 
     async def settle(self) -> None:
         for _ in range(3):
             await asyncio.sleep(0)
+
+    async def came(self) -> list[tuple[str, int]]:
+        heard = []
+        while (each := await self.live.receive(0.0)) is not None:
+            assert isinstance(each, Heard) and isinstance(each.message, wire.Yield)
+            heard.append((each.process_id, each.message.seq))
+        return heard
 
     @property
     def refused(self) -> list[tuple[str | None, str]]:
@@ -49,29 +46,31 @@ def yield_of(seq: int, nonce: bytes = b"1") -> bytes:
     return wire.encode(wire.Yield(nonce, seq, None, (), (), (), 1))
 
 
-def test_what_threads_put_comes_out_on_the_loop_in_order() -> None:
+def test_what_threads_put_comes_out_on_the_loop_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
         post = Post()
         loop_thread = threading.current_thread()
-        threads = set()
+        taken: list[tuple[str, Any]] = []
+        take = post.live.take
 
-        def take(node: str, message: Any) -> None:
-            threads.add(threading.current_thread())
-            post.take(node, message)
+        def noting(what: str, name: str, item: Any) -> None:
+            taken.append((what, threading.current_thread()))
+            take(what, name, item)
 
-        post.inbox.handlers[wire.Yield] = take
+        monkeypatch.setattr(post.live, "take", noting)
 
         def zenoh() -> None:
-            for seq in range(5):
-                post.inbox.put_message("v01", yield_of(seq))
-            post.inbox.put_token("v02", True)
-            post.inbox.put_token("v02", False)
-            post.inbox.put_query("status", "a query")  # type: ignore[arg-type]
+            for node in ("v03", "v01", "v02"):
+                post.hear(node, yield_of(0))
+            post.live.hear("token", "v02", True)
+            post.live.hear("token", "v02", False)
+            post.live.hear("query", "status", "a query")
 
         await asyncio.to_thread(zenoh)
         await post.settle()
-        assert threads == {loop_thread}
-        assert post.came == [*(("v01", seq) for seq in range(5)), ("gone", "v02"), ("status", "a query")]
+        assert taken == [(w, loop_thread) for w in ("message", "message", "message", "token", "token", "query")]
+        assert await post.came() == [("v03", 0), ("v01", 0), ("v02", 0)]
+        assert post.stage.queries == [("status", "a query")]
 
     asyncio.run(run())
 
@@ -80,7 +79,6 @@ def test_what_threads_put_comes_out_on_the_loop_in_order() -> None:
     ("payload", "reason"),
     [
         (yield_of(0, b"of another"), "a message without the nonce of its process"),
-        (yield_of(13), "no yield is owed"),
         (wire.encode(wire.Frames(b"1", 0, 0, [], wire.Traffic())), "an unexpected Frames"),
         (b"\xc1 no message", "12 bytes are not a message"),
         (b"", "0 bytes are not a message"),
@@ -89,12 +87,27 @@ def test_what_threads_put_comes_out_on_the_loop_in_order() -> None:
 def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: bytes, reason: str) -> None:
     async def run() -> None:
         post = Post()
-        post.inbox.put_message("v01", payload)
-        post.inbox.put_message("v01", yield_of(1))
+        post.hear("v01", payload)
+        post.hear("v01", yield_of(0))
         await post.settle()
-        assert post.came == [("v01", 1)]
+        assert await post.came() == [("v01", 0)]
         ((node, said),) = post.refused
         assert node == "v01" and said.startswith(reason)
+
+    asyncio.run(run())
+
+
+def test_a_second_yield_is_refused_unless_the_loop_has_refused_the_first() -> None:
+    async def run() -> None:
+        post = Post()
+        post.hear("v01", yield_of(7))
+        post.hear("v01", yield_of(0))
+        await post.settle()
+        assert await post.came() == [("v01", 7)] and len(post.refused) == 1
+        post.live.refuse("v01", ProtocolError("yield 7 of v01: expected 0"))
+        post.hear("v01", yield_of(0))
+        await post.settle()
+        assert await post.came() == [("v01", 0)]
 
     asyncio.run(run())
 
@@ -102,9 +115,9 @@ def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: bytes, re
 def test_a_hello_needs_no_nonce_that_is_known() -> None:
     async def run() -> None:
         post = Post()
-        post.inbox.put_message("v09", wire.encode(hello("v09", nonce=b"new")))
+        post.hear("v09", wire.encode(hello("v09", nonce=b"new")))
         await post.settle()
-        assert post.came == [("v09", "hello")] and post.refused == []
+        assert post.refused == [("v09", "'v09' is not a node of this run")]
 
     asyncio.run(run())
 
@@ -113,10 +126,10 @@ def test_of_each_key_the_first_refusal_is_logged_and_all_are_counted() -> None:
     async def run() -> None:
         post = Post()
         for node in ("v01", "v02", "v01", "v01"):
-            post.inbox.put_message(node, b"nonsense")
+            post.hear(node, b"nonsense")
         await post.settle()
         assert [node for node, _ in post.refused] == ["v01", "v02"]
-        post.refusals.write_totals()
+        post.live.write_refused()
         events = post.stage.emulation.folder.events
         totals = {e.details["key"]: e.details["count"] for e in events if e.kind == "refused_total"}
         assert sorted(totals.values()) == [1, 3]
@@ -124,16 +137,13 @@ def test_of_each_key_the_first_refusal_is_logged_and_all_are_counted() -> None:
     asyncio.run(run())
 
 
-def test_stacks_and_connections_are_kept() -> None:
+def test_connections_are_kept() -> None:
     async def run() -> None:
         post = Post()
-        post.inbox.put_message("v02", wire.encode(wire.StackDump(b"1", "in main")))
-        post.inbox.put_token("v01", True)
-        post.inbox.put_token("v02", True)
-        post.inbox.put_token("v01", False)
+        for node, alive in (("v01", True), ("v02", True), ("v01", False)):
+            post.live.hear("token", node, alive)
         await post.settle()
-        assert post.inbox.stacks == {"v02": wire.StackDump(b"1", "in main", None)}
-        assert post.inbox.connected == {"v02"}
+        assert post.live.connected == {"v02"}
 
     asyncio.run(run())
 
@@ -141,10 +151,10 @@ def test_stacks_and_connections_are_kept() -> None:
 def test_once_closed_nothing_is_handled_any_more() -> None:
     async def run() -> None:
         post = Post()
-        post.inbox.put_message("v01", yield_of(0))
-        post.inbox.close()
-        post.inbox.put_message("v01", yield_of(1))
+        post.hear("v01", yield_of(0))
+        post.live.close()
+        post.hear("v02", yield_of(0))
         await post.settle()
-        assert post.came == []
+        assert await post.came() == []
 
     asyncio.run(run())

@@ -1,12 +1,9 @@
 """Joining: what a hello is answered."""
 
 import asyncio
-from typing import Any
 
 import pytest
 
-from emulator.drivers.live.inbox import Refusals
-from emulator.drivers.live.joining import Joining
 from tests.emulator.drivers.live.fakes import Stage, hello
 from vnet.transport import wire
 
@@ -15,26 +12,14 @@ from vnet.transport import wire
 def test_an_agent_of_another_version_is_refused_in_one_line(version: int) -> None:
     async def run() -> None:
         stage = Stage()
-        parts: dict[str, Any] = {
-            "emulation": stage.emulation,
-            "members": stage.members,
-            "supervisor": stage.supervisor,
-            "launcher": stage.launcher,
-            "agents": stage.launcher,
-            "attachment": stage.attachment,
-            "options": stage.options,
-            "refusals": Refusals("run", stage.emulation.folder, lambda: 0),
-            "changes": stage.changes,
-        }
-        joining = Joining(**parts)
-        joining.take_hello("v01", hello("v01", version=version))
+        stage.live.take("message", "v01", wire.encode(hello("v01", version=version)))
         reason = (
             f"the agent speaks version {version} of the messages, this emulator version {wire.VERSION}: "
             "use the same version of vnet"
         )
         assert stage.attachment.sent == [("v01", wire.End(b"1", reason, refused=True))]
         assert [(e.kind, e.details["reason"]) for e in stage.emulation.folder.events] == [("refused", reason)]
-        joining.take_hello("v01", hello("v01", ready=False))
+        stage.live.take("message", "v01", wire.encode(hello("v01", ready=False)))
         ((_, welcome),) = stage.attachment.sent[1:]
         assert isinstance(welcome, wire.Welcome) and welcome.version == wire.VERSION
 

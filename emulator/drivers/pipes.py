@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import gc
 import io
+import math
 import os
 import pickle
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Coroutine, Sequence
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -23,25 +25,19 @@ from typing import Any, NamedTuple, NoReturn, TextIO
 
 from msgspec.structs import replace
 
-from emulator.drivers.hosted_programs import Changes, HostedPrograms, RunOverError, Turn
+from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit
+from emulator.drivers.local import Call, Ended, HostedPrograms, LocalProcesses, RunOverError, Turn
+from emulator.drivers.processes import Heard
+from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.runtime import running_node
+from vnet.runtime.arrivals import Mail
 from vnet.runtime.die_with_parent import signal_at_parent_death
-from vnet.runtime.programs import Programs, error_line
+from vnet.runtime.programs import Programs, error_line, load_programs
 from vnet.runtime.running_node import LOOK_S, Patience, RunningNode
 from vnet.transport import wire
-from vnet.transport.backbone import MessageRef
-
-
-class Ended(NamedTuple):
-    """The last answer of a process, when the run is over: its figures are those of `HostedPrograms`."""
-
-    final: wire.Traffic
-    cpu_ns: Mapping[str, int]
-    wake_ups: Mapping[str, int]
-    order_steps: Mapping[str, int]
 
 
 class ProcessDiedError(VnetError):
@@ -59,28 +55,8 @@ class _Said(NamedTuple):
     printed: tuple[str, str]
 
 
-class _Told(NamedTuple):
-    """A turn as it is passed: a grant, which may have thousands of packets, is encoded sooner than pickled."""
-
-    changes: Sequence[Changes]
-    grant: bytes
-    messages: Sequence[MessageRef]
-    """Messages of the backbone, which an encoded grant only refers to."""
-
-    @classmethod
-    def of(cls, turn: Turn) -> _Told:
-        """Return the form of a turn."""
-        return cls(turn.changes, wire.encode(replace(turn.grant, messages=())), turn.grant.messages)
-
-    def turn(self) -> Turn:
-        """Return the turn."""
-        grant = wire.decode_rx(self.grant)
-        assert isinstance(grant, wire.Grant)
-        return Turn(self.changes, replace(grant, messages=self.messages))
-
-
 class ForkedPrograms:
-    """The process of these nodes, at its parent's side. Raises VnetError if there can be none.
+    """One process of these nodes, at its parent's side. Raises VnetError if there can be none.
 
     `others` are those that have been forked before. In the process `detach` lets go of what only its parent needs.
     What its programs print is in their logs alone unless this process `prints` it.
@@ -120,11 +96,16 @@ class ForkedPrograms:
             _be(its, welcomes, programs, folder, detach)
         its.close()
 
-    def give(self, turn: Turn | None) -> None:
-        """Give it a turn; None says that the run is over."""
+    def give(self, calls: Sequence[Call], grant: wire.Grant | None) -> None:
+        """Give it a window, with what is to be called before; without one the run is over.
+
+        A grant may have thousands of packets: it is encoded sooner than pickled. Encoded it only refers to messages
+        of the backbone.
+        """
         self.owes = True
+        told = None if grant is None else (calls, wire.encode(replace(grant, messages=())), grant.messages)
         with suppress(OSError):  # it has ended, which `take` tells, or the error that it has raised before
-            self._connection.send_bytes(pickle.dumps(None if turn is None else _Told.of(turn)))
+            self._connection.send_bytes(pickle.dumps(told))
 
     def take(self, stall_limit_s: float) -> Any:
         """Wait for its answer: a yield, or `Ended`. Raises ProcessDiedError, and what it has raised.
@@ -161,6 +142,102 @@ class ForkedPrograms:
             self._is_gone = True
             os.kill(self.pid, signal.SIGKILL)
             os.waitpid(self.pid, 0)
+
+
+class Pipes(LocalProcesses):
+    """The nodes in parts in processes forked from this one, which work side by side.
+
+    What their programs print is in their logs alone unless this process `prints` it.
+    """
+
+    def __init__(
+        self, emulation: Emulation, groups: Sequence[Sequence[str]], stop: threading.Event, prints: bool
+    ) -> None:
+        super().__init__(emulation, groups, stop)
+        self._prints = prints
+        self._welcomes = {nodes[0]: self.welcomes(nodes) for nodes in groups}
+        self._programs = load_programs(each for welcomes in self._welcomes.values() for each in welcomes)
+        self._processes: dict[str, ForkedPrograms] = {}
+        self._granted: list[str] = []
+        """Processes that have been granted a window and not been heard since."""
+        self._heard: deque[Heard] = deque()
+        self._died: dict[str, dict[str, Any]] = {}
+        self._limit_s = emulation.scenario.run.stall_timeout_s
+
+    def send(self, process_id: str, message: wire.Grant | wire.Batch, mail: Mail | None = None) -> None:
+        """Give a process its next window."""
+        assert isinstance(message, wire.Grant) and mail is not None
+        self._processes[process_id].give(self._take_calls(process_id), mail.within(message))
+        self._granted.append(process_id)
+        self._now_ns = message.time_ns
+
+    async def receive(self, timeout_s: float = math.inf) -> Heard | None:
+        """Wait for the yields of all processes. Raises KeyboardInterrupt if the run is to end."""
+        if self._granted:
+            granted, self._granted = self._granted, []
+            try:
+                answers = {process_id: self._take(process_id) for process_id in granted}
+            except StalledError as stalled:
+                self.is_cut_short = True
+                error = f"no yield within {self._limit_s:g} s of wall clock"
+                self._emulation.folder.event(self._now_ns, EventKind.stalled, str(stalled), error=error)
+                raise KeyboardInterrupt from None
+            self._heard = deque(Heard(process_id, each) for process_id, each in answers.items() if each is not None)
+            if self.is_ending:
+                raise KeyboardInterrupt
+        return self._heard.popleft() if self._heard else None
+
+    def _take(self, process_id: str) -> Any:
+        """Return the answer of a process; None if it has ended before its time."""
+        try:
+            return self._processes[process_id].take(self._limit_s)
+        except ProcessDiedError as death:
+            self._died[process_id] = {"how": str(death)}
+            return None
+
+    def ended(self, among: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
+        """Return the processes that have ended before their time, with how, and have not been returned yet."""
+        died, self._died = self._died, {}
+        return died
+
+    def run(self, course: Coroutine[Any, Any, None]) -> None:
+        """Fork the processes, and run the loop of the pacing, which waits for them. Raises KeyboardInterrupt."""
+        processes = self._processes
+        try:
+            for process_id, welcomes in self._welcomes.items():
+                processes[process_id] = ForkedPrograms(
+                    welcomes,
+                    self._programs,
+                    self._emulation.folder,
+                    others=list(processes.values()),
+                    detach=self._emulation.driving.detach,
+                    prints=self._prints,
+                )
+                self.pids[process_id] = processes[process_id].pid
+            with suppress(StopIteration):
+                course.send(None)
+        except KeyboardInterrupt:
+            self._end()
+            raise
+        else:
+            self._end()
+        finally:
+            course.close()
+            for process in processes.values():
+                process.close()
+
+    def _end(self) -> None:
+        """End all processes but those that are in the midst of a window, and take what they have left to say."""
+        asked = [process_id for process_id, process in self._processes.items() if not process.owes]
+        for process_id in asked:
+            self._processes[process_id].give((), None)
+        for process_id in asked:
+            try:
+                self.endings.append(self._processes[process_id].take(self._limit_s))
+            except ProcessDiedError as death:
+                self._died[process_id] = {"how": str(death)}
+            except StalledError as stalled:
+                self._died[process_id] = {"how": f"did not end within {self._limit_s:g} s, while {stalled} ran"}
 
 
 def _write(stream: TextIO, text: str) -> None:
@@ -204,16 +281,19 @@ def _run(connection: Connection, welcomes: Sequence[wire.Welcome], programs: Pro
     def swap(message: wire.Yield | None) -> Turn:
         if message is not None:
             say(message)
-        told: _Told | None = pickle.loads(connection.recv_bytes())
+        told: Any = pickle.loads(connection.recv_bytes())
         if told is None:
             raise RunOverError
-        return told.turn()
+        calls, encoded, messages = told
+        grant = wire.decode_rx(encoded)
+        assert isinstance(grant, wire.Grant)
+        return calls, replace(grant, messages=messages), None
 
     try:
         hosted = HostedPrograms(welcomes, programs, folder, swap)
         hosted.run()
         _flush_files()
-        say(Ended(hosted.final, hosted.meter.cpu_ns, hosted.meter.wake_ups, hosted.order_steps))
+        say(hosted.ended)
     except BaseException as error:
         _flush_files()
         say(error if isinstance(error, VnetError) else RuntimeError(error_line(error)))
