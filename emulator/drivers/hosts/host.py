@@ -22,6 +22,7 @@ from typing import Any
 
 import zenoh
 
+from emulator.drivers.agent_keys import AgentKeys, Hear
 from emulator.drivers.hosts import messages
 from emulator.drivers.hosts.messages import Call, Calls, HostHello, HostWelcome, encode
 from emulator.drivers.launch import Launcher
@@ -105,45 +106,21 @@ silence of a host is judged by the emulator, which knows what it waits for."""
 
 
 class Down:
-    """The connection of a host to its agents. The callbacks run on Zenoh's threads, with a node's id."""
+    """The router of a host's agents. What they say is heard on Zenoh's threads."""
 
-    def __init__(
-        self,
-        access: Access,
-        realtime: bool,
-        on_tx: Callable[[str, bytes], None],
-        on_alive: Callable[[str, bool], None],
-        on_backbone: Callable[[str, bytes], None],
-    ) -> None:
+    def __init__(self, access: Access, realtime: bool, hear: Hear) -> None:
         self.access = access
-        self._on_tx = on_tx
-        self._on_alive = on_alive
-        self._on_backbone = on_backbone
-        # As at the emulator's router: in real time one frozen agent must not stall all others.
-        self._control = zenoh.CongestionControl.DROP if realtime else zenoh.CongestionControl.BLOCK
-        self._rx: dict[str, zenoh.Publisher] = {}
-        self._unit_rx: dict[str, zenoh.Publisher] = {}
+        self._realtime = realtime
+        self._hear = hear
         self._emulator_token: zenoh.LivelinessToken | None = None
 
     def open(self, stack: ExitStack) -> None:
         """Listen until `stack` is closed. Raises TransportError."""
-        session = self._session = stack.enter_context(open_router(LISTEN, self.access, LEASE_MS))
+        access, session = self.access, stack.enter_context(open_router(LISTEN, self.access, LEASE_MS))
+        self._session = session
         self.endpoint = router_endpoint(session)
-        run = self.access.run
-        for node in (node for nodes in self.access.processes for node in nodes):
-            self._rx[node] = stack.enter_context(
-                session.declare_publisher(keys.node_rx(run, node), congestion_control=self._control, express=True)
-            )
-        for unit in self.access.units:
-            rx = keys.backbone_rx(run, unit)
-            self._unit_rx[unit] = stack.enter_context(
-                session.declare_publisher(rx, congestion_control=self._control, express=True)
-            )
-        if self.access.units:  # before `tx` of nodes, as at the emulator's router
-            stack.enter_context(session.declare_subscriber(keys.backbone_tx(run, "*"), self._take_backbone))
-        stack.enter_context(session.declare_subscriber(keys.node_tx(run, "*"), self._take_tx))
-        alive = keys.node_alive(run, "*")
-        stack.enter_context(session.liveliness().declare_subscriber(alive, self._take_alive, history=True))
+        nodes = [node for nodes in access.processes for node in nodes]
+        self.agents = AgentKeys(session, access.run, nodes, access.units, self._realtime, self._hear, stack)
         self.show_emulator(True)
         stack.callback(self.show_emulator, False)
 
@@ -155,25 +132,6 @@ class Down:
         elif not there and self._emulator_token is not None:
             self._emulator_token.undeclare()  # type: ignore[no-untyped-call]
             self._emulator_token = None
-
-    def put(self, node: str, payload: bytes) -> None:
-        """Pass a message on to a node; one for a node that is not on this host is dropped."""
-        if node in self._rx:
-            self._rx[node].put(payload)
-
-    def put_unit(self, unit: str, payload: bytes) -> None:
-        """Pass a message of the backbone on to a unit; one for a unit that is not on this host is dropped."""
-        if unit in self._unit_rx:
-            self._unit_rx[unit].put(payload)
-
-    def _take_backbone(self, sample: zenoh.Sample) -> None:
-        self._on_backbone(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _take_tx(self, sample: zenoh.Sample) -> None:
-        self._on_tx(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _take_alive(self, sample: zenoh.Sample) -> None:
-        self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
 
 class Up:
@@ -268,9 +226,7 @@ def run_host(
         down = Down(
             Access.create(run, welcome.processes, units=welcome.units),
             welcome.realtime,
-            lambda node, payload: events.put(("tx", node, payload)),
-            lambda node, alive: events.put(("alive", node, alive)),
-            lambda unit, payload: events.put(("backbone", unit, payload)),
+            lambda *event: events.put(event),
         )
         stack.enter_context(signals_handled(lambda *_: events.put(("children", "", None)), signal.SIGCHLD))
         try:
@@ -389,11 +345,11 @@ class HostProcess:
         match kind:
             case "rx":
                 self._take_orders(value)
-            case "tx":
+            case "message":
                 self._relay.take(node, value)
             case "backbone":
                 self._relay.take_unit(node, value)
-            case "alive":
+            case "token":
                 self._relay.add(("token", node, value))
             case "emulator":
                 self._down.show_emulator(value)
@@ -421,10 +377,10 @@ class HostProcess:
             self._relay.hurry()
         elif node in self._launcher.pids:
             self._relay.granted(node)
-        self._down.put(node, payload)
+        self._down.agents.put(node, payload)
 
     def _to_unit(self, unit: str, payload: bytes) -> None:
-        self._down.put_unit(unit, payload)
+        self._down.agents.put_unit(unit, payload)
 
     def _start(self, process_ids: Sequence[str], serials: Sequence[int], nice: int) -> None:
         groups = [self._nodes_of[process_id] for process_id in process_ids]

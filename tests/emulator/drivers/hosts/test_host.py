@@ -68,6 +68,10 @@ class Sides:
         else:
             self.down.append(arguments)
 
+    @property
+    def agents(self) -> "Sides":
+        return self
+
     def show_emulator(self, there: bool) -> None:
         self.emulator.append(there)
 
@@ -120,7 +124,7 @@ def grant(*process_ids: str) -> Event:
 
 
 def test_a_barrier_is_a_message_down_for_each_process_and_one_up(play: Play) -> None:
-    bundles = play.work(grant("v01", "v03"), ("tx", "v03", YIELD), ("tx", "v01", YIELD))
+    bundles = play.work(grant("v01", "v03"), ("message", "v03", YIELD), ("message", "v01", YIELD))
     assert play.sides.down == [("v01", b"grant"), ("v03", b"grant")]
     assert bundles == [[("message", "v03", YIELD), ("message", "v01", YIELD)]]
     assert (play.host.grants, play.host.barriers) == (2, 1)
@@ -130,7 +134,7 @@ def test_last_messages_tokens_and_ends_go_at_once(play: Play) -> None:
     def end() -> None:
         play.launcher.ends = {"v03": Exit(-9, "its last line")}
 
-    steps = [grant("v01", "v03"), ("tx", "v01", YIELD), ("alive", "v03", False), end, ("children", "", None)]
+    steps = [grant("v01", "v03"), ("message", "v01", YIELD), ("token", "v03", False), end, ("children", "", None)]
     assert play.work(*steps) == [  # type: ignore[arg-type]
         [("message", "v01", YIELD), ("token", "v03", False)],
         [("ended", "v03", 2, -9, "its last line", None)],
@@ -138,7 +142,7 @@ def test_last_messages_tokens_and_ends_go_at_once(play: Play) -> None:
 
 
 def test_a_process_that_is_not_there_is_not_waited_for(play: Play) -> None:
-    bundles = play.work(orders(("kill", "v03")), grant("v01", "v03"), ("tx", "v01", YIELD))
+    bundles = play.work(orders(("kill", "v03")), grant("v01", "v03"), ("message", "v01", YIELD))
     assert bundles == [[("message", "v01", YIELD)]]
     assert ("kill", "v03") in play.launcher.done
 
@@ -148,7 +152,7 @@ def test_whoever_is_asked_for_stacks_does_not_keep_the_yields_of_others(
 ) -> None:
     monkeypatch.setattr(host_module, "STACKS_WRITTEN_S", 0.0)
     ask = orders(("to_node", "v03", b"stacks", False), ("signal", "v03", signal.SIGUSR1))
-    bundles = play.work(grant("v01", "v03"), ("tx", "v01", YIELD), ask)
+    bundles = play.work(grant("v01", "v03"), ("message", "v01", YIELD), ask)
     assert [item for bundle in bundles for item in bundle] == [
         ("message", "v01", YIELD),
         ("log_tail", "v03", "the log of v03"),
@@ -178,7 +182,7 @@ def test_at_the_end_everything_is_handed_in(play: Play) -> None:
     (play.folder.logs / "v01.log").write_text("hello\n")
     (play.folder.disks / "v02").mkdir(parents=True)
     (play.folder.disks / "v02" / "data").write_bytes(b"left")
-    bundles = play.work(("tx", "v01", FINAL), orders(("hand_in", 2.0)))
+    bundles = play.work(("message", "v01", FINAL), orders(("hand_in", 2.0)))
     assert ("stop", "2.0") in play.launcher.done
     items = [item for bundle in bundles for item in bundle]
     assert items[:4] == [
