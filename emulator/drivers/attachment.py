@@ -6,13 +6,13 @@ is kept elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
 import zenoh
 
+from emulator.drivers.agent_keys import AgentKeys, Hear, hear_payloads, hear_tokens
 from emulator.drivers.router import SeparateRouter
 from emulator.viewer.sinks import Sinks
 from vnet.runtime.debug_target import DebugTarget
@@ -50,7 +50,7 @@ class Attachment:
         node_ids: tuple[str, ...],
         lease_ms: int,
         drops: bool,
-        hear: Callable[[str, str, Any], None],
+        hear: Hear,
     ) -> None:
         self._connect = options.connect if options.router is None else options.router.endpoint
         self.endpoint = self._connect or options.listen
@@ -61,8 +61,6 @@ class Attachment:
         self._drops = drops
         self._hear = hear
         self._stack = ExitStack()
-        self._rx: dict[str, zenoh.Publisher] = {}
-        self._unit_rx: dict[str, zenoh.Publisher] = {}
         self._host_rx: dict[str, zenoh.Publisher] = {}
         self._observers: dict[str, zenoh.Publisher] = {}
 
@@ -77,18 +75,18 @@ class Attachment:
         else:
             login = options.access.credentials(EMULATOR)
             session = stack.enter_context(open_client(self._connect, login, self._lease_ms))
-        # In lockstep one message is outstanding per agent, so BLOCK is safe; in real time one frozen agent must
-        # not stall all others.
-        control = zenoh.CongestionControl.DROP if self._drops else zenoh.CongestionControl.BLOCK
-        self._rx = {
-            node: stack.enter_context(
-                session.declare_publisher(keys.node_rx(self._run, node), congestion_control=control, express=True)
+        run, hosts = self._run, options.access.hosts
+        self._host_rx = {
+            host: stack.enter_context(
+                session.declare_publisher(
+                    keys.host_rx(run, host), congestion_control=zenoh.CongestionControl.BLOCK, express=True
+                )
             )
-            for node in self._node_ids
-            if not options.access.hosts
+            for host in hosts
         }
-        self._open_units(session, control)
-        self._open_hosts(session)
+        if hosts:  # one that cannot be reached is closed after a while
+            hear_payloads(session, keys.host_tx(run, "*"), "host_message", self._hear, stack)
+            hear_tokens(session, keys.host_alive(run, "*"), "host_token", self._hear, stack)
         self._observers = {
             stream: stack.enter_context(
                 session.declare_publisher(
@@ -97,60 +95,14 @@ class Attachment:
             )
             for stream in ("scene", "period", "end")
         }
-        liveliness = session.liveliness()
-        stack.enter_context(session.declare_subscriber(keys.node_tx(self._run, "*"), self._payload_to("message")))
-        alive = keys.node_alive(self._run, "*")
-        stack.enter_context(liveliness.declare_subscriber(alive, self._state_to("token"), history=True))
-        stack.enter_context(session.declare_queryable(keys.control(self._run, "*"), self._take_query))
-        stack.enter_context(liveliness.declare_token(keys.emulator_alive(self._run)))
-
-    def _open_units(self, session: zenoh.Session, control: zenoh.CongestionControl) -> None:
-        """Declare the keys of the backbone, if there is one; those of units on hosts are their hosts' to declare.
-
-        It comes before `tx` of nodes: who has been heard there can put a message here.
-        """
-        units = () if self._options.access.hosts else self._options.access.units
-        self._unit_rx = {
-            unit: self._stack.enter_context(
-                session.declare_publisher(
-                    keys.backbone_rx(self._run, unit), congestion_control=control, express=True
-                )
-            )
-            for unit in units
-        }
-        if units:
-            tx = keys.backbone_tx(self._run, "*")
-            self._stack.enter_context(session.declare_subscriber(tx, self._payload_to("backbone")))
-
-    def _open_hosts(self, session: zenoh.Session) -> None:
-        """Declare the keys of hosts, if there are any. A host that cannot be reached is closed after a while."""
-        hosts, stack = self._options.access.hosts, self._stack
-        self._host_rx = {
-            host: stack.enter_context(
-                session.declare_publisher(
-                    keys.host_rx(self._run, host), congestion_control=zenoh.CongestionControl.BLOCK, express=True
-                )
-            )
-            for host in hosts
-        }
-        if hosts:
-            stack.enter_context(
-                session.declare_subscriber(keys.host_tx(self._run, "*"), self._payload_to("host_message"))
-            )
-            alive = keys.host_alive(self._run, "*")
-            liveliness = session.liveliness()
-            stack.enter_context(liveliness.declare_subscriber(alive, self._state_to("host_token"), history=True))
+        nodes, units = ((), ()) if hosts else (self._node_ids, options.access.units)  # those on hosts are their own
+        self._agents = AgentKeys(session, run, nodes, units, self._drops, self._hear, stack)
+        stack.enter_context(session.declare_queryable(keys.control(run, "*"), self._take_query))
+        stack.enter_context(session.liveliness().declare_token(keys.emulator_alive(run)))
 
     def close(self) -> None:
         """Close everything."""
         self._stack.close()
-
-    def _payload_to(self, what: str) -> Callable[[zenoh.Sample], None]:
-        return lambda sample: self._hear(what, keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _state_to(self, what: str) -> Callable[[zenoh.Sample], None]:
-        put = zenoh.SampleKind.PUT
-        return lambda sample: self._hear(what, keys.node_of(str(sample.key_expr)), sample.kind == put)
 
     def _take_query(self, query: zenoh.Query) -> None:
         self._hear("query", keys.verb_of(str(query.key_expr)), query)
@@ -161,11 +113,11 @@ class Attachment:
 
     def send(self, node: str, message: wire.EmulatorMessage) -> None:
         """Say something to a node."""
-        self._rx[node].put(wire.encode(message))
+        self._agents.put(node, wire.encode(message))
 
     def send_content(self, unit: str, payload: bytes) -> None:
         """Put an encoded message on a unit's key of the backbone."""
-        self._unit_rx[unit].put(payload)
+        self._agents.put_unit(unit, payload)
 
     def send_host(self, host: str, payload: bytes) -> None:
         """Put an encoded message on the `rx` of a host."""

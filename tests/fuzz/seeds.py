@@ -59,18 +59,18 @@ TX: tuple[wire.AgentMessage, ...] = (
 UNIT_SENT = Sent(b"nonce", 3, "rsu02", b"payload")
 HOST_TX: tuple[messages.FromHost, ...] = (
     messages.HostHello("a", b"n" * 16, 1, "there", "digest", True, None),
-    messages.News(
+    messages.Calls(
         b"n" * 16,
         [
-            messages.FromNode("v01", wire.encode(TX[2])),
-            messages.Token("v01", True),
-            messages.Ended("v01", 1, -9, "a line"),
-            messages.LogTail("v01", "a line"),
-            messages.Part("file", "v01", "a/b", b"data"),
-            messages.LeftOut("file", "v01", 1, ["a: a link"]),
-            messages.Figures({"v01": 5}, [("v01", [0.0, 0.5], [1, 2])]),
-            messages.HandingIn(),
-            messages.HandedIn(),
+            ("message", "v01", wire.encode(TX[2])),
+            ("token", "v01", True),
+            ("ended", "v01", 1, -9, "a line", None),
+            ("log_tail", "v01", "a line"),
+            ("part", "file", "v01", "a/b", b"data"),
+            ("left_out", "file", "v01", 1, ["a: a link"]),
+            ("figures", {"v01": 5}, [("v01", [0.0, 0.5], [1, 2])]),
+            ("handing_in",),
+            ("handed_in",),
         ],
     ),
 )

@@ -22,8 +22,9 @@ from typing import Any
 
 import zenoh
 
+from emulator.drivers.agent_keys import AgentKeys, Hear
 from emulator.drivers.hosts import messages
-from emulator.drivers.hosts.messages import FromNode, FromUnit, HostHello, HostWelcome, Item, News, Order, encode
+from emulator.drivers.hosts.messages import Call, Calls, HostHello, HostWelcome, encode
 from emulator.drivers.launch import Launcher
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
@@ -47,7 +48,7 @@ class Relay:
     """Items for the emulator in the order in which they came, and the processes that owe a yield."""
 
     def __init__(self) -> None:
-        self._items: list[Item] = []
+        self._items: list[Call] = []
         self._size_bytes = 0
         self._is_urgent = False
         self._awaited: set[str] = set()
@@ -66,7 +67,7 @@ class Relay:
 
     def take(self, node: str, payload: bytes) -> None:
         """Take a message of an agent, which is on the `tx` of `node`; yields are on that of their process."""
-        self._items.append(FromNode(node, payload))
+        self._items.append(("message", node, payload))
         self._size_bytes += len(payload)
         if wire.is_yield(payload):
             self._awaited.discard(node)
@@ -75,10 +76,10 @@ class Relay:
 
     def take_unit(self, unit: str, payload: bytes) -> None:
         """Take a message of a unit on its key of the backbone: it waits for the yield that refers to it."""
-        self._items.append(FromUnit(unit, payload))
+        self._items.append(("backbone", unit, payload))
         self._size_bytes += len(payload)
 
-    def add(self, item: Item) -> None:
+    def add(self, item: Call) -> None:
         """Take news of the host itself, which goes at once."""
         self._items.append(item)
         self._is_urgent = True
@@ -88,7 +89,7 @@ class Relay:
         """The processes that owe a yield."""
         return self._awaited
 
-    def take_bundle(self) -> list[Item]:
+    def take_bundle(self) -> list[Call]:
         """Return what is to go now: nothing while all that there is are yields, and one is owed."""
         is_due = self._is_urgent or not self._awaited or self._size_bytes >= FULL_BYTES
         if not is_due:
@@ -105,45 +106,21 @@ silence of a host is judged by the emulator, which knows what it waits for."""
 
 
 class Down:
-    """The connection of a host to its agents. The callbacks run on Zenoh's threads, with a node's id."""
+    """The router of a host's agents. What they say is heard on Zenoh's threads."""
 
-    def __init__(
-        self,
-        access: Access,
-        realtime: bool,
-        on_tx: Callable[[str, bytes], None],
-        on_alive: Callable[[str, bool], None],
-        on_backbone: Callable[[str, bytes], None],
-    ) -> None:
+    def __init__(self, access: Access, realtime: bool, hear: Hear) -> None:
         self.access = access
-        self._on_tx = on_tx
-        self._on_alive = on_alive
-        self._on_backbone = on_backbone
-        # As at the emulator's router: in real time one frozen agent must not stall all others.
-        self._control = zenoh.CongestionControl.DROP if realtime else zenoh.CongestionControl.BLOCK
-        self._rx: dict[str, zenoh.Publisher] = {}
-        self._unit_rx: dict[str, zenoh.Publisher] = {}
+        self._realtime = realtime
+        self._hear = hear
         self._emulator_token: zenoh.LivelinessToken | None = None
 
     def open(self, stack: ExitStack) -> None:
         """Listen until `stack` is closed. Raises TransportError."""
-        session = self._session = stack.enter_context(open_router(LISTEN, self.access, LEASE_MS))
+        access, session = self.access, stack.enter_context(open_router(LISTEN, self.access, LEASE_MS))
+        self._session = session
         self.endpoint = router_endpoint(session)
-        run = self.access.run
-        for node in (node for nodes in self.access.processes for node in nodes):
-            self._rx[node] = stack.enter_context(
-                session.declare_publisher(keys.node_rx(run, node), congestion_control=self._control, express=True)
-            )
-        for unit in self.access.units:
-            rx = keys.backbone_rx(run, unit)
-            self._unit_rx[unit] = stack.enter_context(
-                session.declare_publisher(rx, congestion_control=self._control, express=True)
-            )
-        if self.access.units:  # before `tx` of nodes, as at the emulator's router
-            stack.enter_context(session.declare_subscriber(keys.backbone_tx(run, "*"), self._take_backbone))
-        stack.enter_context(session.declare_subscriber(keys.node_tx(run, "*"), self._take_tx))
-        alive = keys.node_alive(run, "*")
-        stack.enter_context(session.liveliness().declare_subscriber(alive, self._take_alive, history=True))
+        nodes = [node for nodes in access.processes for node in nodes]
+        self.agents = AgentKeys(session, access.run, nodes, access.units, self._realtime, self._hear, stack)
         self.show_emulator(True)
         stack.callback(self.show_emulator, False)
 
@@ -155,25 +132,6 @@ class Down:
         elif not there and self._emulator_token is not None:
             self._emulator_token.undeclare()  # type: ignore[no-untyped-call]
             self._emulator_token = None
-
-    def put(self, node: str, payload: bytes) -> None:
-        """Pass a message on to a node; one for a node that is not on this host is dropped."""
-        if node in self._rx:
-            self._rx[node].put(payload)
-
-    def put_unit(self, unit: str, payload: bytes) -> None:
-        """Pass a message of the backbone on to a unit; one for a unit that is not on this host is dropped."""
-        if unit in self._unit_rx:
-            self._unit_rx[unit].put(payload)
-
-    def _take_backbone(self, sample: zenoh.Sample) -> None:
-        self._on_backbone(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _take_tx(self, sample: zenoh.Sample) -> None:
-        self._on_tx(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _take_alive(self, sample: zenoh.Sample) -> None:
-        self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
 
 class Up:
@@ -212,9 +170,9 @@ class Up:
         """Put a hello."""
         self._tx.put(encode(hello))
 
-    def put(self, items: Sequence[Item]) -> None:
+    def put(self, items: Sequence[Call]) -> None:
         """Put a bundle."""
-        self._tx.put(encode(News(self.nonce, items)))
+        self._tx.put(encode(Calls(self.nonce, items)))
 
 
 HELLO_PERIOD_S = 0.5
@@ -268,9 +226,7 @@ def run_host(
         down = Down(
             Access.create(run, welcome.processes, units=welcome.units),
             welcome.realtime,
-            lambda node, payload: events.put(("tx", node, payload)),
-            lambda node, alive: events.put(("alive", node, alive)),
-            lambda unit, payload: events.put(("backbone", unit, payload)),
+            lambda *event: events.put(event),
         )
         stack.enter_context(signals_handled(lambda *_: events.put(("children", "", None)), signal.SIGCHLD))
         try:
@@ -369,18 +325,6 @@ class HostProcess:
         self._is_over = False
         self.grants = self.barriers = 0
         """Messages for which a process owed a yield, and bundles that held any."""
-        self._takes: dict[type, Callable[[Any], None]] = {
-            messages.ToNode: self._to_node,
-            messages.ToUnit: self._to_unit,
-            messages.Start: self._start,
-            messages.Kill: self._kill,
-            messages.Detach: self._detach,
-            messages.Signal: self._signal,
-            messages.Look: self._look,
-            messages.Patience: self._be_patient,
-            messages.HandIn: self._hand_in,
-            messages.Leave: self._leave,
-        }
 
     def work(self) -> None:
         """Take what comes until the emulator says that the run is over. Raises TransportError if it is gone."""
@@ -401,12 +345,12 @@ class HostProcess:
         match kind:
             case "rx":
                 self._take_orders(value)
-            case "tx":
+            case "message":
                 self._relay.take(node, value)
             case "backbone":
                 self._relay.take_unit(node, value)
-            case "alive":
-                self._relay.add(messages.Token(node, value))
+            case "token":
+                self._relay.add(("token", node, value))
             case "emulator":
                 self._down.show_emulator(value)
                 self._lost_at = None if value else time.monotonic()
@@ -419,102 +363,99 @@ class HostProcess:
         except WireError as error:
             print(f"vnet: host {self._name}: a message of the emulator is dropped: {error}", file=sys.stderr)
             return
-        if not isinstance(message, messages.Orders) or message.nonce != self._up.nonce:
+        if not isinstance(message, Calls) or message.nonce != self._up.nonce:
             return
-        grants = sum(isinstance(order, messages.ToNode) and order.awaited for order in message.orders)
+        grants = sum(call[0] == "to_node" and call[3] for call in message.calls)
         self.grants, self.barriers = self.grants + grants, self.barriers + bool(grants)
-        for order in message.orders:
-            self._carry_out(order)
+        for name, *arguments in message.calls:  # those of TO_HOST and no others
+            getattr(self, f"_{name}")(*arguments)
         if not self._relay.awaited:
             self._relay.hurry()
 
-    def _carry_out(self, order: Order) -> None:
-        self._takes[type(order)](order)
-
-    def _to_node(self, order: messages.ToNode) -> None:
-        if not order.awaited:
+    def _to_node(self, node: str, payload: bytes, awaited: bool) -> None:
+        if not awaited:
             self._relay.hurry()
-        elif order.node in self._launcher.pids:
-            self._relay.granted(order.node)
-        self._down.put(order.node, order.payload)
+        elif node in self._launcher.pids:
+            self._relay.granted(node)
+        self._down.agents.put(node, payload)
 
-    def _to_unit(self, order: messages.ToUnit) -> None:
-        self._down.put_unit(order.node, order.payload)
+    def _to_unit(self, unit: str, payload: bytes) -> None:
+        self._down.agents.put_unit(unit, payload)
 
-    def _start(self, order: messages.Start) -> None:
-        groups = [self._nodes_of[process_id] for process_id in order.process_ids]
-        for process_id, serial in zip(order.process_ids, order.serials, strict=True):
+    def _start(self, process_ids: Sequence[str], serials: Sequence[int], nice: int) -> None:
+        groups = [self._nodes_of[process_id] for process_id in process_ids]
+        for process_id, serial in zip(process_ids, serials, strict=True):
             self._serials[process_id] = serial
             if process_id in self._leaving:
                 self._leaving.pop(process_id).join()
         failure = ""
         try:
-            self._launcher.start_agents(self._down.endpoint, self._down.access, groups, order.nice)
+            self._launcher.start_agents(self._down.endpoint, self._down.access, groups, nice)
         except VnetError as error:
             failure = str(error)
         self._cpu.look(self._launcher.pids)
-        for process_id in order.process_ids:
+        for process_id in process_ids:
             if process_id not in self._launcher.pids:
-                self._relay.add(messages.Ended(process_id, self._serials[process_id], 1, failure))
+                self._relay.add(("ended", process_id, self._serials[process_id], 1, failure, None))
 
-    def _kill(self, order: messages.Kill) -> None:
+    def _kill(self, process_id: str) -> None:
         self._cpu.look(self._launcher.pids)
-        self._launcher.kill(order.process_id)
-        self._relay.ended(order.process_id)
+        self._launcher.kill(process_id)
+        self._relay.ended(process_id)
 
-    def _detach(self, order: messages.Detach) -> None:
+    def _detach(self, process_id: str, patience_s: float) -> None:
         self._cpu.look(self._launcher.pids)
-        wait = self._launcher.detach(order.process_id)
-        self._relay.ended(order.process_id)
-        thread = threading.Thread(target=wait, args=[order.patience_s], name=f"end of {order.process_id}")
+        wait = self._launcher.detach(process_id)
+        self._relay.ended(process_id)
+        thread = threading.Thread(target=wait, args=[patience_s], name=f"end of {process_id}")
         thread.start()
-        self._leaving[order.process_id] = thread
+        self._leaving[process_id] = thread
 
-    def _signal(self, order: messages.Signal) -> None:
-        number = signal.Signals(order.number)
+    def _signal(self, process_id: str, asked: int) -> None:
+        number = signal.Signals(asked)
         if number not in CHILD_SIGNALS:
             return
-        self._launcher.signal(order.process_id, number)
+        self._launcher.signal(process_id, number)
         if number is signal.SIGUSR1:  # its faulthandler writes to its log
             self._relay.hurry()
-            self._tails_due.append((time.monotonic() + STACKS_WRITTEN_S, order.process_id))
+            self._tails_due.append((time.monotonic() + STACKS_WRITTEN_S, process_id))
 
-    def _look(self, order: messages.Look) -> None:
+    def _look(self, time_ns: int, memory_limit_mb: float | None) -> None:
         self._cpu.look(self._launcher.pids)
-        self._memory.look(order.time_ns, self._launcher.pids)
-        if over := first_over(order.memory_limit_mb, self._launcher.pids):
-            self._relay.add(messages.MemoryExceeded(*over))
+        self._memory.look(time_ns, self._launcher.pids)
+        if over := first_over(memory_limit_mb, self._launcher.pids):
+            self._relay.add(("memory", *over))
             self._relay.hurry()
 
-    def _be_patient(self, order: messages.Patience) -> None:
-        self._patience_until = time.monotonic() + order.within_s
+    def _be_patient(self, within_s: float) -> None:
+        self._patience_until = time.monotonic() + within_s
 
-    def _hand_in(self, order: messages.HandIn) -> None:
+    def _hand_in(self, patience_s: float) -> None:
         """End all agents and put what they leave; each part is a bundle of its own."""
-        self._up.put([*self._relay.take_bundle(), messages.HandingIn()])
+        self._up.put([*self._relay.take_bundle(), ("handing_in",)])
         for thread in self._leaving.values():
             thread.join()
-        for process_id, how in self._launcher.stop(order.patience_s).items():
+        for process_id, how in self._launcher.stop(patience_s).items():
             serial = self._serials[process_id]
-            self._up.put([messages.Ended(process_id, serial, how.status, how.log_tail, how.overdue_s)])
+            self._up.put([("ended", process_id, serial, how.status, how.log_tail, how.overdue_s)])
         for item in self._left_behind():
             self._up.put([item])
 
-    def _left_behind(self) -> Iterator[Item]:
+    def _left_behind(self) -> Iterator[Call]:
         from emulator.drivers.hosts.retrieval import hand_in  # slow to import: agents should be started first
 
         yield from hand_in(self._folder, list(self._nodes_of.values()), self._welcome.files_max_mb)
-        yield messages.Figures(dict(self._cpu.cpu_ns), list(self._memory.series()))
-        yield messages.HandedIn()
+        yield "figures", dict(self._cpu.cpu_ns), list(self._memory.series())
+        yield ("handed_in",)
 
-    def _leave(self, order: messages.Leave) -> None:
+    def _leave(self) -> None:
         self._is_over = True
 
     def _children_ended(self) -> None:
         for process_id, how in self._launcher.ended().items():
             self._relay.ended(process_id)
             serial = self._serials[process_id]
-            self._relay.add(messages.Ended(process_id, serial, how.status, how.log_tail))
+            self._relay.add(("ended", process_id, serial, how.status, how.log_tail, None))
 
     # Time.
 
@@ -529,7 +470,7 @@ class HostProcess:
         now = time.monotonic()
         for due, process_id in [each for each in self._tails_due if each[0] <= now]:
             self._tails_due.remove((due, process_id))
-            self._relay.add(messages.LogTail(process_id, self._launcher.log_tail(process_id)))
+            self._relay.add(("log_tail", process_id, self._launcher.log_tail(process_id)))
 
     def _given_up_at(self, lost_at: float) -> float:
         """Return when to give up an emulator that is gone: once the agents, which wait as long, have ended."""

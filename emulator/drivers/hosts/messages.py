@@ -1,15 +1,17 @@
 """The messages between the emulator and a host, on the keys `host/NAME/rx` and `host/NAME/tx`.
 
-What the emulator and an agent say to each other passes as bytes that a host does not decode. Both ends are vnet's
+After the welcome each side calls methods of the other, many in one message. What the emulator and an agent say to
+each other passes as bytes that a host does not decode. Both ends are vnet's
 own, of one version: the hello names its digest. Decoding checks types; a violation is a `WireError`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from vnet.errors import WireError, printable
 from vnet.transport.wire import LARGEST_BUNDLE_BYTES, Message
@@ -58,183 +60,52 @@ class HostRefusal(Message, frozen=True):
     reason: str
 
 
-# Orders of the emulator.
+Call = tuple[Any, ...]
+"""A method of the other side, and its arguments."""
+
+Owned = Literal["log", "file"]
+"""Kind of what is left behind: a log of a process, or a file on a node's disk."""
+TO_HOST: dict[str, Any] = {
+    "to_node": tuple[str, str, bytes, bool],  # a message for a node; True if its process owes a yield for it
+    "to_unit": tuple[str, str, bytes],  # a message for a roadside unit, on its key of the backbone
+    "start": tuple[str, list[str], list[int], int],  # ids of processes, their serial numbers, their niceness
+    "kill": tuple[str, str],
+    "detach": tuple[str, str, float],  # a process has been told to go: the seconds after which it is killed
+    "signal": tuple[str, str, int],
+    "look": tuple[str, int, float | None],  # measure the processes at this emulated time; their limit in megabytes
+    "be_patient": tuple[str, float],  # the emulator, or its router, will be absent for at most so many seconds
+    "hand_in": tuple[str, float],  # wait so many seconds for the processes, end them, hand in what they leave
+    "leave": tuple[str],  # the run is over, and all has been handed in
+}
+"""Calls of the emulator at a host, with the types of the name and the arguments."""
+FROM_HOST: dict[str, Any] = {
+    "message": tuple[str, str, bytes],  # a message on the `tx` of a node
+    "backbone": tuple[str, str, bytes],  # a message on the `tx` of the backbone of a unit
+    "token": tuple[str, str, bool],  # the liveliness token of a node has appeared, or is gone
+    # A process has ended without an order, or could not be started: its id, serial number, status, end of its log,
+    # and for how many seconds it was waited for, if it was killed because it did not end.
+    "ended": tuple[str, str, int, int, str, float | None],
+    "log_tail": tuple[str, str, str],  # the end of the log of a process that was asked for its stacks
+    "part": tuple[str, Owned, str, str, bytes],  # whose, its path in the node's folder, its next bytes
+    "left_out": tuple[str, Owned, str, int, list[str]],  # whose, bytes of a log or files, the first with reasons
+    # CPU time of each process in ns; process, times in s and KiB of private memory of each series.
+    "figures": tuple[str, dict[str, int], list[tuple[str, list[float], list[int]]]],
+    "memory": tuple[str, str, float],  # a process holds more than the limit: its megabytes
+    "handing_in": tuple[str],  # the order to hand in has come: what follows may take its time
+    "handed_in": tuple[str],
+}
+"""Calls of a host at the emulator, with the types of the name and the arguments."""
 
 
-class ToNode(Message, frozen=True):
-    """A message on the `rx` of a node; `awaited` if its process owes a yield for it."""
-
-    node: str
-    payload: bytes
-    awaited: bool
-
-
-class ToUnit(Message, frozen=True):
-    """A message on the `rx` of the backbone of a unit."""
-
-    node: str
-    payload: bytes
-
-
-class Start(Message, frozen=True):
-    """Start these processes, whose ids and serial numbers these are, at a niceness."""
-
-    process_ids: Sequence[str]
-    serials: Sequence[int]
-    nice: int
-
-
-class Kill(Message, frozen=True):
-    """End a process at once."""
-
-    process_id: str
-
-
-class Detach(Message, frozen=True):
-    """A process has been told to go: kill it if it has not gone after so many seconds."""
-
-    process_id: str
-    patience_s: float
-
-
-class Signal(Message, frozen=True):
-    """Send a signal to a process."""
-
-    process_id: str
-    number: int
-
-
-class Look(Message, frozen=True):
-    """Measure CPU time and memory of the processes at this emulated time, and tell if one exceeds the limit."""
-
-    time_ns: int
-    memory_limit_mb: float | None = None
-
-
-class Patience(Message, frozen=True):
-    """The emulator, or its router, will be absent, for at most `within_s` seconds."""
-
-    within_s: float
-
-
-class HandIn(Message, frozen=True):
-    """The run is over: wait so many seconds for the processes, end them, and hand in what they leave."""
-
-    patience_s: float
-
-
-class Leave(Message, frozen=True):
-    """The run is over, and all has been handed in."""
-
-
-Order = ToNode | ToUnit | Start | Kill | Detach | Signal | Look | Patience | HandIn | Leave
-
-
-class Orders(Message, frozen=True):
-    """Orders to a host, in the order in which they are to be carried out."""
+class Calls(Message, frozen=True):
+    """Calls of the other side's methods, in the order in which they are to be carried out."""
 
     nonce: bytes
-    orders: Sequence[Order]
+    calls: Sequence[Call]
 
 
-# News of a host.
-
-
-class FromNode(Message, frozen=True):
-    """A message that came on the `tx` of a node."""
-
-    node: str
-    payload: bytes
-
-
-class FromUnit(Message, frozen=True):
-    """A message that came on the `tx` of the backbone of a unit."""
-
-    node: str
-    payload: bytes
-
-
-class Token(Message, frozen=True):
-    """The liveliness token of a node has appeared, or is gone."""
-
-    node: str
-    alive: bool
-
-
-class Ended(Message, frozen=True):
-    """A process has ended without an order, or could not be started: serial number, status and end of its log.
-
-    `overdue_s` is for how many seconds it was waited for, if it was killed because it did not end.
-    """
-
-    process_id: str
-    serial: int
-    status: int
-    log_tail: str
-    overdue_s: float | None = None
-
-
-class LogTail(Message, frozen=True):
-    """The end of the log of a process that was asked for its stacks."""
-
-    process_id: str
-    text: str
-
-
-class Part(Message, frozen=True):
-    """The next bytes of a process's log, or of a file on a node's disk: `path` is relative to the node's folder."""
-
-    kind: Literal["log", "file"]
-    owner: str
-    path: str
-    data: bytes
-
-
-class LeftOut(Message, frozen=True):
-    """Bytes of a log, or files of a disk, that were not handed in; the first files are named with their reasons."""
-
-    kind: Literal["log", "file"]
-    owner: str
-    count: int
-    which: Sequence[str] = ()
-
-
-class Figures(Message, frozen=True):
-    """CPU time of each process in ns, and private memory: process id, times in s and KiB of each series."""
-
-    cpu_ns: dict[str, int]
-    memory: Sequence[tuple[str, Sequence[float], Sequence[int]]]
-
-
-class MemoryExceeded(Message, frozen=True):
-    """A process holds more private memory than the limit."""
-
-    process_id: str
-    memory_mb: float
-
-
-class HandingIn(Message, frozen=True):
-    """The order to hand in has come: what follows may take its time."""
-
-
-class HandedIn(Message, frozen=True):
-    """All has been handed in."""
-
-
-Item = (
-    FromNode | FromUnit | Token | Ended | LogTail | Part | LeftOut | Figures | MemoryExceeded | HandingIn | HandedIn
-)
-
-
-class News(Message, frozen=True):
-    """News of a host's agents, in the order in which it came."""
-
-    nonce: bytes
-    items: Sequence[Item]
-
-
-ToHost = HostWelcome | HostRefusal | Orders
-FromHost = HostHello | News
+ToHost = HostWelcome | HostRefusal | Calls
+FromHost = HostHello | Calls
 
 _encoder = msgspec.msgpack.Encoder()
 _to_host: msgspec.msgpack.Decoder[ToHost] = msgspec.msgpack.Decoder(ToHost)
@@ -249,18 +120,30 @@ def encode(message: ToHost | FromHost) -> bytes:
 
 def decode_to_host(data: bytes) -> ToHost:
     """Decode a message of the emulator. Raise WireError for a bad one."""
-    return _decode(_to_host, data)
+    return _decode(_to_host, data, TO_HOST)
 
 
 def decode_from_host(data: bytes) -> FromHost:
     """Decode a message of a host. Raise WireError for a bad one, or one above `LARGEST_BUNDLE_BYTES`."""
     if len(data) > LARGEST_BUNDLE_BYTES:
         raise WireError(f"message of {len(data)} bytes: at most {LARGEST_BUNDLE_BYTES} allowed")
-    return _decode(_from_host, data)
+    return _decode(_from_host, data, FROM_HOST)
 
 
-def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
+def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes, allowed: Mapping[str, Any]) -> _M:
     try:
-        return decoder.decode(data)
+        message = decoder.decode(data)
+        if isinstance(message, Calls):
+            message = replace(message, calls=[_checked(call, allowed) for call in message.calls])
+        return message
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise WireError(f"{len(data)} bytes are not a message: {printable(str(error), 200)}") from None
+
+
+def _checked(call: Call, allowed: Mapping[str, Any]) -> Call:
+    """Return a call whose name and types of arguments are allowed. Raise msgspec.ValidationError for another."""
+    name = call[0] if call else None
+    if not isinstance(name, str) or name not in allowed:
+        raise msgspec.ValidationError(f"there is no call {name!r}")
+    checked: Call = msgspec.convert(call, allowed[name])
+    return checked

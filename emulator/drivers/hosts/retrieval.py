@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
-from emulator.drivers.hosts.messages import PART_BYTES, Item, LeftOut, Part
+from emulator.drivers.hosts.messages import PART_BYTES, Call
 from emulator.drivers.processes import ProtocolError
 from emulator.records.events import EventKind
 from emulator.records.node_files import DEEPEST, MOST_FILES, collect
@@ -22,7 +22,7 @@ MOST_LOG_BYTES = 16 * 2**20
 """Bytes of the end of a process's log that are handed in."""
 
 
-def hand_in(path: Path, processes: Sequence[Sequence[str]], files_max_mb: float) -> Iterator[Item]:
+def hand_in(path: Path, processes: Sequence[Sequence[str]], files_max_mb: float) -> Iterator[Call]:
     """Yield the logs of processes and the files of their nodes, which are in the host's folder at `path`.
 
     The folder is laid out as that of a run; its disks are gone afterwards.
@@ -36,20 +36,20 @@ def hand_in(path: Path, processes: Sequence[Sequence[str]], files_max_mb: float)
         root = folder.path / FILES / node
         for file in sorted(path for path in root.rglob("*") if path.is_file()):
             for data in _parts(file, 0):
-                yield Part("file", node, str(file.relative_to(root)), data)
+                yield "part", "file", node, str(file.relative_to(root)), data
         if node in left_out:
-            yield LeftOut("file", node, left_out[node].count, left_out[node].which)
+            yield "left_out", "file", node, left_out[node].count, list(left_out[node].which)
 
 
-def _log(folder: RunFolder, process_id: str) -> Iterator[Item]:
+def _log(folder: RunFolder, process_id: str) -> Iterator[Call]:
     log = folder.logs / f"{process_id}.log"
     if not log.exists():
         return
     start = max(log.stat().st_size - MOST_LOG_BYTES, 0)
     if start:
-        yield LeftOut("log", process_id, start)
+        yield "left_out", "log", process_id, start, []
     for data in _parts(log, start):
-        yield Part("log", process_id, "", data)
+        yield "part", "log", process_id, "", data
 
 
 def _parts(file: Path, start: int) -> Iterator[bytes]:
@@ -72,41 +72,41 @@ class Retrieval:
         self._taken_bytes: Counter[tuple[str, str]] = Counter()
         self._files: set[tuple[str, str]] = set()
 
-    def take(self, part: Part) -> None:
+    def take(self, kind: str, owner: str, path: str, data: bytes) -> None:
         """Write the next bytes of a log or a file. Raises ProtocolError for what does not belong there."""
-        path = self._path(part)
-        self._taken_bytes[part.kind, part.owner] += len(part.data)
-        if self._taken_bytes[part.kind, part.owner] > self._most_bytes[part.kind]:
-            raise ProtocolError(f"more bytes of {part.owner} than are kept")
+        place = self._path(kind, owner, path)
+        self._taken_bytes[kind, owner] += len(data)
+        if self._taken_bytes[kind, owner] > self._most_bytes[kind]:
+            raise ProtocolError(f"more bytes of {owner} than are kept")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("ab") as file:
-                file.write(part.data)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            with place.open("ab") as file:
+                file.write(data)
         except OSError as error:
-            raise ProtocolError(f"{part.kind} of {part.owner}: {error.strerror}") from None
+            raise ProtocolError(f"{kind} of {owner}: {error.strerror}") from None
 
-    def tell_left_out(self, time_ns: int, left_out: LeftOut) -> None:
+    def tell_left_out(self, time_ns: int, kind: str, owner: str, count: int, which: Sequence[str]) -> None:
         """Write an event about what a host could not hand in. Raises ProtocolError for another's."""
-        self._check_owner(left_out.kind, left_out.owner)
-        if left_out.kind == "log":
-            self._folder.event(time_ns, EventKind.log_left_out, left_out.owner, bytes=left_out.count)
+        self._check_owner(kind, owner)
+        if kind == "log":
+            self._folder.event(time_ns, EventKind.log_left_out, owner, bytes=count)
         else:
-            which = [printable(each, 300) for each in left_out.which[:3]]
-            self._folder.event(time_ns, EventKind.files_left_out, left_out.owner, count=left_out.count, which=which)
+            first = [printable(each, 300) for each in which[:3]]
+            self._folder.event(time_ns, EventKind.files_left_out, owner, count=count, which=first)
 
     def _check_owner(self, kind: str, owner: str) -> None:
         if owner not in (self._logs if kind == "log" else self._nodes):
             raise ProtocolError(f"{kind} of {owner!r}, which is not on this host")
 
-    def _path(self, part: Part) -> Path:
+    def _path(self, kind: str, owner: str, name: str) -> Path:
         """Return where a part belongs: in the logs, or on a disk, from which the run's folder takes its files."""
-        self._check_owner(part.kind, part.owner)
-        if part.kind == "log":
-            return self._folder.logs / f"{part.owner}.log"
-        path = PurePosixPath(part.path)
-        self._files.add((part.owner, part.path))
-        if path.is_absolute() or not path.parts or ".." in path.parts or "\0" in part.path:
-            raise ProtocolError(f"file {part.path[:100]!r} of {part.owner}: not below its folder")
+        self._check_owner(kind, owner)
+        if kind == "log":
+            return self._folder.logs / f"{owner}.log"
+        path = PurePosixPath(name)
+        self._files.add((owner, name))
+        if path.is_absolute() or not path.parts or ".." in path.parts or "\0" in name:
+            raise ProtocolError(f"file {name[:100]!r} of {owner}: not below its folder")
         if len(path.parts) > DEEPEST + 1 or len(self._files) > MOST_FILES * len(self._nodes):
-            raise ProtocolError(f"file {part.path[:100]!r} of {part.owner}: too deep, or one too many")
-        return self._folder.disks / part.owner / path
+            raise ProtocolError(f"file {name[:100]!r} of {owner}: too deep, or one too many")
+        return self._folder.disks / owner / path

@@ -17,7 +17,7 @@ from typing import Any
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.hosts import messages
-from emulator.drivers.hosts.messages import HostHello, HostWelcome, Order
+from emulator.drivers.hosts.messages import Call, HostHello, HostWelcome
 from emulator.drivers.hosts.retrieval import Retrieval
 from emulator.drivers.launch import Exit
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ChangeSignal
@@ -47,7 +47,7 @@ class _Host:
     is_gone: bool = False
     is_handing_in: bool = False
     has_handed_in: bool = False
-    orders: list[Order] = field(default_factory=list)
+    orders: list[Call] = field(default_factory=list)
 
     @property
     def nodes(self) -> list[str]:
@@ -127,22 +127,22 @@ class Fleet:
                 self._loop.call_soon(self._lose, self._hosts[name], process_ids)
                 continue
             serials = [self._serials[process_id] for process_id in process_ids]
-            self._order(self._hosts[name], messages.Start(process_ids, serials, nice))
+            self._order(self._hosts[name], "start", process_ids, serials, nice)
 
     def signal(self, name: str, number: signal.Signals) -> None:
         """Send a signal to a process, if it is there."""
         if name in self._serials:
-            self._order(self._host_of[name], messages.Signal(name, number))
+            self._order(self._host_of[name], "signal", name, int(number))
 
     def kill(self, name: str) -> None:
         """End a process at once; its end is not told."""
         if self._serials.pop(name, None) is not None:
-            self._order(self._host_of[name], messages.Kill(name))
+            self._order(self._host_of[name], "kill", name)
 
     def detach(self, name: str) -> Callable[[float], None]:
         """Forget a process that has been told to go; its host kills it if it does not."""
         if self._serials.pop(name, None) is not None:
-            self._order(self._host_of[name], messages.Detach(name, DETACH_PATIENCE_S))
+            self._order(self._host_of[name], "detach", name, DETACH_PATIENCE_S)
         return lambda patience_s: None
 
     def request_stack(self, name: str) -> None:
@@ -156,7 +156,7 @@ class Fleet:
     def look(self, time_ns: int) -> None:
         """Have CPU time and memory of the processes measured."""
         for host in self._hosts.values():
-            self._order(host, messages.Look(time_ns, self._scenario.run.memory_limit_mb))
+            self._order(host, "look", time_ns, self._scenario.run.memory_limit_mb)
 
     # To the hosts.
 
@@ -164,19 +164,19 @@ class Fleet:
         """Say something to a node."""
         host = self._host_of[node]
         if isinstance(message, wire.Await):
-            self._order(host, messages.Patience(message.within_s))
-        self._order(host, messages.ToNode(node, wire.encode(message), isinstance(message, wire.Grant)))
+            self._order(host, "be_patient", message.within_s)
+        self._order(host, "to_node", node, wire.encode(message), isinstance(message, wire.Grant))
 
     def send_content(self, unit: str, payload: bytes) -> None:
         """Put an encoded message on a unit's key of the backbone."""
-        self._order(self._host_of[unit], messages.ToUnit(unit, payload))
+        self._order(self._host_of[unit], "to_unit", unit, payload)
 
-    def _order(self, host: _Host, order: Order) -> None:
+    def _order(self, host: _Host, *call: Any) -> None:
         if host.nonce is None or host.is_gone:
             return
         if not self._has_work:
             self._loop.call_soon(self.flush)
-        host.orders.append(order)
+        host.orders.append(call)
         self._has_work[host.name] = host
 
     def flush(self) -> None:
@@ -184,7 +184,7 @@ class Fleet:
         for host in self._has_work.values():
             assert host.nonce is not None
             orders, host.orders = host.orders, []
-            self._send(host.name, messages.encode(messages.Orders(host.nonce, orders)))
+            self._send(host.name, messages.encode(messages.Calls(host.nonce, orders)))
         self._has_work = {}
 
     # From the hosts.
@@ -201,14 +201,14 @@ class Fleet:
             elif message.nonce != host.nonce or host.is_gone:
                 raise ProtocolError("a message without the nonce of its host")
             else:
-                self._take_items(host, message.items)
+                self._take_calls(host, message.calls)
         except (WireError, ProtocolError) as error:
             self._refuse(name, str(error))
 
-    def _take_items(self, host: _Host, items: Sequence[messages.Item]) -> None:
-        for item in items:
+    def _take_calls(self, host: _Host, calls: Sequence[Call]) -> None:
+        for call in calls:
             try:
-                self._take_item(host, item)
+                self._take_call(host, call)
             except ProtocolError as error:
                 self._refuse(host.name, str(error))
 
@@ -259,39 +259,33 @@ class Fleet:
             return f"its vnet is not that of the emulator ({digests}): install the same"
         return None
 
-    def _take_item(self, host: _Host, item: messages.Item) -> None:
-        match item:
-            case messages.FromNode(node, payload):
+    def _take_call(self, host: _Host, call: Call) -> None:
+        match call:
+            case ("message" | "backbone" | "token") as what, node, item:
                 self._check_node(host, node)
-                self._tell("message", node, payload)
-            case messages.FromUnit(node, payload):
-                self._check_node(host, node)
-                self._tell("backbone", node, payload)
-            case messages.Token(node, alive):
-                self._check_node(host, node)
-                self._tell("token", node, alive)
-            case messages.Ended(process_id, serial, status, log_tail, overdue_s):
+                self._tell(what, node, item)
+            case "ended", process_id, serial, status, log_tail, overdue_s:
                 self._check_node(host, process_id)
                 if self._serials.get(process_id) == serial:
                     del self._serials[process_id]
                     self._tell("ended", process_id, Exit(status, log_tail, overdue_s))
-            case messages.LogTail(process_id, text):
+            case "log_tail", process_id, text:
                 self._check_node(host, process_id)
                 self._log_tails[process_id] = text
-            case messages.Part():
-                host.retrieval.take(item)
+            case "part", kind, owner, path, data:
+                host.retrieval.take(kind, owner, path, data)
                 self._changes.set()
-            case messages.LeftOut():
-                host.retrieval.tell_left_out(self._time_ns(), item)
-            case messages.Figures(cpu_ns, memory):
+            case "left_out", kind, owner, count, which:
+                host.retrieval.tell_left_out(self._time_ns(), kind, owner, count, which)
+            case "figures", cpu_ns, memory:
                 self._take_figures(host, cpu_ns, memory)
-            case messages.MemoryExceeded(process_id, memory_mb):
+            case "memory", process_id, memory_mb:
                 self._check_node(host, process_id)
                 self._tell("memory", process_id, memory_mb)
-            case messages.HandingIn():
+            case ("handing_in",):
                 host.is_handing_in = True
                 self._changes.set()
-            case messages.HandedIn():
+            case ("handed_in",):
                 host.has_handed_in = True
                 self._changes.set()
 
@@ -343,7 +337,7 @@ class Fleet:
         """
         left = [host for host in self._hosts.values() if host.is_ready and not host.is_gone]
         for host in left:
-            self._order(host, messages.HandIn(patience_s))
+            self._order(host, "hand_in", patience_s)
         silent_at = dict.fromkeys([host.name for host in left], time.monotonic() + ANSWER_PATIENCE_S)
         while left := [host for host in left if not (host.has_handed_in or host.is_gone)]:
             if not await self._changes.wait(max(silent_at[host.name] for host in left) - time.monotonic()):
@@ -353,7 +347,7 @@ class Fleet:
         for host in left:
             self._folder.event(self._time_ns(), EventKind.host_silent, None, host=host.name, where=host.where)
         for host in self._hosts.values():
-            self._order(host, messages.Leave())
+            self._order(host, "leave")
         self.flush()
         for key, count in self._refused.items():
             self._folder.event(self._time_ns(), EventKind.refused_total, key=key, count=count)

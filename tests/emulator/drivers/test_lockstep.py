@@ -1,5 +1,6 @@
 """The barrier, with processes that are nothing but what they yield."""
 
+import asyncio
 import math
 import random
 from collections.abc import Sequence
@@ -10,12 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.processes import ProtocolError
+from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.lockstep import Lockstep, run_in_lockstep
+from emulator.drivers.processes import Heard, Processes, ProtocolError
 from emulator.radio.outcomes import Outcome
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.radio import Packet
+from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 
 IDS = ["v01", "v02", "v03", "v04"]
@@ -394,8 +396,8 @@ class Vehicle:
         ]
 
 
-class Course:
-    """Runs vehicles in processes to the end, and checks every grant."""
+class Course(Processes):
+    """Runs vehicles in processes to the end, and checks every grant. Yields come in any order."""
 
     def __init__(
         self, emulation: Emulation, groups: Sequence[Sequence[str]], seed: int, order: random.Random
@@ -411,40 +413,38 @@ class Course:
         self.sent_ns: dict[bytes, int] = {}
         self.seqs: dict[str, int] = {}
         self.paused: set[str] = set()
-        self.barriers = 0
+        self.answers: list[Heard] = []
+        self.end_ns = self.barriers = 0
 
     def run(self) -> tuple[str, dict[str, list[tuple[Any, ...]]]]:
-        now_ns = 0
-        grants = self.lockstep.start()
-        while grants:
-            self.apply_actions()
-            (end_ns,) = {grant.end_ns for grant in grants.values()}
-            assert all(now_ns <= grant.time_ns < end_ns for grant in grants.values()), "windows are in order"
-            now_ns = end_ns
-            self.barriers += 1
-            assert self.lockstep.owed.keys() == grants.keys()
-            answers = [(process_id, self.answer(process_id, grant)) for process_id, grant in grants.items()]
-            self.order.shuffle(answers)
-            for process_id, message in answers:
-                with pytest.raises(AssertionError):
-                    self.lockstep.step()  # while one of them is still owed
-                self.lockstep.receive(process_id, message)
-            grants = self.lockstep.step()
+        asyncio.run(run_in_lockstep(self.lockstep, self))
         return self.emulation.engine.trace.sha256(), self.diary
 
-    def apply_actions(self) -> None:
-        for actions in self.lockstep.take_actions():
-            self.paused = actions.paused
-            for node in actions.start:
-                self.vehicles[node] = Vehicle(node, self.emulation.incarnation[node], self.seed)
-                if not self.permanent:
-                    self.seqs.pop(node, None)
+    async def act(self, actions: ProcessActions) -> None:
+        self.paused = actions.paused
+        for node in actions.start:
+            self.vehicles[node] = Vehicle(node, self.emulation.incarnation[node], self.seed)
+            if not self.permanent:
+                self.seqs.pop(node, None)
+
+    def send(self, process_id: str, message: wire.Grant | wire.Batch, mail: Mail | None = None) -> None:
+        assert isinstance(message, wire.Grant) and mail is not None
+        self.barriers += not self.answers
+        begin_ns = self.answers[0].arrived_ns if self.answers else self.end_ns
+        assert begin_ns <= message.time_ns < message.end_ns, "windows are in order"
+        self.end_ns = message.end_ns
+        self.answers.append(Heard(process_id, self.answer(process_id, mail.within(message)), begin_ns))
+
+    async def receive(self, timeout_s: float = math.inf) -> Heard:
+        assert self.lockstep.owed.keys() == {each.process_id for each in self.answers}
+        with pytest.raises(AssertionError):
+            self.lockstep.step()  # while one of them is still owed
+        return self.answers.pop(self.order.randrange(len(self.answers)))
 
     def answer(self, process_id: str, grant: wire.Grant) -> wire.Yield:
         """Give a process its grant, let its vehicles pass through the window, and yield."""
         assert grant.seq == self.seqs.get(process_id, -1) + 1
         self.seqs[process_id] = grant.seq
-        grant = self.lockstep.take_mail(process_id).within(grant)
         for packet in grant.packets:
             assert self.sent_ns[packet.payload] == packet.sent_ns, "nothing is delivered that was not sent before"
             assert packet.sent_ns <= packet.received_ns < grant.end_ns

@@ -12,18 +12,7 @@ import pytest
 from emulator.drivers.hosts import host as host_module
 from emulator.drivers.hosts import messages
 from emulator.drivers.hosts.host import Event, HostProcess
-from emulator.drivers.hosts.messages import (
-    Ended,
-    Figures,
-    FromNode,
-    HandedIn,
-    HandingIn,
-    LogTail,
-    Order,
-    Part,
-    Token,
-    ToNode,
-)
+from emulator.drivers.hosts.messages import Call, Calls
 from emulator.drivers.launch import Exit
 from emulator.records.run_folder import RunFolder
 from tests.emulator.drivers.live.fakes import FakeLauncher
@@ -79,6 +68,10 @@ class Sides:
         else:
             self.down.append(arguments)
 
+    @property
+    def agents(self) -> "Sides":
+        return self
+
     def show_emulator(self, there: bool) -> None:
         self.emulator.append(there)
 
@@ -111,8 +104,8 @@ class Play:
 
     def work(self, *steps: Event | Callable[[], None]) -> list[list[Any]]:
         """Start both processes, take these steps and leave; returns the bundles that have gone up."""
-        begin = orders(messages.Start(["v01", "v03"], [1, 2], 0))
-        self.steps = [begin, *steps, orders(messages.Leave())]
+        begin = orders(("start", ["v01", "v03"], [1, 2], 0))
+        self.steps = [begin, *steps, orders(("leave",))]
         self.host.work()
         return self.sides.bundles
 
@@ -122,18 +115,18 @@ def play(tmp_path: Path) -> Play:
     return Play(tmp_path)
 
 
-def orders(*those: Order, nonce: bytes = b"1") -> Event:
-    return "rx", "", messages.encode(messages.Orders(nonce, those))
+def orders(*those: Call, nonce: bytes = b"1") -> Event:
+    return "rx", "", messages.encode(Calls(nonce, those))
 
 
 def grant(*process_ids: str) -> Event:
-    return orders(*(ToNode(process_id, b"grant", True) for process_id in process_ids))
+    return orders(*(("to_node", process_id, b"grant", True) for process_id in process_ids))
 
 
 def test_a_barrier_is_a_message_down_for_each_process_and_one_up(play: Play) -> None:
-    bundles = play.work(grant("v01", "v03"), ("tx", "v03", YIELD), ("tx", "v01", YIELD))
+    bundles = play.work(grant("v01", "v03"), ("message", "v03", YIELD), ("message", "v01", YIELD))
     assert play.sides.down == [("v01", b"grant"), ("v03", b"grant")]
-    assert bundles == [[FromNode("v03", YIELD), FromNode("v01", YIELD)]]
+    assert bundles == [[("message", "v03", YIELD), ("message", "v01", YIELD)]]
     assert (play.host.grants, play.host.barriers) == (2, 1)
 
 
@@ -141,16 +134,16 @@ def test_last_messages_tokens_and_ends_go_at_once(play: Play) -> None:
     def end() -> None:
         play.launcher.ends = {"v03": Exit(-9, "its last line")}
 
-    steps = [grant("v01", "v03"), ("tx", "v01", YIELD), ("alive", "v03", False), end, ("children", "", None)]
+    steps = [grant("v01", "v03"), ("message", "v01", YIELD), ("token", "v03", False), end, ("children", "", None)]
     assert play.work(*steps) == [  # type: ignore[arg-type]
-        [FromNode("v01", YIELD), Token("v03", False)],
-        [Ended("v03", 2, -9, "its last line")],
+        [("message", "v01", YIELD), ("token", "v03", False)],
+        [("ended", "v03", 2, -9, "its last line", None)],
     ]
 
 
 def test_a_process_that_is_not_there_is_not_waited_for(play: Play) -> None:
-    bundles = play.work(orders(messages.Kill("v03")), grant("v01", "v03"), ("tx", "v01", YIELD))
-    assert bundles == [[FromNode("v01", YIELD)]]
+    bundles = play.work(orders(("kill", "v03")), grant("v01", "v03"), ("message", "v01", YIELD))
+    assert bundles == [[("message", "v01", YIELD)]]
     assert ("kill", "v03") in play.launcher.done
 
 
@@ -158,27 +151,29 @@ def test_whoever_is_asked_for_stacks_does_not_keep_the_yields_of_others(
     play: Play, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(host_module, "STACKS_WRITTEN_S", 0.0)
-    ask = orders(ToNode("v03", b"stacks", False), messages.Signal("v03", signal.SIGUSR1))
-    bundles = play.work(grant("v01", "v03"), ("tx", "v01", YIELD), ask)
+    ask = orders(("to_node", "v03", b"stacks", False), ("signal", "v03", signal.SIGUSR1))
+    bundles = play.work(grant("v01", "v03"), ("message", "v01", YIELD), ask)
     assert [item for bundle in bundles for item in bundle] == [
-        FromNode("v01", YIELD),
-        LogTail("v03", "the log of v03"),
+        ("message", "v01", YIELD),
+        ("log_tail", "v03", "the log of v03"),
     ]
     assert ("SIGUSR1", "v03") in play.launcher.done
 
 
 def test_only_signals_that_agents_know_are_sent(play: Play) -> None:
-    play.work(*(orders(messages.Signal("v01", number)) for number in (signal.SIGTERM, signal.SIGSTOP)))
+    play.work(*(orders(("signal", "v01", number)) for number in (signal.SIGTERM, signal.SIGSTOP)))
     assert [done for done in play.launcher.done if done[0].startswith("SIG")] == [("SIGSTOP", "v01")]
 
 
 def test_a_process_that_cannot_be_started_has_ended(play: Play) -> None:
     play.launcher.failure = "cannot start the process of v01: no memory"
-    assert play.work() == [[Ended(name, n, 1, play.launcher.failure) for name, n in (("v01", 1), ("v03", 2))]]
+    assert play.work() == [
+        [("ended", name, n, 1, play.launcher.failure, None) for name, n in (("v01", 1), ("v03", 2))]
+    ]
 
 
 def test_a_process_starts_again_once_the_one_before_has_gone(play: Play) -> None:
-    again = orders(messages.Detach("v03", 1.0), messages.Start(["v03"], [3], 0))
+    again = orders(("detach", "v03", 1.0), ("start", ["v03"], [3], 0))
     play.work(again)
     assert play.launcher.done == [("start", "v01", "v02"), ("start", "v03"), ("wait for", "v03"), ("start", "v03")]
 
@@ -187,20 +182,20 @@ def test_at_the_end_everything_is_handed_in(play: Play) -> None:
     (play.folder.logs / "v01.log").write_text("hello\n")
     (play.folder.disks / "v02").mkdir(parents=True)
     (play.folder.disks / "v02" / "data").write_bytes(b"left")
-    bundles = play.work(("tx", "v01", FINAL), orders(messages.HandIn(2.0)))
+    bundles = play.work(("message", "v01", FINAL), orders(("hand_in", 2.0)))
     assert ("stop", "2.0") in play.launcher.done
     items = [item for bundle in bundles for item in bundle]
     assert items[:4] == [
-        FromNode("v01", FINAL),
-        HandingIn(),
-        Part("log", "v01", "", b"hello\n"),
-        Part("file", "v02", "data", b"left"),
+        ("message", "v01", FINAL),
+        ("handing_in",),
+        ("part", "log", "v01", "", b"hello\n"),
+        ("part", "file", "v02", "data", b"left"),
     ]
-    assert isinstance(items[4], Figures) and items[5:] == [HandedIn()]
+    assert items[4][0] == "figures" and items[5:] == [("handed_in",)]
 
 
 def test_orders_of_another_and_nonsense_change_nothing(play: Play, capsys: pytest.CaptureFixture[str]) -> None:
-    play.work(orders(messages.Kill("v01"), nonce=b"2"), ("rx", "", b"nonsense"), orders(ToNode("v09", b"x", False)))
+    play.work(orders(("kill", "v01"), nonce=b"2"), ("rx", "", b"nonsense"), orders(("to_node", "v09", b"x", False)))
     assert play.launcher.pids.keys() == {"v01", "v03"}
     assert "a message of the emulator is dropped" in capsys.readouterr().err
 
@@ -215,5 +210,5 @@ def test_without_the_emulator_agents_learn_it_and_the_host_ends(
 
 
 def test_an_absence_that_was_announced_is_waited_for(play: Play) -> None:
-    play.work(orders(messages.Patience(3600.0)), ("emulator", "", False), ("emulator", "", True))
+    play.work(orders(("be_patient", 3600.0)), ("emulator", "", False), ("emulator", "", True))
     assert play.sides.emulator == [False, True]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from emulator.drivers.hosts import retrieval
-from emulator.drivers.hosts.messages import LeftOut, Part
+from emulator.drivers.hosts.messages import Call
 from emulator.drivers.hosts.retrieval import Retrieval, hand_in
 from emulator.drivers.processes import ProtocolError
 from emulator.records.node_files import collect
@@ -41,13 +41,13 @@ def test_logs_and_files_come_as_they_were(
 ) -> None:
     monkeypatch.setattr(retrieval, "PART_BYTES", 1000)
     writer = Retrieval(here, PROCESSES, ONE_MB)
-    for item in hand_in(there.path, PROCESSES, ONE_MB):
-        if isinstance(item, Part):
-            assert len(item.data) <= 1000
-            writer.take(item)
+    for name, *arguments in hand_in(there.path, PROCESSES, ONE_MB):
+        if name == "part":
+            assert len(arguments[3]) <= 1000
+            writer.take(*arguments)
         else:
-            assert isinstance(item, LeftOut)
-            writer.tell_left_out(7, item)
+            assert name == "left_out"
+            writer.tell_left_out(7, *arguments)
     assert collect(here, ["v01", "v02", "v03"], ONE_MB) == {}
     assert (here.logs / "v01.log").read_text() == "a line\nanother\n"
     files = here.path / "files"
@@ -60,27 +60,27 @@ def test_logs_and_files_come_as_they_were(
 
 def test_of_a_long_log_the_end_comes(there: RunFolder, here: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retrieval, "MOST_LOG_BYTES", 8)
-    items = [item for item in hand_in(there.path, PROCESSES[:1], 0.0) if item.owner == "v01"]  # type: ignore[union-attr]
-    assert items == [LeftOut("log", "v01", 7), Part("log", "v01", "", b"another\n")]
-    Retrieval(here, PROCESSES, 0.0).tell_left_out(7, items[0])  # type: ignore[arg-type]
+    items = [item for item in hand_in(there.path, PROCESSES[:1], 0.0) if item[2] == "v01"]
+    assert items == [("left_out", "log", "v01", 7, []), ("part", "log", "v01", "", b"another\n")]
+    Retrieval(here, PROCESSES, 0.0).tell_left_out(7, *items[0][1:])
     assert [(event.kind, event.details) for event in here.events] == [("log_left_out", {"bytes": 7})]
 
 
 @pytest.mark.parametrize(
     "part",
     [
-        Part("file", "v09", "a", b""),
-        Part("log", "v02", "", b""),  # its process is v01
-        Part("file", "v01", "../v03/a", b""),
-        Part("file", "v01", "/etc/cron.d/a", b""),
-        Part("file", "v01", "", b""),
-        Part("file", "v01", "a\0b", b""),
-        Part("file", "v01", "a/" * 30 + "b", b""),
-        Part("file", "v01", "a", bytes(1_000_001)),
+        ("part", "file", "v09", "a", b""),
+        ("part", "log", "v02", "", b""),  # its process is v01
+        ("part", "file", "v01", "../v03/a", b""),
+        ("part", "file", "v01", "/etc/cron.d/a", b""),
+        ("part", "file", "v01", "", b""),
+        ("part", "file", "v01", "a\0b", b""),
+        ("part", "file", "v01", "a/" * 30 + "b", b""),
+        ("part", "file", "v01", "a", bytes(1_000_001)),
     ],
     ids=["another's", "no process", "up", "absolute", "none", "nul", "deep", "large"],
 )
-def test_what_does_not_belong_there_is_refused(part: Part, here: RunFolder) -> None:
+def test_what_does_not_belong_there_is_refused(part: Call, here: RunFolder) -> None:
     with pytest.raises(ProtocolError):
-        Retrieval(here, PROCESSES, ONE_MB).take(part)
+        Retrieval(here, PROCESSES, ONE_MB).take(*part[1:])
     assert not here.disks.exists()

@@ -8,22 +8,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.hosts import messages
-from emulator.drivers.hosts.messages import (
-    Ended,
-    FromNode,
-    HandedIn,
-    HandingIn,
-    HostHello,
-    HostRefusal,
-    HostWelcome,
-    Item,
-    Kill,
-    News,
-    Orders,
-    Start,
-    Token,
-    ToNode,
-)
+from emulator.drivers.hosts.messages import Call, Calls, HostHello, HostRefusal, HostWelcome
 from emulator.drivers.launch import Exit
 from emulator.drivers.live.fleet import ANSWER_PATIENCE_S, Fleet
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ChangeSignal
@@ -72,15 +57,15 @@ class Play:
             self.fleet.take(host, hello(host, ready=True))
         self.fleet.start_agents("", self.access, PROCESSES)
 
-    def news(self, host: str, *items: Item, nonce: bytes = b"1") -> None:
-        self.fleet.take(host, messages.encode(News(nonce, items)))
+    def news(self, host: str, *items: Call, nonce: bytes = b"1") -> None:
+        self.fleet.take(host, messages.encode(Calls(nonce, items)))
 
     async def bundles(self) -> list[tuple[str, list[Any]]]:
         """The bundles sent since the last call, after some turns of the loop; each bundle by its host."""
         for _ in range(3):
             await asyncio.sleep(0)
         sent, self.sent = self.sent, []
-        return [(host, list(message.orders)) for host, message in sent if isinstance(message, Orders)]
+        return [(host, list(message.calls)) for host, message in sent if isinstance(message, Calls)]
 
     @property
     def refused(self) -> list[str]:
@@ -108,10 +93,10 @@ def test_grants_of_a_barrier_are_one_bundle_a_host() -> None:
         await play.bundles()
         for process_id in ("v01", "v03", "v04"):
             play.fleet.send(process_id, GRANT)
-        grants = {node: ToNode(node, wire.encode(GRANT), True) for node in ("v01", "v03", "v04")}
+        grants = {node: ("to_node", node, wire.encode(GRANT), True) for node in ("v01", "v03", "v04")}
         assert await play.bundles() == [("a", [grants["v01"]]), ("b", [grants["v03"], grants["v04"]])]
         play.fleet.send("v03", wire.StackRequest())
-        assert await play.bundles() == [("b", [ToNode("v03", wire.encode(wire.StackRequest()), False)])]
+        assert await play.bundles() == [("b", [("to_node", "v03", wire.encode(wire.StackRequest()), False)])]
 
     run(main)
 
@@ -126,7 +111,7 @@ def test_agents_are_started_once_all_hosts_are_there() -> None:
         play.join()
         assert play.fleet.is_prepared() and play.fleet.missing == []
         starts = await play.bundles()
-        assert starts == [("a", [Start(["v01"], [1], 0)]), ("b", [Start(["v03", "v04"], [2, 3], 0)])]
+        assert starts == [("a", [("start", ["v01"], [1], 0)]), ("b", [("start", ["v03", "v04"], [2, 3], 0)])]
 
     run(main)
 
@@ -147,10 +132,10 @@ def test_a_host_that_cannot_start_agents_says_why() -> None:
         (hello("a", digest="0123456789abcdef"), "its vnet is not that of the emulator (0123456789a…"),
         (hello("b"), "a hello of 'b'"),
         (b"nonsense", "8 bytes are not a message"),
-        (messages.encode(News(b"2", [FromNode("v01", b"x")])), "a message without the nonce of its host"),
-        (messages.encode(News(b"1", [FromNode("v03", b"x")])), "'v03' is not on host a"),
-        (messages.encode(News(b"1", [Token("v04", True)])), "'v04' is not on host a"),
-        (messages.encode(News(b"1", [Ended("v03", 2, 0, "")])), "'v03' is not on host a"),
+        (messages.encode(Calls(b"2", [("message", "v01", b"x")])), "a message without the nonce of its host"),
+        (messages.encode(Calls(b"1", [("message", "v03", b"x")])), "'v03' is not on host a"),
+        (messages.encode(Calls(b"1", [("token", "v04", True)])), "'v04' is not on host a"),
+        (messages.encode(Calls(b"1", [("ended", "v03", 2, 0, "", None)])), "'v03' is not on host a"),
     ],
 )
 def test_what_a_host_may_not_say_is_refused(payload: bytes, reason: str) -> None:
@@ -168,7 +153,7 @@ def test_what_a_host_may_not_say_is_refused(payload: bytes, reason: str) -> None
 def test_one_wrong_item_does_not_take_the_others_with_it() -> None:
     async def main(play: Play) -> None:
         play.join()
-        play.news("a", FromNode("v01", b"1"), FromNode("v03", b"2"), FromNode("v02", b"3"))
+        play.news("a", ("message", "v01", b"1"), ("message", "v03", b"2"), ("message", "v02", b"3"))
         assert play.came == [("v01", b"1"), ("v02", b"3")]
 
     run(main)
@@ -179,13 +164,13 @@ def test_the_end_of_a_process_that_has_been_replaced_is_old_news() -> None:
         play.join()
         play.fleet.kill("v03")
         play.fleet.start_agents("", play.access, [["v03"]])
-        play.news("b", Ended("v03", 2, -9, ""))
+        play.news("b", ("ended", "v03", 2, -9, "", None))
         assert play.came == [] and play.fleet.pids["v03"] == 4
-        play.news("b", Ended("v03", 4, 1, "its last line"))
+        play.news("b", ("ended", "v03", 4, 1, "its last line", None))
         assert play.came == [("v03", Exit(1, "its last line"))]
         assert "v03" not in play.fleet.pids
         (_, (_, orders)) = await play.bundles()
-        assert orders[1:] == [Kill("v03"), Start(["v03"], [4], 0)]
+        assert orders[1:] == [("kill", "v03"), ("start", ["v03"], [4], 0)]
 
     run(main)
 
@@ -233,14 +218,14 @@ def test_the_end_waits_for_what_is_handed_in_and_not_for_the_silent(monkeypatch:
         await play.bundles()
         ending = asyncio.ensure_future(play.fleet.hand_in(1.0))
         assert [host for host, _ in await play.bundles()] == ["a", "b"]
-        play.news("a", HandingIn())
+        play.news("a", ("handing_in",))
         await asyncio.sleep(4 * ANSWER_PATIENCE_S)  # on a machine that is busy
         assert not ending.done()
-        play.news("a", HandedIn())
+        play.news("a", ("handed_in",))
         play.fleet.take_token("a", False)
         await ending
         silent = [event for event in play.emulation.folder.events if event.kind == "host_silent"]
         assert [event.details["host"] for event in silent] == ["b"]
-        assert [orders for _, orders in await play.bundles()] == [[messages.Leave()], [messages.Leave()]]
+        assert [orders for _, orders in await play.bundles()] == [[("leave",)], [("leave",)]]
 
     in_virtual_time(main(), monkeypatch)
