@@ -1,7 +1,9 @@
 """The engine and its channel: one outcome for every reception, and draws that depend only on what they decide."""
 
+import mmap
 import tracemalloc
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -319,3 +321,18 @@ def test_arrivals_at_one_time_are_ordered_and_are_shown_in_that_order(seed: int,
     keys = [tuple(row[names.index(name)] for name in ("arrival_ns", "sender", "seq", "receiver")) for row in table]
     assert keys == sorted(keys)
     assert len(packets) > 10 or subject.counts[Outcome.delivered] == len(packets)
+
+
+def test_the_room_of_a_trace_takes_memory_only_as_it_is_written() -> None:
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+    def traces(count: int) -> list[Trace]:
+        return [Trace(["v0"], knows_power=True) for _ in range(count)]
+
+    del traces(1)[0]  # malloc learns of sizes as they are given back
+    held = traces(20)
+    del held[::2]
+    before = resident()
+    held += traces(10)
+    assert resident() - before < 10 * 2**20
