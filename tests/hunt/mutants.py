@@ -109,7 +109,7 @@ def mutated(mutant: Mutant) -> str:
 
 
 def found_by(tree: Path, paths: list[str]) -> str:
-    """Run tests in a copy of the tree until the first fails, the quick ones first; return it, or why there is none."""
+    """Run tests in a copy of the tree until the first fails, quick ones first; return it, or why there is none."""
     environment = {**os.environ, "PYTHONPATH": str(tree)}
     for which in ("not slow", "slow"):
         options = ["-x", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-o", "addopts=", "-m", which]

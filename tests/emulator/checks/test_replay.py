@@ -139,8 +139,7 @@ def test_a_deterministic_program_agrees_in_all_layouts(tmp_path: Path, command: 
     assert ("live" in replay["text"]) == (command == "simulate")
 
 
-@pytest.mark.parametrize("command", ["simulate", "run"])
-@pytest.mark.parametrize("program", [sends_a_set_of_objects, throws_dice])
+@pytest.mark.parametrize(("command", "program"), [("run", sends_a_set_of_objects), ("simulate", throws_dice)])
 def test_a_nondeterministic_program_is_found_with_frame_vehicle_and_line(
     tmp_path: Path, command: str, program: Callable[[Node], Awaitable[None]]
 ) -> None:
