@@ -20,12 +20,6 @@ BEACON = ROOT / "scenarios" / "beacon.toml"
 TWELVE = ROOT / "scenarios" / "twelve.toml"
 
 
-@pytest.fixture(autouse=True)
-def _modules_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep what a session of pytester has imported: numpy's and scipy's modules in C cannot be imported twice."""
-    monkeypatch.setattr("_pytest.pytester.SysModulesSnapshot.restore", lambda snapshot: None)
-
-
 def run_tests(pytester: pytest.Pytester, code: str, *options: str) -> pytest.RunResult:
     """Run a test module in a session of its own."""
     header = f"import pytest\nBEACON = {str(BEACON)!r}\nTWELVE = {str(TWELVE)!r}\n"
