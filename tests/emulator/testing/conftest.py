@@ -1,4 +1,4 @@
-"""What a session of pytester has imported stays: modules in C, such as numpy's and scipy's, cannot come twice."""
+"""Sessions of pytester that keep what they have imported: modules in C, such as numpy's, cannot come twice."""
 
 import sys
 
