@@ -135,7 +135,8 @@ class Trace:
         self._causes = [""]
         self._receptions = _Table(_RECEPTION, INITIAL_RECEPTIONS)
         self._frames = _Table(_FRAME, INITIAL_FRAMES)
-        self._powers = _Table(_POWER, INITIAL_RECEPTIONS if knows_power else 0)
+        # 32 MiB, which malloc never takes from the heap: pages from there are zeroed, and so in memory, at once.
+        self._powers = _Table(_POWER, 2 * INITIAL_RECEPTIONS if knows_power else 0)
         self.knows_power = knows_power
         self.chooses = False
         """True if a program has chosen a power or a bit rate."""

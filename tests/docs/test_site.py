@@ -13,8 +13,6 @@ from tests.docs.markdown import PAGES
 from tests.docs.once import unless_passed
 from tests.support.paths import ROOT
 
-LOADED = re.compile(r"""<(?:script|img|iframe)[^>]*\ssrc="(?:https?:)?//|<link[^>]*\shref="(?:https?:)?//""")
-
 
 @pytest.fixture(scope="module")
 def configuration() -> ModuleType:

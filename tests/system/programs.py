@@ -120,12 +120,6 @@ async def names_neighbours(node: Node) -> None:
                 print(line, flush=True)
 
 
-async def forgetful(node: Node) -> None:
-    """Takes its randomness from the machine instead of `node.rng`: it does not replay."""
-    async for _ in node.gnss:
-        await node.radio.broadcast(os.urandom(8))
-
-
 async def answering(node: Node) -> None:
     """Speaks at every fix, and answers at once, in seven bytes, what it hears of the vehicle before it.
 

@@ -17,16 +17,6 @@ def run(vnet: Vnet, command: str, program: str, *options: str) -> Finished:
     return vnet(command, "scenarios/beacon.toml", "--program", entry, *OPTIONS, *options)
 
 
-def test_who_only_waits_does_the_same_live_and_simulated(vnet: Vnet) -> None:
-    live, simulated = run(vnet, "run", "only_waits"), run(vnet, "simulate", "only_waits")
-    assert live.status == 0, live.stderr + live.stdout
-    assert live.fingerprint == simulated.fingerprint
-    arrivals = {row["arrival_ns"] for row in simulated.trace() if row["outcome"] == "delivered"}
-    sent_again = {row["sent_ns"] for row in simulated.trace() if row["sent_ns"] > 0}
-    assert sent_again
-    assert sent_again <= arrivals, "packets reach who waits for them at the instant of their arrival"
-
-
 @pytest.mark.parametrize("command", ["run", "simulate"])
 def test_a_program_that_raises_is_named_with_its_traceback(vnet: Vnet, command: str) -> None:
     done = run(vnet, command, "raises")

@@ -87,8 +87,9 @@ def test_the_ratio_is_that_of_100_ms_one_lookahead_ago(latency_ms: float) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("entry", [MEASURES, SLEEPS], ids=["busy programs", "quiet instants"])
-@pytest.mark.parametrize("latency_ms", [0.3, 35.0])
+@pytest.mark.parametrize(
+    ("entry", "latency_ms"), [(MEASURES, 0.3), (SLEEPS, 35.0)], ids=["busy programs", "quiet instants"]
+)
 def test_live_processes_read_what_their_simulation_does(entry: str, latency_ms: float) -> None:
     plan = scenario(entry, latency_ms=latency_ms)
     without = plan.model_copy(update={"run": plan.run.model_copy(update={"windows": False})})

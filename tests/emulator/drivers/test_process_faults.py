@@ -300,15 +300,6 @@ def test_what_has_finished_or_crashed_is_not_started_anew_whoever_shares_its_pro
     assert [emulation.up[node] for node in IDS] == [False, True, True, False]
 
 
-@pytest.mark.parametrize("together", [2, 4])
-@pytest.mark.parametrize("program", [ORDERED, "tests.support.fault_programs:some_end"])
-def test_how_many_share_a_process_makes_no_difference(program: str, together: int) -> None:
-    faults = [fault("kill", 0.53, 0.4), fault("pause", 1.2, 0.37), fault("restart", 1.4, 0.6)]
-    faults += [fault("skew", 0.8, 1.0, "v02", offset_ms=-300), fault("drift", 1.0, 1.0, "v03", rate_ppm=2e5)]
-    emulation, _ = both(faults, program, run={"nodes_per_process": together})
-    assert fingerprint(emulation) == fingerprint(run_together(scenario_of(faults, program)))
-
-
 def test_reports_of_who_was_killed_at_that_instant_are_discarded_with_its_frames() -> None:
     emulation = emulation_of(scenario_of([fault("kill", 1.0, 1.0, "v02")], ORDERED))
     emulation.act(1_000_000_000)

@@ -276,24 +276,36 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize("program", UNHANDLED, ids=lambda program: program.__name__)
-def test_what_nobody_handles_is_told_with_its_instant(program: Callable[..., Any], run: str) -> None:
+async def fails_its_own_way(node: Node) -> None:
+    await [*UNHANDLED][int(node.id[1:]) - 1](node)
+
+
+async def handles_its_own_way(node: Node) -> None:
+    await HANDLED[int(node.id[1:]) - 1](node)
+
+
+def run_all(program: str, count: int, run: str) -> Emulation:
+    """Run a program of `count` vehicles, each of which does another thing."""
     drive, nodes_per_process = RUNS[run]
-    emulation = drive(scenario_of([], entry(program), vehicles=2, run={"nodes_per_process": nodes_per_process}))
-    place, time_s = UNHANDLED[program]
-    found = [
-        (event.node, event.time_ns / 1e9, event.details["place"].partition(" (")[0])
-        for event in exceptions(emulation)
-    ]
-    assert found == [("v01", time_s, place), ("v02", time_s, place)]
-    assert all("Error" in event.details["where"] for event in exceptions(emulation))
+    return drive(scenario_of([], program, vehicles=count, run={"nodes_per_process": nodes_per_process}))
+
+
+def places(emulation: Emulation) -> list[tuple[str | None, tuple[str, float]]]:
+    """Return of each exception its vehicle, where it was raised and when."""
+    events = exceptions(emulation)
+    assert all("Error" in event.details["where"] for event in events)
+    return sorted((e.node, (e.details["place"].partition(" (")[0], e.time_ns / 1e9)) for e in events)
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_what_nobody_handles_is_told_with_its_instant(run: str) -> None:
+    emulation = run_all(entry(fails_its_own_way), len(UNHANDLED), run)
+    assert places(emulation) == [(f"v{n:02}", told) for n, told in enumerate(UNHANDLED.values(), 1)]
     assert judged(emulation).verdict is Verdict.INVALID
 
 
-@pytest.mark.parametrize("program", HANDLED, ids=lambda program: program.__name__)
-def test_what_a_program_handles_is_none(program: Callable[..., Any]) -> None:
-    emulation = run_together(scenario_of([], entry(program), vehicles=2))
+def test_what_a_program_handles_is_none() -> None:
+    emulation = run_all(entry(handles_its_own_way), len(HANDLED), "simulated")
     assert exceptions(emulation) == []
     assert judged(emulation).verdict is Verdict.VALID
     assert not [event for event in emulation.folder.events if event.kind == "crashed"]

@@ -13,9 +13,8 @@ from typing import Any
 
 import pytest
 
-from emulator.drivers.emulation import Emulation
 from emulator.records.verdicts import Verdict
-from tests.emulator.drivers.test_unhandled import RUNS, exceptions, judged, sends
+from tests.emulator.drivers.test_unhandled import RUNS, exceptions, judged, places, run_all, sends
 from tests.support.multi_loop_driver import run_together, scenario_of
 from vnet.node import Node
 
@@ -120,20 +119,14 @@ TOLD: dict[Program, tuple[str, float]] = {
 }
 
 
+async def fails_its_own_way(node: Node) -> None:
+    await [*TOLD][int(node.id[1:]) - 1](node)
+
+
 @pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize("program", TOLD, ids=lambda program: program.__name__)
-def test_what_the_loop_never_sees_is_told_with_its_instant(program: Program, run: str) -> None:
-    drive, nodes_per_process = RUNS[run]
-    emulation: Emulation = drive(
-        scenario_of([], entry(program), vehicles=2, run={"nodes_per_process": nodes_per_process})
-    )
-    place, time_s = TOLD[program]
-    found = [
-        (event.node, event.time_ns / 1e9, event.details["place"].partition(" (")[0])
-        for event in exceptions(emulation)
-    ]
-    assert found == [("v01", time_s, place), ("v02", time_s, place)]
-    assert all("ValueError" in event.details["where"] for event in exceptions(emulation))
+def test_what_the_loop_never_sees_is_told_with_its_instant(run: str) -> None:
+    emulation = run_all(entry(fails_its_own_way), len(TOLD), run)
+    assert places(emulation) == [(f"v{n:02}", told) for n, told in enumerate(TOLD.values(), 1)]
     assert judged(emulation).verdict is Verdict.INVALID
 
 
@@ -158,11 +151,7 @@ async def submits_and_asks(node: Node) -> None:
 
 @pytest.mark.parametrize("run", RUNS)
 def test_a_job_whose_end_somebody_asks_for_is_handled(run: str) -> None:
-    drive, nodes_per_process = RUNS[run]
-    emulation: Emulation = drive(
-        scenario_of([], entry(submits_and_asks), vehicles=2, run={"nodes_per_process": nodes_per_process})
-    )
-    assert exceptions(emulation) == []
+    assert exceptions(run_all(entry(submits_and_asks), 2, run)) == []
 
 
 async def leaves_a_thread(node: Node) -> None:

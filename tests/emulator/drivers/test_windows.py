@@ -21,7 +21,6 @@ from vnet.transport import wire
 pytestmark = pytest.mark.slow
 
 IMPROVISES = "tests.support.window_programs:improvises"
-MS = 1_000_000
 Fingerprint = tuple[str, Any, Any, list[Any]]
 
 MEDIUM: dict[str, Any] = {

@@ -16,7 +16,6 @@ from emulator.scenario.radio import (
 from tests.support.radio import engine, line
 
 MS = 1_000_000
-PERIOD_NS = 100 * MS
 
 
 def test_the_busy_ratio_is_the_airtime_of_all_that_are_sensed() -> None:

@@ -20,7 +20,6 @@ from emulator.scenario.scenario import Radio, Scenario, dump_scenario, load_scen
 from emulator.world.world import build_world
 from tests.support.motion import along, scenario_of_trips, write_trips
 from tests.support.radio import engine, line, nist_qpsk_half
-from vnet.errors import ScenarioError
 
 MS = 1_000_000
 PERIOD_NS = 100 * MS
@@ -173,44 +172,6 @@ def test_the_peer_cap_and_the_loss_act_on_what_the_radio_leaves() -> None:
 
 
 # The scenario.
-
-
-@pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ("[radio.fading]", ["radio", "fading needs path_loss"]),
-        ("[radio.shadowing]", ["radio", "shadowing needs path_loss"]),
-        ("[radio.receiver]", ["radio", "receiver needs path_loss or mac"]),
-        ("[radio.congestion]\nkind = 'etsi'", ["radio", "congestion needs mac"]),
-        ("[radio.path_loss]", ["radio.path_loss: a kind is needed"]),
-        ("[radio.path_loss]\nkind = 'cost231'", ["'cost231'", "dual_slope, free_space, log_distance, two_ray"]),
-        ("[radio.path_loss]\nkind = 'free_space'\nexponent = 3", ["exponent: unknown key", "frequency_ghz"]),
-        ("[radio.path_loss]\nkind = 'log_distance'\nexponent = 0", ["exponent = 0", "greater than 0"]),
-        (
-            "[radio]\nbitrate_mbps = 5.5\n[radio.mac]",
-            ["radio", "bitrate_mbps = 5.5", "3, 4.5, 6, 9, 12, 18, 24, 27"],
-        ),
-        ("[radio]\nlinks = [[0]]\n[radio.path_loss]\nkind = 'free_space'", ["path_loss and links", "leave one"]),
-        ("[radio.mac]\naccess_category = 'AC'", ["radio.mac.access_category = 'AC'", "'VO', 'VI', 'BE' or 'BK'"]),
-        (
-            "[radio.path_loss]\nkind = 'free_space'\n[radio.fading]\nm = [1.0]",
-            ["radio.fading", "1 shapes m need 0 distances"],
-        ),
-        (
-            "[radio.path_loss]\nkind = 'free_space'\n[radio.fading]\nm = [1, 2, 3]\nuntil_m = [9, 8]",
-            ["radio.fading", "must grow"],
-        ),
-        ("[radio.mac]\n[radio.congestion]\nkind = 'etsi'\nbusy = [0.5]", ["5 pauses need 4 busy ratios"]),
-    ],
-)
-def test_what_does_not_fit_together_is_one_line(tmp_path: Any, text: str, parts: list[str]) -> None:
-    path = tmp_path / "s.toml"
-    path.write_text(text)
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario(path)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(part in message for part in parts), message
 
 
 def test_a_physical_radio_survives_its_dump(tmp_path: Any) -> None:

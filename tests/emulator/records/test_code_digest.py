@@ -35,11 +35,6 @@ FILES = {
     "cd_broken.py": "def (:\n",
     "cd_elsewhere.py": "",
 }
-SINGLE = """
-async def main(node):
-    async for fix in node.gnss:
-        await node.radio.broadcast(b"one")
-"""
 OWN = {"cd_program/__init__.py", "cd_program/app.py", "cd_program/near.py", "cd_lazy.py", "cd_broken.py"}
 ENTRY = "cd_program.app:main"
 

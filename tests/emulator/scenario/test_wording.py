@@ -3,14 +3,17 @@
 import math
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, get_args
 
 import pytest
 from pydantic import BaseModel, ValidationError
 
 from emulator.scenario.faults import KINDS
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.sections import first_problem
+from tests.support.paths import ROOT
+from vnet.errors import ScenarioError
 
 WRONG: tuple[Any, ...] = (
     *(None, True, -1, 1.5, math.inf, math.nan, 10**30, "text", "", b"bytes", [], {}, [1], [[1, 2]], ["a", 5]),
@@ -65,21 +68,22 @@ def test_no_word_of_pydantic_s_is_shown() -> None:
     assert [text for text in said if not text.isprintable() or len(text) > 1000] == []
 
 
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        ({"run": {"seed": "one"}}, "run.seed = 'one': a whole number is needed"),
-        ({"run": {"seed": 1.5}}, "run.seed = 1.5: a whole number is needed"),
-        ({"run": {"duration_s": [1]}}, "run.duration_s = [1]: a number is needed"),
-        ({"run": {"pacing": "realtme"}}, "must be 'lockstep' or 'realtime' (did you mean realtime?)"),
-        ({"radio": {"loss": 2}}, "radio.loss = 2: must be less than or equal to 1"),
-        ({"run": 5}, "run = 5: a table is needed"),
-        ({"program": {"checks": "a"}}, "program.checks = 'a': a list is needed"),
-        ({"network": {"kind": "file", "path": 5}}, "network.path = 5: a path is needed"),
-        ({"fault": [{"kind": "kill"}]}, "fault.0.kill.duration_s: is missing"),
-        ({"fault": 5}, "fault = 5: a list is needed"),
-        ({"fault": [{"kind": "kill", "at_s": 1, "nodes": {"ids": 5}}]}, "is missing"),
-    ],
-)
-def test_the_key_its_value_and_what_is_allowed_are_said(data: dict[str, Any], said: str) -> None:
-    assert said in problem(data)
+def said_of(text: str, folder: Path) -> str:
+    """Return what is wrong with a scenario of this text."""
+    path = folder / "s.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    said = str(caught.value).removeprefix(f"{path}: ").replace(str(folder), "FOLDER")
+    assert said != str(caught.value) and "\n" not in said
+    return said
+
+
+def test_messages_are_those_that_were_read(tmp_path: Path) -> None:
+    """Each names the key, its value, and what is allowed."""
+    golden = (ROOT / "tests" / "golden" / "messages.txt").read_text(encoding="utf-8")
+    texts = re.findall(r"(.+?)\n=> [^\n]+\n\n?", golden, re.DOTALL)
+    assert len(texts) > 100
+    shown = "\n".join(f"{text}\n=> {said_of(text, tmp_path)}\n" for text in texts)
+    (tmp_path / "messages.txt").write_text(shown, encoding="utf-8")
+    assert shown == golden, f"read {tmp_path}/messages.txt; if it is right, keep it"

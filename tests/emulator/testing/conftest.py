@@ -1,6 +1,14 @@
-"""Modules that these tests import once: pytester forgets what a session imported, and numpy cannot come twice."""
+"""Sessions of pytester that keep what they have imported: modules in C, such as numpy's, cannot come twice."""
 
-from importlib import import_module
+import sys
 
-for _name in ("agents.beacon", "agents.cooperative", "emulator.testing.harness", "emulator.testing.strategies"):
-    import_module(_name)
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _modules_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    def forget_tests(snapshot: object) -> None:
+        for name in [name for name in sys.modules if name.startswith(("test_", "conftest"))]:
+            del sys.modules[name]
+
+    monkeypatch.setattr("_pytest.pytester.SysModulesSnapshot.restore", forget_tests)

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
-from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import LaneMap
 
@@ -265,14 +264,6 @@ def test_components_of_a_matrix_are_connected_by_links_of_either_direction() -> 
     links[0, 1] = links[2, 1] = links[3, 4] = True
     labels = components(np.zeros((5, 2)), 3000.0, links).tolist()
     assert labels[0] == labels[1] == labels[2] != labels[3] == labels[4]
-
-
-def test_the_dense_scenario_exercises_the_cap() -> None:
-    dense = load_scenario(ROOT / "scenarios" / "dense.toml")
-    position_m = build_world(dense).at(0).position_m
-    distance_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
-    degrees = (distance_m <= dense.radio.range_m).sum(axis=0) - 1
-    assert (degrees > dense.radio.max_peers).mean() > 0.5
 
 
 def test_an_exception_for_a_vehicle_that_is_not_there_is_refused() -> None:

@@ -21,6 +21,13 @@ def test_neither_a_small_nor_a_large_covariance_opens_the_gate_for_a_lie(varianc
     assert near_the_median(np.vstack([HONEST, [50.0, 0.0]]), covariances, 3.0).tolist() == [True] * 4 + [False]
 
 
+@pytest.mark.parametrize(("stretched", "near"), [(1 - 1e-9, True), (1 + 1e-9, False)])
+def test_the_gate_is_five_deviations_of_all_of_the_one_and_of_the_floor(stretched: float, near: bool) -> None:
+    edge_m = 5 * np.sqrt(0.01 + 0.04 + 0.25**2) * stretched
+    covariances = np.array([np.eye(2) * 0.01] * 4 + [np.eye(2) * 0.04])
+    assert near_the_median(np.array([[0.0, 0.0]] * 4 + [[edge_m, 0.0]]), covariances, 3.0)[-1] == near
+
+
 def test_who_knows_little_and_says_so_is_inside() -> None:
     estimates = np.vstack([HONEST, [4.0, -3.0]])
     sure, unsure = np.eye(2) * 0.01, np.eye(2) * 9.0

@@ -19,8 +19,6 @@ from vnet.transport import wire
 
 RUNNING, PAUSED, AWAY, RETURNING, DEAD = ProcessState
 
-On = Callable[[Callable[[], Coroutine[Any, Any, None]]], None]
-
 
 def on_a_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]:
     """Run a coroutine test on an event loop of its own."""

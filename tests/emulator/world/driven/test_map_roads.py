@@ -17,7 +17,6 @@ from vnet.driving import Action
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
 
-STEP_NS = 100_000_000
 EAST, NORTH = ("edge 0", "edge 1"), ("edge 2", "edge 3")
 
 
