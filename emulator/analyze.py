@@ -25,8 +25,7 @@ from emulator.radio.connectivity import connectivity_of
 from emulator.radio.topology import Topology
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import METRICS
-from emulator.scenario.lookahead import lookahead_ns
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.scenario import Scenario, lookahead_ns
 from emulator.world.world import World, build_world, components
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array

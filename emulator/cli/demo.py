@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from emulator.cli.options import DurationOption, OutOption
 from emulator.cli.runs import run
-from emulator.scenario.shipped import find_scenario
+from emulator.scenario.loading import find_scenario
 
 
 def demo(duration: DurationOption = None, out: OutOption = None) -> None:

@@ -10,7 +10,7 @@ from emulator.radio.own_rules import load_rules
 from emulator.records.code_digest import changed_code
 from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.recorded import recorded_code
+from emulator.scenario.loading import recorded_code
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, tell
 

@@ -30,7 +30,7 @@ from emulator.cli.options import (
     SetOption,
     load,
 )
-from emulator.scenario.overrides import parse_values
+from emulator.scenario.loading import parse_values
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import VnetError, printable

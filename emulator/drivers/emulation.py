@@ -32,11 +32,9 @@ from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.fault_families import Fault, Infrastructure, OwnRule, ProcessFault
-from emulator.scenario.lookahead import least_latency_ns
-from emulator.scenario.program import Program
-from emulator.scenario.roadside import RoadsideUnit
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
+from emulator.scenario.program import Program, RoadsideUnit
+from emulator.scenario.scenario import Scenario, least_latency_ns
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
 from emulator.world.own_sensors import SensorFailure

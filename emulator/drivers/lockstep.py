@@ -26,7 +26,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep_process import LockstepProcess
 from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import ProtocolError, check_yield, wire_packet
-from emulator.scenario.lookahead import lookahead_ns
+from emulator.scenario.scenario import lookahead_ns
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import Fix
 from vnet.radio import Packet

@@ -13,8 +13,7 @@ import numpy as np
 
 from emulator.faults.selectors import Nodes, links_of, partitioned_links, select
 from emulator.scenario import random_streams
-from emulator.scenario.fault_families import Fault, LinkFault, NodeFault, ProcessFault
-from emulator.scenario.faults import Partition, Swizzle
+from emulator.scenario.faults import Fault, LinkFault, NodeFault, Partition, ProcessFault, Swizzle
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
 from vnet.types import Mask

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scenario.fault_families import LinkFault, Selector
-from emulator.scenario.faults import Partition
-from emulator.scenario.node_ids import node_id
+from emulator.scenario.faults import LinkFault, Partition, Selector
+from emulator.scenario.network import node_id
 from vnet.errors import ScenarioError, first_names
 from vnet.types import Array, Mask
 

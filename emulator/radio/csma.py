@@ -52,9 +52,8 @@ from emulator.radio.unicast import (
     acknowledgement_of,
     retry_of,
 )
-from emulator.scenario.lookahead import least_latency_ns
 from emulator.scenario.radio import Mac, Receiver
-from emulator.scenario.scenario import Radio
+from emulator.scenario.scenario import Radio, least_latency_ns
 from vnet.units import NS_PER_MS
 
 END, ACK_END, ACK_TIMEOUT, READY, SLOWLY_READY, ACCESS, ACK_BEGIN = range(7)

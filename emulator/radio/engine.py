@@ -39,8 +39,7 @@ from emulator.radio.stages import Latency, Loss, change_by_faults, in_range, los
 from emulator.radio.topology import Topology
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
 from emulator.radio.unicast import Result, address, address_all
-from emulator.scenario.lookahead import MIN_LATENCY_NS
-from emulator.scenario.scenario import Radio
+from emulator.scenario.scenario import MIN_LATENCY_NS, Radio
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
 from vnet.radio import SendOptions

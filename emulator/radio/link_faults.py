@@ -18,8 +18,7 @@ from emulator.radio.frames import Copied, Frame, Receptions
 from emulator.radio.mac import Mac
 from emulator.radio.outcomes import PENDING
 from emulator.radio.own_rules import OwnRules, RuledLinks
-from emulator.scenario.fault_families import DelayFault, LossFault
-from emulator.scenario.faults import Corrupt, Custom, Duplicate, Range, Swizzle, Throttle
+from emulator.scenario.faults import Corrupt, Custom, DelayFault, Duplicate, LossFault, Range, Swizzle, Throttle
 from emulator.scenario.random_streams import Draws
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_MS

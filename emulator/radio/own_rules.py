@@ -28,7 +28,7 @@ from emulator.radio.propagation import DIGITS
 from emulator.radio.rule_answers import Answer, Answered, answered_by_link, answered_by_sender
 from emulator.radio.topology import TopologySnapshot
 from emulator.scenario import rule_watch
-from emulator.scenario.fault_families import OwnRule
+from emulator.scenario.faults import OwnRule
 from emulator.scenario.own_functions import load_function
 from emulator.scenario.program import Program
 from emulator.scenario.random_streams import Draws, frame_stream

@@ -12,9 +12,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.radio import DualSlope, Fading, FreeSpace, LogDistance, Shadowing, TwoRay
 from emulator.scenario.random_streams import Draws
-from emulator.scenario.roadside import RoadsideUnit
 from vnet.types import Array
 
 LIGHT_M_S = 299_792_458.0

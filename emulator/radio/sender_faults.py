@@ -13,8 +13,7 @@ import numpy as np
 from emulator.faults.plan import PlannedFault
 from emulator.radio.choices import Choices
 from emulator.radio.frames import NO_CAUSE
-from emulator.scenario.fault_families import SenderFault
-from emulator.scenario.faults import CustomSender, DataReplay, DoS, StaleMessages, Sybil
+from emulator.scenario.faults import CustomSender, DataReplay, DoS, SenderFault, StaleMessages, Sybil
 from vnet.units import NS_PER_S
 
 REMEMBERED_FRAMES = 4096

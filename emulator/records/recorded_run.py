@@ -48,11 +48,9 @@ from emulator.records.run_tables import VALUES_AS_LIST, StatesReader, TableFile,
 from emulator.records.tables import BUSY, METRICS, PAYLOADS, STATES, TRACE, Condition, Table, always
 from emulator.records.verdict_file import Record, read_record
 from emulator.records.verdicts import MOST_ROWS
-from emulator.scenario.fault_families import ProcessFault, SenderFault
-from emulator.scenario.faults import Range, Swizzle
-from emulator.scenario.recorded import parse_recorded_scenario
-from emulator.scenario.scenario import Scenario, load_scenario
-from emulator.scenario.toml import LARGEST_BYTES
+from emulator.scenario.faults import ProcessFault, Range, SenderFault, Swizzle
+from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.link_table import LinkTable
 from emulator.world.links import load_links
 from emulator.world.neighbours import Links

@@ -30,7 +30,8 @@ from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_ca
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
 from emulator.records.verdicts import Verdict
 from emulator.report.index import write_index
-from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.scenario.loading import dump_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.credibility import after_a_fix, compared_with_before
 from emulator.testing.explanation import PARTING_FILE, Explanation, explain

@@ -14,8 +14,7 @@ import numpy as np
 from emulator.checks.own import load_checks
 from emulator.drivers.session import with_order_steps
 from emulator.radio.own_rules import load_rules
-from emulator.scenario.fault_families import OwnRule
-from emulator.scenario.faults import KINDS
+from emulator.scenario.faults import KINDS, OwnRule
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.schedules import LEAST_TIME_S, Ranges, ScheduleConstraints, draw_fault, known_kinds

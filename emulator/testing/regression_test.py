@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from emulator.scenario.scenario import load_scenario
+from emulator.scenario.loading import load_scenario
 from emulator.testing.trial import REPLAY, TrialPool
 
 TEST_FILE = "test_failure.py"

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from emulator.drivers.join import split_into_processes
-from emulator.scenario.fault_draws import Chooser, Drawn
-from emulator.scenario.fault_families import Fault
-from emulator.scenario.faults import KINDS, parse_fault
+from emulator.scenario.faults import KINDS, Chooser, Drawn, Fault, parse_fault
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError, did_you_mean, printable

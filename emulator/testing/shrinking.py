@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from emulator.scenario.fault_families import Fault, Selector
-from emulator.scenario.faults import Partition
+from emulator.scenario.faults import Fault, Partition, Selector
 
 Schedule = tuple[Fault, ...]
 SHORTEST_S = 0.1

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from hypothesis import strategies as st
 
-from emulator.scenario.fault_families import Fault
+from emulator.scenario.faults import Fault
 from emulator.testing.scenarios import Source, make_scenario
 from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_kinds
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.scenario.limits import WILD_M
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
+from emulator.scenario.sections import WILD_M
 from emulator.world.csv_file import open_csv
 from vnet.errors import ScenarioError, shown
 from vnet.types import Array

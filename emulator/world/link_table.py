@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scenario.limits import DAY_S
+from emulator.scenario.sections import DAY_S
 from emulator.world.csv_file import check_columns, number_within, open_csv
 from vnet.errors import ScenarioError, first_names, shown
 from vnet.types import Array, IntArray

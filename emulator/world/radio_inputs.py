@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulator.scenario.roadside import RoadsideUnit
+from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.scenario import Scenario
 from emulator.world.buildings import Buildings
 from emulator.world.link_table import LinkTable

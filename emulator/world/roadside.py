@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emulator.scenario.roadside import RoadsideUnit
+from emulator.scenario.program import RoadsideUnit
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, shown
 

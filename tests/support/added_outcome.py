@@ -60,7 +60,8 @@ def jam_every_second_frame() -> None:
 
 def legend(vehicles: int) -> list[str]:
     """The names in the legend of a recording's map."""
-    from emulator.scenario.scenario import Scenario, dump_scenario
+    from emulator.scenario.loading import dump_scenario
+    from emulator.scenario.scenario import Scenario
     from emulator.viewer.overview_scene import draw_legend
 
     canvas = Mock()

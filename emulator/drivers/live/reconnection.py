@@ -15,8 +15,7 @@ from emulator.drivers.live.supervisor import ProcessState, Supervisor
 from emulator.drivers.live.waiting import Stalled
 from emulator.drivers.router import ROUTER
 from emulator.records.events import KINDS, EventKind
-from emulator.scenario.fault_families import Infrastructure
-from emulator.scenario.faults import EmulatorRestart
+from emulator.scenario.faults import EmulatorRestart, Infrastructure
 from vnet.transport import wire
 
 AWAIT_WARNING_S = 0.2

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.scenario.driven import Driven
-from emulator.scenario.network import Map
+from emulator.scenario.network import Driven, Map
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.map_links import Links

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.scenario.driven import Driven
+from emulator.scenario.network import Driven
 from emulator.world.driven.road import Ints, Road, SingleRoad
 from vnet.counted import counted
 from vnet.errors import ScenarioError

@@ -17,7 +17,7 @@ from typing import IO, TypeVar
 
 import msgspec
 
-from emulator.scenario.sumo_loop import LIBSUMO
+from emulator.scenario.network import LIBSUMO
 from emulator.world.driven.sumo_messages import LENGTH_BYTES, TIED, Answer, Failure, Request, decode_answer, write
 from vnet.errors import ScenarioError, VnetError, printable
 

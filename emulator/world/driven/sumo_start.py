@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from emulator.scenario.network import Network
-from emulator.scenario.node_ids import node_id
+from emulator.scenario.network import Network, node_id, read_begin_s
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.sumo import read_begin_s
 from emulator.world.driven.sumo_client import SumoProcess
 from emulator.world.driven.sumo_messages import Begin, Begun, Find, Found, State, Step, StepTo
 from vnet.errors import ScenarioError, first_names, shown

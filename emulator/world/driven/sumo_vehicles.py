@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from emulator.scenario.node_ids import node_id
+from emulator.scenario.network import node_id
 from emulator.world.driven.sumo_client import SumoProcess
 from emulator.world.driven.sumo_messages import COLUMNS, Order, State, Step, Watch
 from emulator.world.driven.vehicles import COLLISION, LIMITED, Happening, Log

@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from emulator.scenario.driven import control_step_ns
-from emulator.scenario.node_ids import node_id
+from emulator.scenario.network import Sumo, control_step_ns, node_id
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.sumo_loop import Sumo
 from emulator.world.driven.background import Background
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.sumo_client import require_libsumo

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from emulator.scenario.driven import Driven
+from emulator.scenario.network import Driven
 from emulator.world.driven.dynamics import Limits, Longitudinal
 from emulator.world.driven.rectangles import rectangles_overlap
 from emulator.world.driven.start import Start, one_each, start_on_single_road

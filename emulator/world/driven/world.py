@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.scenario.driven import control_step_ns
+from emulator.scenario.network import control_step_ns
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.start import Start, start_on_single_road
 from emulator.world.driven.stepped import SteppedWorld

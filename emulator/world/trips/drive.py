@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from emulator.scenario.limits import DAY_S
-from emulator.scenario.network import Map, Network
+from emulator.scenario.network import Map, Network, read_begin_s
 from emulator.scenario.program import Program
-from emulator.scenario.sumo import read_begin_s
+from emulator.scenario.sections import DAY_S
 from emulator.world.maps.around import lanes_around, notes_of
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads

@@ -12,7 +12,8 @@ from emulator.checks.judge import check_run
 from emulator.records import run_folder
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import TABLES
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.stream.playback import messages
 from tests.emulator.checks.test_judge import run_scenario
 from tests.emulator.scenario.test_sumo import load as sumo_scenario

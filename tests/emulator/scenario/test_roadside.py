@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scenario.scenario import dump_scenario, load_scenario
+from emulator.scenario.loading import dump_scenario, load_scenario
 from vnet.errors import ScenarioError
 
 

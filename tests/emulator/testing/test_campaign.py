@@ -16,7 +16,8 @@ from rich.console import Console
 from emulator.cells.worker import WorkerDiedError, WorkerTimeoutError
 from emulator.checks.judge import Verdict
 from emulator.scenario.faults import Pause
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing import campaign
 from emulator.testing.campaign import run_campaign
 from emulator.testing.campaign_plan import Plan

@@ -7,9 +7,9 @@ import pytest
 
 from emulator.checks.judge import Verdict
 from emulator.report.index import write_index
-from emulator.scenario.fault_draws import Drawn
-from emulator.scenario.faults import KINDS, Delay, GnssJump
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.faults import KINDS, Delay, Drawn, GnssJump
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.failure_kinds import FailureKind, failure_kinds
 from emulator.testing.matrix import count_verdicts, page

@@ -9,8 +9,7 @@ from hypothesis.errors import NoSuchExample
 
 from emulator.faults.plan import FaultPlan
 from emulator.faults.selectors import Nodes
-from emulator.scenario.fault_families import Selector
-from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause
+from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause, Selector
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import schedule_toml
 from emulator.testing.campaign_plan import Plan

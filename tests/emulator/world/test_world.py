@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError

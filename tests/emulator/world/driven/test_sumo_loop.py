@@ -27,7 +27,8 @@ from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import map_charts
 from emulator.report.source import Source
-from emulator.scenario.scenario import Scenario, load_scenario, scenario_from
+from emulator.scenario.loading import load_scenario, scenario_from
+from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import unpack
 from emulator.stream.playback import messages
 from emulator.viewer.recorder import Recorder

@@ -15,7 +15,8 @@ from emulator.cli.commands import app
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
 from emulator.world.maps.roads import Roads
