@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from emulator.radio.obstacles import Obstacles
 from emulator.radio.propagation import DIGITS, MeanPower
 from emulator.scenario.scenario import Radio, Scenario
-from emulator.world.link_table import LinkTable
 from emulator.world.neighbours import Links, links_within
-from emulator.world.radio_inputs import RadioInputs
+from emulator.world.radio_inputs import LinkTable, RadioInputs
 from vnet.types import Array, IntArray, Mask
 
 

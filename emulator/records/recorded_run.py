@@ -51,10 +51,8 @@ from emulator.records.verdicts import MOST_ROWS
 from emulator.scenario.faults import ProcessFault, Range, SenderFault, Swizzle
 from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.world.link_table import LinkTable
-from emulator.world.links import load_links
 from emulator.world.neighbours import Links
-from emulator.world.radio_inputs import RadioInputs
+from emulator.world.radio_inputs import LinkTable, RadioInputs, load_links
 from emulator.world.world import build_world
 from vnet.bounded import read_regular
 from vnet.errors import ScenarioError, VnetError, printable

@@ -22,7 +22,7 @@ from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
 from emulator.scenario.faults import GnssFault
 from emulator.scenario.scenario import Scenario
-from emulator.world.graph import components_of_links
+from emulator.world.neighbours import components_of_links
 from vnet.errors import VnetError, did_you_mean, first_names, shown
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S

@@ -1,7 +1,7 @@
 """The faults of a scenario: what each kind is called, what it inherits, when it acts, and how campaigns draw it.
 
-A kind of fault is one class that derives from a family, below. The class is the only place that says
-how the kind is called, which parameters it has, what the reference page says about it, how a campaign draws it, and which law it
+A kind of fault is one class that derives from a family, below. The class is the only place that says how the kind
+is called, which parameters it has, what the reference page says about it, how a campaign draws it, and which law it
 follows. CONTRIBUTING.md shows an example. The layers above act on families:
 
 | family | carried out by | judged by |

@@ -33,7 +33,7 @@ from emulator.stream.messages import unpack
 from emulator.stream.playback import messages
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
-from emulator.world.driven.sumo_world import SumoWorld
+from emulator.world.driven.sumo import SumoWorld
 from emulator.world.world import build_world
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together
 from tests.support.recordings import read_back
