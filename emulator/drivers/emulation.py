@@ -22,10 +22,10 @@ from emulator.drivers.orders import Orders
 from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
-from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import abilities_of
 from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
+from emulator.radio.topology import connectivity_of
 from emulator.records.costs import Costs
 from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics

@@ -42,8 +42,7 @@ from emulator.radio.frames import BROADCAST, Frame
 from emulator.radio.mac import Throttle
 from emulator.radio.medium import WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
-from emulator.radio.reception import Threshold, milliwatts
-from emulator.radio.signals import BACKOFF, JITTER, NEXT_BACKOFF, Signals, sender_draw
+from emulator.radio.reception import BACKOFF, JITTER, NEXT_BACKOFF, Signals, Threshold, milliwatts, sender_draw
 from emulator.radio.unicast import (
     ACK_TIMEOUT_NS,
     MOST_ATTEMPTS,

@@ -20,23 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
-from emulator.radio.byte_flips import flipped
-from emulator.radio.choices import Choices, allowed_choices
-from emulator.radio.connectivity import connectivity_of
 from emulator.radio.csma import Csma
-from emulator.radio.frames import BROADCAST, Frame, Receptions, Stage
+from emulator.radio.faults import LinkFaults, Outgoing, SenderFaults
+from emulator.radio.frames import BROADCAST, Choices, Frame, Receptions, Stage, allowed_choices, flipped
 from emulator.radio.in_flight import NO_ARRIVAL_NS, Deliveries, Delivery, InFlight
-from emulator.radio.link_faults import LinkFaults
 from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
 from emulator.radio.propagation import transmit_powers_dbm
-from emulator.radio.reception import Reception
-from emulator.radio.sender_faults import Outgoing, SenderFaults
-from emulator.radio.signals import Signals
+from emulator.radio.reception import Reception, Signals
 from emulator.radio.stages import Latency, Loss, change_by_faults, in_range, lose_by_faults, peer_cap, sender_side
-from emulator.radio.topology import Topology
+from emulator.radio.topology import Topology, connectivity_of
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
 from emulator.radio.unicast import Result, address, address_all
 from emulator.scenario.scenario import MIN_LATENCY_NS, Radio

@@ -6,6 +6,7 @@ not depend on changes while it waits or is on air, nor on the steps in which the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -14,8 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.outcomes import PENDING, Outcome
+from emulator.radio.propagation import DIGITS
 from emulator.radio.rule_answers import Answered
 from emulator.radio.topology import TopologySnapshot
+from emulator.scenario.radio import RATES_MBPS
+from emulator.scenario.scenario import Radio
+from vnet.radio import MIN_POWER_DBM, SendOptions
 from vnet.types import Mask
 
 NO_CAUSE = -1
@@ -24,6 +29,55 @@ NOT_ON_AIR = -1
 """Start of the transmission of a frame that was never transmitted, or whose start is not modelled."""
 BROADCAST = -1
 """Addressee of a frame to all."""
+
+
+def random_flips(draw: float, size_bytes: int, count: int) -> Iterator[tuple[int, int]]:
+    """Return `count` bytes of a frame to alter, as position and XOR mask, from a uniform draw in [0, 1).
+
+    All bytes of a shorter frame are altered.
+    """
+    rng = np.random.default_rng(int(draw * 2**53))
+    positions = rng.choice(size_bytes, size=min(count, size_bytes), replace=False)
+    masks = rng.integers(1, 256, size=len(positions))
+    return zip(positions.tolist(), masks.tolist(), strict=True)
+
+
+def flips_between(sent: bytes, arrived: bytes) -> Iterator[tuple[int, int]]:
+    """Yield where two payloads of one length differ, as position and XOR mask."""
+    for position, (before, after) in enumerate(zip(sent, arrived, strict=True)):
+        if before != after:
+            yield position, before ^ after
+
+
+def flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:
+    """Return a payload with these bytes altered."""
+    changed = bytearray(payload)
+    for position, mask in flips:
+        changed[position] ^= mask
+    return bytes(changed)
+
+
+class Choices(NamedTuple):
+    """Power of a frame above its sender's largest in dB, bit rate in Mbit/s, addressee, and the sender's ticket."""
+
+    gain_db: float
+    bitrate_mbps: float
+    to: int = BROADCAST
+    ticket: int = 0
+
+
+def allowed_choices(radio: Radio, options: SendOptions, largest_dbm: float | None) -> Choices:
+    """Return the power and the bit rate that a program has chosen for a frame, as far as the radio has them.
+
+    `largest_dbm` is the sender's largest power, None without a path loss.
+    """
+    gain_db, bitrate_mbps = 0.0, radio.bitrate_mbps
+    if options.power_dbm is not None and largest_dbm is not None and math.isfinite(options.power_dbm):
+        power_dbm = max(options.power_dbm, MIN_POWER_DBM)
+        gain_db = round(min(power_dbm - largest_dbm, 0.0), DIGITS)
+    if radio.is_physical and options.rate_mbps in RATES_MBPS:
+        bitrate_mbps = float(options.rate_mbps or bitrate_mbps)
+    return Choices(gain_db, bitrate_mbps)
 
 
 @dataclass(slots=True, eq=False)

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
-from emulator.radio.byte_flips import flips_between, random_flips
-from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions
+from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions, flips_between, random_flips
 from emulator.radio.outcomes import PENDING
 from emulator.radio.propagation import DIGITS
 from emulator.radio.rule_answers import Answer, Answered, answered_by_link, answered_by_sender

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.frames import Frame, Receptions, rows
 from emulator.radio.outcomes import PENDING, Outcome
-from emulator.radio.signals import latency_draws
+from emulator.radio.reception import latency_draws
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import MIN_LATENCY_NS, Radio
 from vnet.types import Array

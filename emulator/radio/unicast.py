@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.dot11p import PREAMBLE_NS, SIFS_NS, SLOT_NS, airtime_ns
+from emulator.radio.faults import ActiveLinkFaults
 from emulator.radio.frames import BROADCAST, NO_CAUSE, Frame, Receptions
-from emulator.radio.link_faults import ActiveLinkFaults
 from emulator.radio.medium import Medium
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
-from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Stage, decided_at
+from emulator.radio.topology import connectivity_of
 from emulator.radio.trace import ACKNOWLEDGED, LATE
 from emulator.records.busy import busy_windows
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events

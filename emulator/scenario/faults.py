@@ -7,9 +7,9 @@ follows. CONTRIBUTING.md shows an example. The layers above act on families:
 | family | carried out by | judged by |
 |---|---|---|
 | `ProcessFault` | `drivers/emulation.py` | `checks/faults.py` |
-| `cuts = True` | `radio/link_faults.py` | `checks/faults.py` |
-| `LossFault`, `DelayFault` | `radio/link_faults.py` by the kind's law | `checks/faults.py`, `checks/latency.py` |
-| `SenderFault` | `radio/sender_faults.py` | `checks/senders.py` |
+| `cuts = True` | `radio/faults.py` | `checks/faults.py` |
+| `LossFault`, `DelayFault` | `radio/faults.py` by the kind's law | `checks/faults.py`, `checks/latency.py` |
+| `SenderFault` | `radio/faults.py` | `checks/senders.py` |
 | `OwnRule` | `radio/own_rules.py` | `checks/own_rules.py` |
 | `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/senders.py`, `checks/fault_effects.py` |
 | `Infrastructure` | `drivers/live/reconnection.py` | `checks/fault_effects.py` |

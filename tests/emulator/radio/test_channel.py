@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from emulator.radio.connectivity import Disc
 from emulator.radio.engine import Engine
+from emulator.radio.faults import ActiveLinkFaults
 from emulator.radio.frames import Frame, Receptions, Stage
-from emulator.radio.link_faults import ActiveLinkFaults
 from emulator.radio.mac import TransmitQueue
 from emulator.radio.outcomes import Outcome
 from emulator.radio.stages import Latency, Loss, in_range, peer_cap, sender_side
-from emulator.radio.topology import Topology
+from emulator.radio.topology import Disc, Topology
 from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of
 from emulator.scenario.scenario import Radio
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from emulator.radio.connectivity import distances_m
 from emulator.radio.propagation import MeanPower, loss_db
+from emulator.radio.topology import distances_m
 from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.radio import PathLoss
 

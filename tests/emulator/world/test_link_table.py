@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from emulator.checks.judge import judge
 from emulator.export.measured_links import measured_links
-from emulator.radio.connectivity import Measured, connectivity_of
 from emulator.radio.engine import Engine
+from emulator.radio.topology import Measured, connectivity_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Radio, Scenario
 from emulator.world.radio_inputs import LinkTable, RadioInputs, load_links
