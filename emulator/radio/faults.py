@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault, swizzle_times_ns
-from emulator.radio.frames import NO_CAUSE, Choices, Copied, Frame, Receptions, random_flips
+from emulator.radio.frames import Copied, CopyNumbers, Frame, Receptions, Transmission, random_flips
 from emulator.radio.mac import Mac
 from emulator.radio.outcomes import PENDING
 from emulator.radio.own_rules import OwnRules, RuledLinks
@@ -84,8 +83,9 @@ class ActiveLinkFaults:
         """True if a reception may arrive more than once."""
         return bool(self.copying or self.ruled)
 
-    def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
+    def losses(self, sent: Transmission) -> Iterator[tuple[int, Mask]]:
         """Yield, in the order in which faults act, a fault's number and the columns (M,) that lose the frame."""
+        frame = sent.frame
         at = frame.topology.receivers(frame.sender)
         for number, cut in self.cut:
             yield number, cut[frame.sender][at]
@@ -95,10 +95,11 @@ class ActiveLinkFaults:
         for one in self.losing:
             yield one.planned.number, (_lost(one, frame) & _links(one)[frame.sender])[at]
         for ruled in self.ruled:
-            yield ruled.planned.number, ruled.lost(frame)
+            yield ruled.planned.number, ruled.lost(sent)
 
-    def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
-        """Delay, duplicate or alter the pending receptions of frame number `index`."""
+    def changes(self, sent: Transmission, index: int, receptions: Receptions) -> None:
+        """Delay, duplicate or alter the pending receptions of transmission number `index`."""
+        frame = sent.frame
         pending = receptions.outcome[index] == PENDING
         at: _Columns = slice(None) if receptions.receiver is None else receptions.receiver[index]
         for one in self.delaying:
@@ -118,7 +119,7 @@ class ActiveLinkFaults:
             draws, links = _drawn(one, frame, at)
             _corrupt(one, frame, index, receptions, draws, pending & links)
         for ruled in self.ruled:
-            ruled.change(frame, index, receptions)
+            ruled.change(sent, index, receptions)
 
 
 class LinkFaults:
@@ -226,52 +227,21 @@ REMEMBERED_FRAMES = 4096
 """Frames kept of each affected sender, to be sent again."""
 
 
-class _Sent(NamedTuple):
-    """A frame that an affected sender has sent."""
-
-    time_ns: int
-    seq: int
-    payload: bytes
-    choices: Choices
-
-
-@dataclass(frozen=True, slots=True)
-class Outgoing:
-    """A frame before it is enqueued: copy number `copy` of frame `seq`, sent under the name `alias` if it is set.
-
-    `choices` are power, bit rate and addressee, those of the frame that is sent again if it is an older one. `draw`
-    distinguishes its random draws from those of the other copies. The frame is recorded, but never sent, if the
-    fault `cause` has `dropped` it.
-    """
-
-    payload: bytes
-    seq: int
-    choices: Choices
-    copy: int = 0
-    draw: int = 0
-    cause: int = NO_CAUSE
-    alias: str | None = None
-    dropped: bool = False
-
-
 class SenderFaults:
     """The acting sender faults, and the frames that affected senders have sent.
 
-    `next_copy` numbers the copies of (sender, seq). `ask` returns the payloads that a rule of the user's own sends
-    in place of a frame, none if it drops it: of a fault, at a time in ns, by a sender.
+    They number copies of frames among `copies`. `ask` returns the payloads that a rule of the user's own sends in
+    place of a frame, none if it drops it.
     """
 
     def __init__(
-        self,
-        node_ids: Sequence[str],
-        next_copy: Callable[[int, int], int],
-        ask: Callable[[PlannedFault, int, int, Outgoing], list[bytes]],
+        self, node_ids: Sequence[str], copies: CopyNumbers, ask: Callable[[PlannedFault, Frame], list[bytes]]
     ) -> None:
         self._ask = ask
         self._node_ids = node_ids
-        self._next_copy = next_copy
+        self._copies = copies
         self._acting: dict[int, list[PlannedFault]] = {}
-        self._sent: dict[int, deque[_Sent]] = {}
+        self._sent: dict[int, deque[Frame]] = {}
 
     @property
     def misbehave(self) -> bool:
@@ -287,55 +257,60 @@ class SenderFaults:
                     self._acting.setdefault(node, []).append(planned)
         self._sent = {node: self._sent.get(node, deque(maxlen=REMEMBERED_FRAMES)) for node in self._acting}
 
-    def frames(self, time_ns: int, node: int, original: Outgoing) -> Iterator[Outgoing]:
-        """Yield all frames that are sent when `node` enqueues one."""
-        acting = self._acting.get(node)
-        if not acting:
-            yield original
-            return
-        seq, choices = original.seq, original.choices
-        self._sent[node].append(_Sent(time_ns, seq, original.payload, choices))
+    def frames(self, frame: Frame) -> Iterator[Frame]:
+        """Yield all frames that are sent when a node enqueues one."""
+        acting = self._acting.get(frame.sender, ())
+        if acting:
+            self._sent[frame.sender].append(frame)
+        original = frame
         for planned in acting:
-            if isinstance(planned.fault, StaleMessages) and (old := self._from(node, time_ns, planned.fault.age_s)):
-                again = old.choices._replace(ticket=choices.ticket)
-                original = Outgoing(old.payload, seq, again, cause=planned.number)
+            if isinstance(planned.fault, StaleMessages) and (old := self._older(original, planned.fault.age_s)):
+                frame = replace(_again(original, old), cause=planned.number)
         further: dict[int, list[bytes]] = {}
         for planned in acting:
-            if isinstance(planned.fault, CustomSender) and not original.dropped:
-                sent = self._ask(planned, time_ns, node, Outgoing(original.payload, seq, original.choices))
+            if isinstance(planned.fault, CustomSender) and not frame.dropped:
+                sent = self._ask(planned, frame)
                 further[planned.number] = sent[1:]
                 if not sent:
-                    original = replace(original, cause=planned.number, dropped=True)
-                elif sent[0] != original.payload:
-                    original = replace(original, payload=sent[0], cause=planned.number)
-        yield original
+                    frame = replace(frame, cause=planned.number, dropped=True)
+                elif sent[0] != frame.payload:
+                    frame = replace(frame, payload=sent[0], cause=planned.number)
+        yield frame
         for planned in acting:
             for index, more in enumerate(further.get(planned.number, ()), start=1):
-                yield self._copy(planned, node, replace(original, payload=more), index)
-            yield from self._again(planned, time_ns, node, original)
+                yield self._copy(planned, replace(frame, payload=more), index)
+            yield from self._repeated(planned, frame)
 
-    def _again(self, planned: PlannedFault, time_ns: int, node: int, original: Outgoing) -> Iterator[Outgoing]:
+    def _repeated(self, planned: PlannedFault, frame: Frame) -> Iterator[Frame]:
         match planned.fault:
             case DoS(factor=factor):
                 for index in range(1, factor):
-                    yield self._copy(planned, node, original, index)
+                    yield self._copy(planned, frame, index)
             case Sybil(ghosts=ghosts):
                 for ghost in range(1, ghosts + 1):
-                    yield self._copy(planned, node, original, ghost, f"{self._node_ids[node]}~{ghost}")
+                    yield self._copy(planned, frame, ghost, f"~{ghost}")
             case DataReplay(age_s=age_s):
-                if old := self._from(node, time_ns, age_s):
-                    again = Outgoing(old.payload, old.seq, old.choices)
-                    yield self._copy(planned, node, again, original.seq - old.seq)
+                if old := self._older(frame, age_s):
+                    yield self._copy(planned, replace(_again(frame, old), seq=old.seq), frame.seq - old.seq)
 
-    def _copy(
-        self, planned: PlannedFault, node: int, frame: Outgoing, index: int, alias: str | None = None
-    ) -> Outgoing:
+    def _copy(self, planned: PlannedFault, frame: Frame, index: int, suffix: str = "") -> Frame:
         """Return another copy of a frame; `index` distinguishes the copies that one fault makes of it."""
-        draw = (planned.number + 1 << 32) + index
-        copy = self._next_copy(node, frame.seq)
-        return Outgoing(frame.payload, frame.seq, frame.choices, copy, draw, planned.number, alias)
+        return replace(
+            frame,
+            copy=self._copies.next(frame.sender, frame.seq),
+            draw=(planned.number + 1 << 32) + index,
+            cause=planned.number,
+            name=self._node_ids[frame.sender] + suffix,
+            dropped=False,
+            ticket=0,
+        )
 
-    def _from(self, node: int, time_ns: int, age_s: float) -> _Sent | None:
-        """Return the latest frame of `node` that is at least `age_s` old, or None."""
-        before_ns = time_ns - round(age_s * NS_PER_S)
-        return next((sent for sent in reversed(self._sent[node]) if sent.time_ns <= before_ns), None)
+    def _older(self, frame: Frame, age_s: float) -> Frame | None:
+        """Return the latest frame of a frame's sender that is at least `age_s` older, or None."""
+        before_ns = frame.sent_ns - round(age_s * NS_PER_S)
+        return next((sent for sent in reversed(self._sent[frame.sender]) if sent.sent_ns <= before_ns), None)
+
+
+def _again(frame: Frame, old: Frame) -> Frame:
+    """Return a frame that is an older one, sent again now: its payload, power, bit rate and addressee."""
+    return replace(frame, payload=old.payload, gain_db=old.gain_db, bitrate_mbps=old.bitrate_mbps, to=old.to)

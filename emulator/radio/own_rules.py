@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
-from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions, flips_between, random_flips
+from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions, Transmission, flips_between, random_flips
 from emulator.radio.outcomes import PENDING
 from emulator.radio.propagation import DIGITS
 from emulator.radio.rule_answers import Answer, Answered, answered_by_link, answered_by_sender
@@ -193,29 +193,29 @@ class RuledLinks:
     draws: Draws
     rules: OwnRules
 
-    def lost(self, frame: Frame) -> Mask:
+    def lost(self, sent: Transmission) -> Mask:
         """Return the columns (M,) at which the rule drops a frame; what else it answers is kept for `change`."""
-        topology, sender, links = frame.topology, frame.sender, self.planned.links
+        topology, sender, links = sent.frame.topology, sent.frame.sender, self.planned.links
         assert links is not None
         drop = np.zeros(topology.in_range.shape[1], dtype=bool)
         near = topology.in_range[sender] & topology.admitted[sender] & links[sender][topology.receivers(sender)]
         columns = np.flatnonzero(near)
-        if frame.sender_outcome or not len(columns):
+        if sent.sender_outcome or not len(columns):
             return drop
-        answered = self.rules.ask_link(self.planned, frame, columns)
+        answered = self.rules.ask_link(self.planned, sent.frame, columns)
         if answered is not None:
             drop[columns] = answered.drop
-            frame.answers[self.planned.number] = columns, answered
+            sent.answers[self.planned.number] = columns, answered
         return drop
 
-    def change(self, frame: Frame, index: int, receptions: Receptions) -> None:
-        """Delay, alter and duplicate the pending receptions of frame number `index` as the rule has answered."""
-        if self.planned.number not in frame.answers:
+    def change(self, sent: Transmission, index: int, receptions: Receptions) -> None:
+        """Delay, alter and duplicate the pending receptions of transmission number `index` as the rule says."""
+        if self.planned.number not in sent.answers:
             return
-        columns, answered = frame.answers[self.planned.number]
+        columns, answered = sent.answers[self.planned.number]
         pending = receptions.outcome[index, columns] == PENDING
         self._delay(answered.delay_ns, columns[pending], pending, index, receptions)
-        self._alter(answered, frame, index, columns, pending, receptions)
+        self._alter(answered, sent.frame, index, columns, pending, receptions)
         copied = np.where(pending, answered.copies, 0)
         for number in range(int(copied.max())):
             mask = np.zeros(receptions.outcome.shape[1], dtype=bool)

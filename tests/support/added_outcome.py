@@ -48,12 +48,12 @@ def jam_every_second_frame() -> None:
 
     lose = Loss.__call__
 
-    def jam(self: Any, frames: Any, receptions: Any) -> None:
-        for index, frame in enumerate(frames):
+    def jam(self: Any, transmissions: Any, receptions: Any) -> None:
+        for index, sent in enumerate(transmissions):
             row = receptions.outcome[index]
-            if frame.seq % 2:
+            if sent.frame.seq % 2:
                 row[row == PENDING] = Outcome["jammed"]
-        lose(self, frames, receptions)
+        lose(self, transmissions, receptions)
 
     Loss.__call__ = jam  # type: ignore[method-assign]
 
