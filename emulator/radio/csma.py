@@ -36,12 +36,9 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from emulator.radio.congestion import CongestionControl, congestion_control_of
 from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
-from emulator.radio.frames import BROADCAST, CopyNumbers, Receptions, Result, Transmission
+from emulator.radio.frames import BROADCAST, CopyNumbers, Receptions, Transmission
 from emulator.radio.mac import Mac, Throttle
 from emulator.radio.medium import WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
@@ -61,7 +58,7 @@ from emulator.radio.unicast import (
 from emulator.scenario.radio import Mac as MacSection
 from emulator.scenario.radio import Receiver
 from emulator.scenario.scenario import Radio, least_latency_ns
-from vnet.types import Array, IntArray
+from vnet.types import Array
 from vnet.units import NS_PER_MS
 
 HEARD, ACK_HEARD, END, ACK_END, ACK_TIMEOUT, READY, SLOWLY_READY, ACCESS, ACK_BEGIN = range(9)
@@ -129,13 +126,21 @@ def edca_parameters(mac: MacSection) -> EdcaParameters:
 class Csma(Mac):
     """MAC of `count` vehicles that share one medium; see the module's docstring.
 
-    It asks the `topology` who is up, notes acknowledgements in the `trace`, and numbers retries among `copies`.
+    It asks the `topology` who is up, notes acknowledgements in the `trace`, numbers retries among `copies`, and
+    tells `unicasts` what became of frames to single vehicles.
     """
 
     shares_medium = True
 
     def __init__(
-        self, radio: Radio, signals: Signals, topology: Topology, trace: Trace, copies: CopyNumbers, seed: int
+        self,
+        radio: Radio,
+        signals: Signals,
+        topology: Topology,
+        trace: Trace,
+        copies: CopyNumbers,
+        unicasts: Unicasts,
+        seed: int,
     ) -> None:
         super().__init__()
         mac = radio.mac
@@ -145,7 +150,7 @@ class Csma(Mac):
         self._has_eifs = mac.eifs  # after broadcasts, too
         self._count = signals.count
         self._deferral = Deferral(self._count) if mac.eifs else None
-        self._unicasts = Unicasts(least_latency_ns(radio), trace)
+        self._unicasts = unicasts
         self._signals = signals
         self._topology = topology
         self._trace = trace
@@ -469,45 +474,7 @@ class Csma(Mac):
             station.queue.appendleft(retry)
         self._back_off(station, sent, now_ns, attempts)
 
-    # What nodes are told.
-
-    @property
-    def has_results(self) -> bool:
-        """See `Mac`."""
-        return self._unicasts.are_open
-
-    def ticket(self, sender: int, to: int, number: int, time_ns: int) -> int | None:
-        """See `Mac`; a frame to its own sender, or to nobody, has failed."""
-        if to in (sender, BROADCAST):
-            self._unicasts.refuse(sender, number, time_ns)
-            return None
-        return self._unicasts.register(sender, number)
-
-    def next_result_ns(self) -> int | None:
-        """See `Mac`."""
-        return self._unicasts.next_ns()
-
-    def take_results(self, time_ns: int) -> list[Result]:
-        """See `Mac`."""
-        return self._unicasts.take(time_ns)
-
-    def forget(self, node: int) -> None:
-        """See `Mac`."""
-        self._unicasts.forget(node)
-
-    def note_duplicates(
-        self,
-        transmissions: Sequence[Transmission],
-        first_row: int,
-        outcome: NDArray[np.uint8],
-        arrival_ns: IntArray,
-    ) -> None:
-        """See `Mac`."""
-        self._unicasts.note_duplicates(transmissions, first_row, outcome, arrival_ns)
-
-    def miss_duplicates(self, time_ns: int, counts: dict[Outcome, int]) -> None:
-        """See `Mac`."""
-        self._unicasts.miss_duplicates(time_ns, self._topology.up, counts)
+    # How busy the medium is.
 
     def busy_ratios(self, time_ns: int) -> list[Array]:
         """See `Mac`."""

@@ -42,7 +42,8 @@ from emulator.radio.reception import Reception, Signals
 from emulator.radio.stages import Latency, Loss, change_by_faults, in_range, lose_by_faults, peer_cap, sender_side
 from emulator.radio.topology import Topology, connectivity_of
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
-from emulator.scenario.scenario import MIN_LATENCY_NS, Radio
+from emulator.radio.unicast import Unicasts
+from emulator.scenario.scenario import MIN_LATENCY_NS, Radio, least_latency_ns
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
 from vnet.radio import SendOptions
@@ -84,8 +85,9 @@ class Engine:
         self._topology = Topology(position_m, connectivity_of(radio, seed, inputs), radio.max_peers, nakagami)
         self._trace = Trace(node_ids, radio.mac is not None, knows_power=radio.path_loss is not None)
         self._copies = CopyNumbers()
+        self._unicasts = Unicasts(least_latency_ns(radio), self._trace)
         if radio.mac is not None and signals is not None:
-            self._mac: Mac = Csma(radio, signals, self._topology, self._trace, self._copies, seed)
+            self._mac: Mac = Csma(radio, signals, self._topology, self._trace, self._copies, self._unicasts, seed)
         else:
             self._mac = TransmitQueue(seed, radio)
         self._rules = rules or OwnRules(seed, node_ids)
@@ -137,7 +139,7 @@ class Engine:
         """Set a node up or down. A node that is down sends nothing; what arrives there is `receiver_down`."""
         self._topology.set_up(node, up)
         if not up:
-            self._mac.forget(node)
+            self._unicasts.forget(node)
 
     def set_faults(self, active: Sequence[PlannedFault], time_ns: int) -> None:
         """Let exactly these faults act from `time_ns` on. Receptions in flight are not affected."""
@@ -196,10 +198,12 @@ class Engine:
         to, ticket = BROADCAST, 0
         if options.to is not None:
             to = self._number.get(options.to, BROADCAST)
-            given = self._mac.ticket(node, to, options.number, frame.sent_ns)
-            if given is None:
+            if not self._mac.shares_medium:
                 return None
-            ticket, self._trace.acknowledges = given, True
+            if to in (node, BROADCAST):
+                self._unicasts.refuse(node, options.number, frame.sent_ns)
+                return None
+            ticket, self._trace.acknowledges = self._unicasts.register(node, options.number), True
         if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
         return replace(frame, gain_db=gain_db, bitrate_mbps=bitrate_mbps, to=to, ticket=ticket)
@@ -314,7 +318,7 @@ class Engine:
             if number:
                 self._counts[Outcome(kind)] += number
         if self._trace.acknowledges:
-            self._mac.note_duplicates(transmissions, first, outcome, arrival_ns)
+            self._unicasts.note_duplicates(transmissions, first, outcome, arrival_ns)
         flying = np.flatnonzero(outcome == PENDING)
         self._in_flight.add(
             transmissions, frame_index[flying], receiver[flying], first + flying, arrival_ns[flying]
@@ -351,7 +355,7 @@ class Engine:
         while (next_ns := self._mac.next_ns()) is not None and next_ns < until_ns:
             if (ended := self._mac.step()) is not None:
                 self._judge(ended)
-            if ended is not None or self._mac.sent or self._mac.has_results:
+            if ended is not None or self._mac.sent or self._unicasts.are_open:
                 until_ns = self._first_ns(time_ns, nodes)
 
     def _first_ns(self, time_ns: int, nodes: Sequence[int] | IntArray) -> int:
@@ -362,14 +366,14 @@ class Engine:
 
     def next_result_ns(self) -> int | None:
         """Return the time of the next result of a frame to a single vehicle, as far as it is known, or None."""
-        if not self._mac.has_results:
+        if not self._unicasts.are_open:
             return None
         self._settle()
-        return self._mac.next_result_ns()
+        return self._unicasts.next_ns()
 
     def take_results(self, time_ns: int) -> list[Result]:
         """Remove and return the results up to `time_ns` of frames to single vehicles, in order."""
-        return [] if self.next_result_ns() is None else self._mac.take_results(time_ns)
+        return [] if self.next_result_ns() is None else self._unicasts.take(time_ns)
 
     def pending_rows(self) -> list[int]:
         """Return the row numbers of the trace whose receptions are in flight."""
@@ -394,7 +398,7 @@ class Engine:
 
     def _arrive(self, time_ns: int) -> Deliveries:
         arrived = self._take_arrivals(time_ns)
-        self._mac.miss_duplicates(time_ns, self._counts)
+        self._unicasts.miss_duplicates(time_ns, self._topology.up, self._counts)
         return arrived
 
     def _take_arrivals(self, time_ns: int) -> Deliveries:

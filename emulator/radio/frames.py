@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.propagation import DIGITS
-from emulator.radio.rule_answers import Answered
 from emulator.radio.topology import TopologySnapshot
 from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio
@@ -89,6 +88,18 @@ class Signal:
     sender_draws: int
     locked: NDArray[np.bool_] | None = None
     pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Answered:
+    """The answer of a rule of the user's own to a frame: arrays (n,) over a frame's receivers, and payloads by index."""
+
+    drop: Mask
+    delay_ns: NDArray[np.int64]
+    corrupt: NDArray[np.int64]
+    payload: Mapping[int, bytes]
+    copies: NDArray[np.int64]
+    copy_delay_ns: int
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

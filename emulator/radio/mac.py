@@ -7,15 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from emulator.radio.dot11p import airtime_ns
-from emulator.radio.frames import Frame, Receptions, Result, Transmission
+from emulator.radio.frames import Frame, Receptions, Transmission
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio
-from vnet.types import Array, IntArray
+from vnet.types import Array
 from vnet.units import NS_PER_MS
 
 
@@ -31,7 +28,7 @@ class Mac:
     """
 
     shares_medium: ClassVar[bool] = False
-    """True if the vehicles share a medium, which they sense."""
+    """True if the vehicles share a medium: they sense how busy it is, and acknowledge frames to one of them."""
 
     def __init__(self) -> None:
         self.sent: list[Transmission] = []
@@ -58,42 +55,6 @@ class Mac:
 
     def judge(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
         """Note who could read transmissions, and what becomes of those to single vehicles."""
-
-    # Frames to single vehicles.
-
-    @property
-    def has_results(self) -> bool:
-        """True if a result is not known yet, or has not been taken."""
-        return False
-
-    def ticket(self, sender: int, to: int, number: int, time_ns: int) -> int | None:
-        """Return a ticket for frame `number` of a node to the node number `to`; None if it cannot be sent."""
-        return None
-
-    def next_result_ns(self) -> int | None:
-        """Return the time of the next result, or None."""
-        return None
-
-    def take_results(self, time_ns: int) -> list[Result]:
-        """Remove and return the results up to `time_ns`, in order."""
-        return []
-
-    def forget(self, node: int) -> None:
-        """Forget what a node that goes down has asked for."""
-
-    def note_duplicates(
-        self,
-        transmissions: Sequence[Transmission],
-        first_row: int,
-        outcome: NDArray[np.uint8],
-        arrival_ns: IntArray,
-    ) -> None:
-        """Note the attempts received once more; outcome and arrival (n,) are those of rows from the first on."""
-
-    def miss_duplicates(self, time_ns: int, counts: dict[Outcome, int]) -> None:
-        """Change attempts that would arrive by `time_ns` to `receiver_down`, where nobody got the one before."""
-
-    # How busy the medium is.
 
     def busy_ratios(self, time_ns: int) -> list[Array]:
         """Return the channel busy ratios (N,) of every window that ends by `time_ns`, which `run` has reached."""

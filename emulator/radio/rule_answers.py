@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emulator.radio.frames import Answered
 from emulator.scenario.own_functions import NonsenseError
 from vnet.errors import shown
 from vnet.types import Mask
@@ -37,18 +38,6 @@ class Answer(NamedTuple):
     """Number of further arrivals, 0 to 20."""
     copy_delay_s: float = 0.01
     """Time from one of these arrivals to the next in seconds, more than 0 and up to 60."""
-
-
-@dataclass(frozen=True)
-class Answered:
-    """An answer that has been understood: arrays (n,) over a frame's receivers, and payloads by index."""
-
-    drop: Mask
-    delay_ns: NDArray[np.int64]
-    corrupt: NDArray[np.int64]
-    payload: Mapping[int, bytes]
-    copies: NDArray[np.int64]
-    copy_delay_ns: int
 
 
 def answered_by_link(answer: Any, receivers: Sequence[str], size_bytes: int) -> Answered:

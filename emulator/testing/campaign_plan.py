@@ -29,7 +29,6 @@ RANDOM, NONE = "random", "none"
 """Faults of all kinds, and none drawn: then the runs differ by their seeds."""
 SHRINK_STEPS = 250
 """Runs that shrink a failure: of its order, then of its faults, then of its vehicles and seconds."""
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
