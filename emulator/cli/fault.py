@@ -13,7 +13,7 @@ import typer
 from msgspec import convert
 from rich.table import Table
 
-from emulator.cli.help import group
+from emulator.cli.application import group
 from emulator.drivers.control import ask
 from emulator.drivers.status import Snapshot
 from emulator.scenario.faults import KINDS, OwnRule, parse_fault

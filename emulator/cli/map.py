@@ -12,7 +12,7 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from emulator.cli.help import group
+from emulator.cli.application import group
 from emulator.cli.options import pair
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.safe_console import SafeConsole

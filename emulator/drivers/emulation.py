@@ -20,8 +20,7 @@ from emulator.drivers.driving import Driving
 from emulator.drivers.log_book import LogBook
 from emulator.drivers.orders import Orders
 from emulator.drivers.presence import Presence
-from emulator.faults.plan import FaultPlan, PlannedFault
-from emulator.faults.selectors import Nodes
+from emulator.faults.plan import FaultPlan, Nodes, PlannedFault
 from emulator.radio.dot11p import abilities_of
 from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure

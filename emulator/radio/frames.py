@@ -92,7 +92,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Answered:
-    """The answer of a rule of the user's own to a frame: arrays (n,) over a frame's receivers, and payloads by index."""
+    """Answer of a rule of the user's own to a frame: arrays (n,) over its receivers, and payloads by index."""
 
     drop: Mask
     delay_ns: NDArray[np.int64]

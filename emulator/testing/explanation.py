@@ -19,7 +19,7 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.loading import dump_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import with_seed
-from emulator.testing.shrinking_runs import with_faults, with_tape
+from emulator.testing.shrinking import with_faults, with_tape
 from emulator.testing.trial import TrialPool
 from vnet.errors import VnetError, printable
 from vnet.units import NS_PER_S

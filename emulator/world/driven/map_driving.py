@@ -20,8 +20,7 @@ from emulator.world.maps.roads import NUMBER, Ints, Roads
 from emulator.world.neighbours import links_within
 from emulator.world.projection import Frame
 from vnet.errors import ScenarioError, did_you_mean, first_names
-from vnet.roads.grid import ranges
-from vnet.roads.road_map import RoadMap
+from vnet.roads.road_map import RoadMap, ranges
 from vnet.types import Array, Mask
 
 ROOM_M = 4.0

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import emulator
-from emulator.cli.check import check
+from emulator.cli.folders import check
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.program import Program
 from emulator.world.trips.drive import drive
