@@ -10,7 +10,7 @@ from rich.console import Console
 
 from emulator.drivers.session import Session
 from emulator.drivers.status import Course, Snapshot
-from emulator.scenario.scenario import load_scenario
+from emulator.scenario.loading import load_scenario
 from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import EVERY_S, Painter
 

@@ -5,8 +5,7 @@ import time
 
 import numpy as np
 
-from emulator.world.maps.classes import NUMBER
-from emulator.world.maps.roads import Roads, RoadsBuilder
+from emulator.world.maps.roads import NUMBER, Roads, RoadsBuilder
 
 STREETS, BLOCK_M, PIECES = 84, 150.0, 5
 """So many streets each way, so far apart, each block of so many segments: 2 113 km of road."""

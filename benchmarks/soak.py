@@ -17,7 +17,8 @@ import numpy as np
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.faults import parse_fault
-from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.scenario.loading import dump_scenario
+from emulator.scenario.scenario import Scenario
 
 VEHICLES, SETTLE_S = 20, 20.0
 EVERY_S, SHORTEST_S, LONGEST_S = 12.0, 3.0, 10.0

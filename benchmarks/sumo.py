@@ -14,7 +14,7 @@ from typing import Any
 
 from emulator.drivers.session import Session
 from emulator.scenario.scenario import Scenario
-from emulator.world.driven.sumo_world import SumoWorld
+from emulator.world.driven.sumo import SumoWorld
 
 RUNS = 3
 PROGRAMS, VEHICLES = 50, 590

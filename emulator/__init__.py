@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from emulator.checks.own import Result
     from emulator.learning.environment import environment
     from emulator.learning.episode import Moment
-    from emulator.radio.own_rules import RadioFrame
-    from emulator.radio.rule_answers import Answer
+    from emulator.radio.own_rules import Answer, RadioFrame
     from emulator.report.notebook import Run
     from emulator.world.own_sensors import SensedTruth
 
@@ -34,7 +33,7 @@ __all__ = [
 ]
 
 _PUBLIC = {
-    "Answer": "emulator.radio.rule_answers",
+    "Answer": "emulator.radio.own_rules",
     "Moment": "emulator.learning.episode",
     "RadioFrame": "emulator.radio.own_rules",
     "Result": "emulator.checks.own",

@@ -21,12 +21,10 @@ from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from emulator.linear_model import convergence_factor, deviation_covariance
-from emulator.radio.connectivity import connectivity_of
-from emulator.radio.topology import Topology
+from emulator.radio.topology import Topology, connectivity_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import METRICS
-from emulator.scenario.lookahead import lookahead_ns
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.scenario import Scenario, lookahead_ns
 from emulator.world.world import World, build_world, components
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array

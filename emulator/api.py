@@ -26,8 +26,8 @@ from emulator.cells.worker import Place, Worker, call_fitly, is_fit
 from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.drivers.simulate import ProcessCount
 from emulator.report.notebook import Run
+from emulator.scenario.loading import Source, hinting, scenario_of
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.source import Source, hinting, scenario_of
 from vnet.runtime.programs import Program, given_programs
 
 

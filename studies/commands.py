@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
-from emulator.cli.help import group
+from emulator.cli.application import group
 from emulator.cli.options import pair
-from emulator.scenario.limits import DAY_S
+from emulator.scenario.sections import DAY_S
 from emulator.terminal.console import one_line_errors, tell
 from studies import paper
 from studies.paper_values import PAPER_RMSE_M

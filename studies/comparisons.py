@@ -17,8 +17,8 @@ import pyarrow as pa
 
 from emulator.cells.cells import Cell, has_result, read_series
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
+from emulator.scenario.loading import scenario_of
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.source import scenario_of
 from studies.paper import BOUND, BOUND_POSITION, Labels, counted_from
 from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from emulator.scenario.declared import load_entry
+from emulator.scenario.own_functions import load_entry
 
 _VALUES = "agents.cooperative.paper_values"
 PAPER_RMSE_M: dict[str, dict[str, float]] = load_entry(f"{_VALUES}:PAPER_RMSE_M")

@@ -9,7 +9,7 @@ import yaml
 import emulator.cli.commands
 from emulator.cli.access import create_access
 from emulator.cli.options import host_names
-from emulator.scenario.scenario import load_scenario
+from emulator.scenario.loading import load_scenario
 from emulator.world.world import build_world
 from tests.support.paths import ROOT
 from vnet.transport.access import OBSERVER, host_user

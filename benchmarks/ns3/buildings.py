@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.ns3.simulators import MissingError, build
-from emulator.radio.obstacles import Obstacles
+from emulator.radio.propagation import Obstacles
 from emulator.scenario.radio import Buildings as Section
 from emulator.world.buildings import Buildings
 from vnet.types import Array

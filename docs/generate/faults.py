@@ -7,11 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from docs.generate.keys import key_table
 from docs.generate.markdown import docstring, table
 from docs.generate.markdown import page as whole_page
-from emulator.scenario.fault_draws import Drawn
-from emulator.scenario.fault_families import Fault, Selector
-from emulator.scenario.faults import KINDS
-from emulator.testing.campaign_plan import MOST_FAULTS
-from emulator.testing.schedules import simulated_kinds
+from emulator.scenario.faults import KINDS, Drawn, Fault, Selector
+from emulator.testing.campaign_plan import MOST_FAULTS, simulated_kinds
 
 INTRODUCTION = """
 A fault is a table `[[fault]]` in a scenario, the arguments of `vnet fault inject`, or those of `emu.fault(…)` in a

@@ -11,8 +11,7 @@ from agents.cooperative.options import Options
 from docs.generate.keys import key_docstrings, key_table, option_table, subsections
 from docs.generate.markdown import docstring, sentence
 from docs.generate.markdown import page as whole_page
-from emulator.scenario.program import ProgramException
-from emulator.scenario.roadside import RoadsideUnit
+from emulator.scenario.program import ProgramException, RoadsideUnit
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import OwnSensor
 

@@ -28,7 +28,8 @@ from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.records.atomic import atomically, disk_errors, write_atomically
 from emulator.records.code_digest import digests_of
 from emulator.records.events import Level
-from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.scenario.loading import dump_scenario
+from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 
 FORMAT = 2

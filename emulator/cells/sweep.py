@@ -24,8 +24,8 @@ from emulator.cells.programs import checked_function, entry_of, require_importab
 from emulator.records.atomic import atomically, write_atomically
 from emulator.records.run_folder import RUNS
 from emulator.report.sweep_page import sweep_page
+from emulator.scenario.loading import Source, hinting, scenario_of
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.source import Source, hinting, scenario_of
 from vnet.errors import ScenarioError, VnetError, shown
 from vnet.runtime.programs import Program
 

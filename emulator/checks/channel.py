@@ -13,9 +13,8 @@ from emulator.records.distributions import binomial_interval
 from emulator.records.events import EventKind
 from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
-from emulator.scenario.fault_families import SenderFault
-from emulator.scenario.faults import Custom, CustomSender, StaleMessages
-from emulator.world.link_table import LinkTable
+from emulator.scenario.faults import Custom, CustomSender, SenderFault, StaleMessages
+from emulator.world.radio_inputs import LinkTable
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S

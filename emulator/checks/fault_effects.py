@@ -20,16 +20,19 @@ from emulator.radio.dot11p import SLOT_NS
 from emulator.records.events import EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
-from emulator.scenario.fault_families import (
+from emulator.scenario.faults import (
     ClockFault,
+    Corrupt,
     DelayFault,
     Fault,
     GnssFault,
+    GnssFreeze,
+    GnssOutage,
     Infrastructure,
     ProcessFault,
     SenderFault,
+    Throttle,
 )
-from emulator.scenario.faults import Corrupt, GnssFreeze, GnssOutage, Throttle
 from vnet.counted import counted
 from vnet.types import Mask
 from vnet.units import NS_PER_MS

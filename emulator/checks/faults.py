@@ -15,8 +15,19 @@ from emulator.faults.plan import PlannedFault
 from emulator.records.exchanges import sent_by_programs
 from emulator.records.recorded_run import NO_FAULT, ON_AIR, UNHEARD_OF, RecordedRun
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
-from emulator.scenario.fault_families import Fault, LossFault, ProcessFault, SenderFault
-from emulator.scenario.faults import BurstLoss, Corrupt, Custom, CustomSender, Duplicate, GnssOutage, StaleMessages
+from emulator.scenario.faults import (
+    BurstLoss,
+    Corrupt,
+    Custom,
+    CustomSender,
+    Duplicate,
+    Fault,
+    GnssOutage,
+    LossFault,
+    ProcessFault,
+    SenderFault,
+    StaleMessages,
+)
 from vnet.counted import counted
 from vnet.types import Array, Mask
 

@@ -41,10 +41,9 @@ from emulator.records.verdicts import (
     result,
     unknown,
 )
-from emulator.scenario.declared import are_here, declared_checks
-from emulator.scenario.fault_families import OwnRule, SenderFault
-from emulator.scenario.faults import Corrupt
-from emulator.scenario.toml import parse_toml
+from emulator.scenario.faults import Corrupt, OwnRule, SenderFault
+from emulator.scenario.loading import parse_toml
+from emulator.scenario.own_functions import are_here, declared_checks
 from vnet.counted import counted
 
 FIRST_WITH_MANIFEST = 3

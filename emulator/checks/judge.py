@@ -19,7 +19,7 @@ from emulator.radio.trace import sha256_of_table
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run import Run
 from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict
-from emulator.scenario.modules import with_modules
+from emulator.scenario.loading import with_modules
 
 __all__ = [
     "CheckResult",

@@ -10,11 +10,10 @@ import numpy as np
 
 from emulator.checks.channel import nothing_seen, received_twice
 from emulator.faults.plan import PlannedFault
-from emulator.radio.rule_answers import LONGEST_DELAY_S, MOST_COPIES
+from emulator.radio.own_rules import LONGEST_DELAY_S, MOST_COPIES
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result
-from emulator.scenario.fault_families import DelayFault
-from emulator.scenario.faults import Custom, Duplicate, Throttle
+from emulator.scenario.faults import Custom, DelayFault, Duplicate, Throttle
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS, NS_PER_S

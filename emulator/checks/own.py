@@ -19,8 +19,7 @@ import numpy as np
 from emulator.records.run import Run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, unknown
-from emulator.scenario.declared import declared_checks
-from emulator.scenario.own_functions import in_words, line_of, load_function, outside
+from emulator.scenario.own_functions import declared_checks, in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
 from vnet.errors import VnetError, printable, shown
 from vnet.runtime.programs import search_programs_in

@@ -7,7 +7,7 @@ from typing import Any
 from emulator.records.events import Event, EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result
-from emulator.scenario.fault_families import OwnRule
+from emulator.scenario.faults import OwnRule
 from vnet.counted import counted
 from vnet.units import NS_PER_S
 

@@ -25,9 +25,9 @@ from emulator.records.recorded_world import ARRAYS, RecordedWorld
 from emulator.records.run_folder import WORLD_FILE
 from emulator.records.tables import BUSY, STATES
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result
-from emulator.scenario.fault_families import OwnRule, SenderFault
-from emulator.scenario.faults import StaleMessages
-from emulator.scenario.scenario import Scenario, input_files_of
+from emulator.scenario.faults import OwnRule, SenderFault, StaleMessages
+from emulator.scenario.loading import input_files_of
+from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss
 from emulator.world.world import Instant, build_world, components, periods_of
 from vnet.counted import counted

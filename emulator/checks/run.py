@@ -17,7 +17,7 @@ from emulator.records.period_figures import VECTORS
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result, unknown
-from emulator.scenario.fault_families import ProcessFault
+from emulator.scenario.faults import ProcessFault
 from vnet.counted import counted
 from vnet.errors import first_names
 from vnet.types import IntArray, Mask

@@ -12,9 +12,8 @@ from emulator.faults.plan import PlannedFault
 from emulator.records.distributions import chi2_cdf, chi2_sf
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
-from emulator.scenario.fault_families import GnssFault
-from emulator.scenario.faults import CustomSender, DataReplay, DoS, Sybil
-from emulator.world.receivers import further_error_m
+from emulator.scenario.faults import CustomSender, DataReplay, DoS, GnssFault, Sybil
+from emulator.world.gnss import further_error_m
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S

@@ -14,7 +14,7 @@ from emulator.records.reported import is_text
 from emulator.records.run_tables import VALUES_AS_LIST
 from emulator.records.tables import STATES
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result
-from emulator.scenario.fault_families import ProcessFault
+from emulator.scenario.faults import ProcessFault
 from vnet.counted import counted
 from vnet.errors import printable
 from vnet.reports import COVARIANCE_TOLERANCE, LONGEST_TEXT, check_name

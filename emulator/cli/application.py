@@ -1,4 +1,4 @@
-"""The command line of `vnet` as an application of Typer's: the wanted commands, and stubs of the others."""
+"""The command line of `vnet` as an application of Typer's: wanted commands, stubs of others, and plain help."""
 
 from __future__ import annotations
 
@@ -7,11 +7,47 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from emulator.cli.help import group
 from emulator.cli.table import COMMANDS, REGISTRY, Command
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
+
+DEFAULTS = {"--check-determinism": "--check-determinism=layouts"}
+"""Values of options that may be given without one."""
+
+
+class _Group(TyperGroup):
+    """A group of commands whose help lists them by panel, with nothing cut off."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Give the one option whose value may be left out, which Typer does not have, its default."""
+        return super().parse_args(ctx, [DEFAULTS.get(each, each) for each in args])
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write each panel's commands, their names aligned over all panels."""
+        width = max(map(len, self.commands))
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for name, command in self.commands.items():
+            panel: Any = getattr(command, "rich_help_panel", None)
+            row = (name.ljust(width), command.short_help or command.help or "")
+            panels.setdefault(panel or "Commands", []).append(row)
+        for panel, rows in panels.items():
+            with formatter.section(panel):
+                formatter.write_dl(rows)
+
+
+def group(about: str) -> typer.Typer:
+    """Return an empty group of commands, which is about `about`."""
+    return typer.Typer(
+        cls=_Group,
+        help=about,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        no_args_is_help=True,
+    )
+
 
 ANY_ARGUMENTS = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 """Settings of a command that refuses whatever it is asked, its help too."""

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import one_line_errors
 from emulator.testing.conformance.findings import counted
 from emulator.testing.conformance.play import PATIENCE_S, SCENES, Conformance

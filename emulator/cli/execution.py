@@ -15,8 +15,8 @@ from tempfile import TemporaryDirectory
 
 import typer
 
+from emulator.checks.own import load_checks
 from emulator.cli.access import create_access, load_or_create_access
-from emulator.cli.new_run import prepare_folder
 from emulator.cli.options import DEFAULT_ADDRESS, DEFAULT_LISTEN, OutputOptions
 from emulator.cli.report import report_at_end
 from emulator.drivers.attachment import LiveOptions
@@ -26,7 +26,11 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.router import SeparateRouter
 from emulator.drivers.session import Local, Programs, Session
 from emulator.drivers.signals import first_interrupt_told, signals_ignored
+from emulator.radio.own_rules import load_rules
+from emulator.records.code_digest import changed_code
+from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
+from emulator.scenario.loading import recorded_code
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, say_first, tell
 from emulator.terminal.progress import Progress, show_progress
@@ -36,6 +40,28 @@ from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import World
 from vnet.errors import VnetError, did_you_mean, printable
+
+
+def prepare_folder(
+    out: Path | None, path: Path, scenario: Scenario, log_format: LogFormat, notes: Sequence[str] = ()
+) -> RunFolder:
+    """Prepare the folder of a run of `scenario`, which was read from `path`; its `open` makes it.
+
+    Each of `notes` on the input is told in a line, and recorded as an event `note`.
+
+    Where `path` is of another run's folder, and program or vnet have changed since, the run goes on: one line says
+    so, and the event `code_changed` records it.
+    """
+    load_rules(scenario.fault, scenario.program)
+    load_checks(scenario.program)  # a folder appears only once they have proved usable
+    folder = RunFolder.prepare(out, scenario)
+    for note in notes:
+        tell(note, log_format)
+        folder.event(0, EventKind.note, what=note)
+    if changed := changed_code(recorded_code(path), folder.code):
+        tell(f"{path}: {changed}", log_format)
+        folder.event(0, EventKind.code_changed, what=changed)
+    return folder
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,10 @@ import typer
 from msgspec import convert
 from rich.table import Table
 
-from emulator.cli.help import group
+from emulator.cli.application import group
 from emulator.drivers.control import ask
 from emulator.drivers.status import Snapshot
-from emulator.scenario.fault_families import OwnRule
-from emulator.scenario.faults import KINDS, parse_fault
+from emulator.scenario.faults import KINDS, OwnRule, parse_fault
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import Painter

@@ -12,22 +12,19 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from emulator.cli.help import group
+from emulator.cli.application import group
 from emulator.cli.options import pair
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.safe_console import SafeConsole
-from emulator.world.maps import datum as calibration
 from emulator.world.maps.city import SIZE_M, city_roads
-from emulator.world.maps.datum import PLACE_M, Calibration
 from emulator.world.maps.files import read_roads, write_roads, writer_of
-from emulator.world.maps.problems import MapReport, examine
+from emulator.world.maps.problems import PLACE_M, Calibration, MapReport, calibrate, examine, residuals
 from emulator.world.maps.roads import Roads
 from emulator.world.projection import Frame
-from emulator.world.trips.clean import Rules
 from emulator.world.trips.drive import whole_motion
 from emulator.world.trips.files import check_trips_name, write_trips
 from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
-from emulator.world.trips.motion import Motion
+from emulator.world.trips.motion import Motion, Rules
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array
 
@@ -151,15 +148,15 @@ def datum(
         used = np.ones(len(motion.node_ids), dtype=np.bool_)
         if others is not None:
             used[1::2] = False
-        found = calibration.residuals(lanes, motion)
+        found = residuals(lanes, motion)
         try:
-            result = calibration.calibrate(found.of(used))
+            result = calibrate(found.of(used))
         except ScenarioError as error:
             raise ScenarioError(f"{map_file}: {error}") from None
         _print_datum(result, int(used.sum()))
         if others is not None:
             try:
-                rest = calibration.calibrate(found.of(~used))
+                rest = calibrate(found.of(~used))
                 alone = f"datum_m = {_metres(rest.datum_m)}, aside_m = {rest.aside_m:.2f}"
             except ScenarioError as error:
                 alone = str(error)

@@ -13,8 +13,9 @@ from typing import Annotated
 
 import typer
 
+from emulator.scenario.loading import load_scenario
 from emulator.scenario.program import from_here
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat
 from vnet.errors import OverrideError, ScenarioError, VnetError, printable
 from vnet.runtime.debug_target import DebugTarget, resolve

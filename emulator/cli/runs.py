@@ -1,4 +1,4 @@
-"""`vnet run`, `vnet simulate` and `vnet emulator`: a scenario from its file to its verdict.
+"""`vnet run`, `vnet simulate`, `vnet emulator` and `vnet demo`: a scenario from its file to its verdict.
 
 What runs it is imported once it has been read, and the user told so: that takes longer than all before.
 """
@@ -46,6 +46,7 @@ from emulator.cli.options import (
     load,
 )
 from emulator.cli.own_child import OwnChild, may_fork
+from emulator.scenario.loading import find_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, one_line_errors, say_first
 from emulator.terminal.standard_output import result_only
@@ -227,3 +228,11 @@ def _check_restarts(scenario: Scenario, own_router: bool) -> None:
     kinds = {fault.kind for fault in scenario.fault}
     if "router_restart" in kinds and not own_router:
         raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+
+
+def demo(duration: DurationOption = None, out: OutOption = None) -> None:
+    """Run the shipped scenario quickstart: 38 vehicles with a process each, recorded for Rerun.
+
+    It is `vnet run quickstart --rerun save`.
+    """
+    run(find_scenario("quickstart"), duration=duration, out=out, rerun=["save"])

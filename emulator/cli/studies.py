@@ -1,7 +1,8 @@
-"""`vnet analyze` and `vnet campaign`: what a network's graph says, and many runs under random faults."""
+"""`vnet sweep`, `vnet campaign` and `vnet analyze`: many runs, and what a network's graph says."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -22,10 +23,99 @@ from emulator.cli.options import (
     SetOption,
     load,
 )
+from emulator.scenario.loading import parse_values
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import result_only
-from vnet.errors import VnetError
+from vnet.errors import VnetError, printable
+
+INTERRUPTED = 130
+
+
+def sweep(
+    scenario: ScenarioArgument,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=VALUES", help="Values of a key: radio.loss=0,0.1,0.3. May be repeated."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 … N of each combination.")] = 1,
+    program: ProgramOption = None,
+    duration: DurationOption = None,
+    overrides: SetOption = None,
+    option: ProgramOptionsOption = None,
+    checks: ChecksOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="For the results; a sweep goes on there. Default: runs/sweep-NAME."),
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores.")
+    ] = None,
+    executor: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of Dask: dask://HOST:PORT.")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Only the i-th of n parts: 1/4. Each may run elsewhere.")
+    ] = None,
+) -> None:
+    """Run a scenario over values of its keys and over seeds: a table with a row a run, and a page with curves.
+
+    All combinations of values are run, with each seed, which draws a generated network too unless network.seed is
+    set or varied. Finished runs are kept: after Ctrl-C the same command goes on. Ends with status 0 when all runs
+    are there, whatever their verdicts, which the table has.
+    """
+    from emulator.cells.cells import run_cells
+    from emulator.cells.executors import open_executor
+    from emulator.cells.sweep import (
+        NETWORK_SEED,
+        PAGE,
+        TABLE,
+        SweepPlan,
+        default_folder,
+        missing_cells,
+        parse_shard,
+        write_sweep,
+    )
+
+    with one_line_errors():
+        plain = load(scenario, overrides, program, Pacing.LOCKSTEP, None, duration, option, checks)
+        keeps_network = any(each.partition("=")[0].strip() == NETWORK_SEED for each in overrides or ())
+        plan = SweepPlan.of(plain, _all_varied(vary or ()), range(1, seeds + 1), keeps_network)
+        cells = plan.cells if shard is None else plan.shard(*parse_shard(shard))
+        folder = out or default_folder(plan)
+        try:
+            with open_executor(executor) as pool:
+                run_cells(cells, folder, title="sweep", executor=pool, jobs=jobs)
+        except KeyboardInterrupt:
+            done = len(plan.cells) - missing_cells(plan, folder)
+            print(f"interrupted: {done} of {len(plan.cells)} runs are in {folder}; the same command goes on")
+            raise typer.Exit(INTERRUPTED) from None
+        if missing := missing_cells(plan, folder):
+            print(f"shard {shard}: {len(cells)} runs are in {folder}; {missing} of {len(plan.cells)} are missing")
+            return
+        table = write_sweep(plan, folder)
+        verdicts = table["verdict"].to_pylist()
+        counts = ", ".join(f"{verdicts.count(name)} {name}" for name in sorted(set(verdicts)))
+        SafeConsole().print(f"{len(table)} runs: {counts}", highlight=False)
+        print(folder / TABLE)
+        print(folder / PAGE)
+
+
+def _all_varied(texts: Sequence[str]) -> dict[str, list[object]]:
+    varied: dict[str, list[object]] = {}
+    for key, values in map(_varied, texts):
+        if key in varied:
+            raise VnetError(f"--vary {key}: is given twice; write all values behind one, separated by commas")
+        varied[key] = values
+    return varied
+
+
+def _varied(text: str) -> tuple[str, list[object]]:
+    key, equals, values = text.partition("=")
+    if not equals:
+        raise VnetError(f"--vary {printable(text)}: write it as KEY=VALUES, for example radio.loss=0,0.1,0.3")
+    return key.strip(), parse_values(key.strip(), values)
+
 
 RUNS_ON_DASK = 64
 """Runs of a campaign that wait for Dask's workers at once: more than most clusters have."""
@@ -97,8 +187,7 @@ def campaign(
     """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
     from emulator.cells.executors import open_executor
     from emulator.testing.campaign import run_campaign
-    from emulator.testing.campaign_plan import Plan
-    from emulator.testing.schedules import parse_ranges
+    from emulator.testing.campaign_plan import Plan, parse_ranges
 
     with one_line_errors(), result_only(True):
         loaded = load(

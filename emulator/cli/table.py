@@ -57,7 +57,7 @@ COMMANDS = (
         "Run it in one process: the same trace, faster.",
         runs_programs=True,
     ),
-    Command("demo", Panel.RUN, "demo", "demo", "Run the shipped scenario quickstart, and record it."),
+    Command("demo", Panel.RUN, "runs", "demo", "Run the shipped scenario quickstart, and record it."),
     Command("new", Panel.RUN, "new", "new", "Write a scenario, a program, a check and a test to begin with."),
     Command(
         "emulator", Panel.RUN, "runs", "emulator", "Run it for agents that are started by hand, here or elsewhere."
@@ -65,18 +65,18 @@ COMMANDS = (
     Command("host", Panel.RUN, "host", "host", "Start the vehicles of one of several hosts (experimental)."),
     Command("access", Panel.RUN, "access", "access", "Write the users and rules of a separate router (zenohd)."),
     Command("status", Panel.LOOK, "fault", "status", "Show how a run that is on is getting on."),
-    Command("check", Panel.LOOK, "check", "check", "Judge a finished run again."),
+    Command("check", Panel.LOOK, "folders", "check", "Judge a finished run again."),
     Command("report", Panel.LOOK, "report", "report", "Write a run's report, or a list of runs, as a page."),
     Command(
         "compare", Panel.LOOK, "report", "compare", "Set two runs side by side, and show where they first differ."
     ),
-    Command("diff", Panel.LOOK, "diff", "diff", "Show where two runs part for the first time."),
+    Command("diff", Panel.LOOK, "folders", "diff", "Show where two runs part for the first time."),
     Command(
         "radio", Panel.LOOK, "export", "radio", "Show delivery by distance, latency, age, and the worst links."
     ),
-    Command("trace", Panel.LOOK, "trace", "trace", "Show who sent what to whom, and what became of it."),
+    Command("trace", Panel.LOOK, "folders", "trace", "Show who sent what to whom, and what became of it."),
     Command("view", Panel.LOOK, "viewing", "view", "Open a run's recording in Rerun, or serve it."),
-    Command("play", Panel.LOOK, "playback", "play", "Play a finished run in Rerun."),
+    Command("play", Panel.LOOK, "viewing", "play", "Play a finished run in Rerun."),
     Command("fault", Panel.BREAK, "fault", "app", "Inject faults into a run that is on, and heal them."),
     Command(
         "campaign",
@@ -90,7 +90,7 @@ COMMANDS = (
     Command(
         "sweep",
         Panel.STUDY,
-        "sweep",
+        "studies",
         "sweep",
         "Run it over values of its keys and over seeds: a table.",
         runs_programs=True,
@@ -111,7 +111,7 @@ COMMANDS = (
     Command(
         "record", Panel.FILES, "viewing", "record", "Watch a run from outside, and write a Rerun recording of it."
     ),
-    Command("render", Panel.FILES, "playback", "render", "Write a finished run's recording again from its files."),
+    Command("render", Panel.FILES, "viewing", "render", "Write a finished run's recording again from its files."),
     Command("map", Panel.FILES, "map", "app", "Look at maps, and convert them."),
 )
 

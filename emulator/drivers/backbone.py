@@ -17,8 +17,8 @@ import pyarrow as pa
 from emulator.radio.engine import Engine
 from emulator.radio.trace import payload_digest
 from emulator.records.backbone_table import BackboneRow, backbone_table
+from emulator.scenario.program import Backbone
 from emulator.scenario.random_streams import Draws
-from emulator.scenario.roadside import Backbone
 from emulator.scenario.scenario import Scenario
 from vnet.backbone import UnitAbilities
 from vnet.runtime.arrivals import NewsItem

@@ -38,7 +38,7 @@ from emulator.records.run_folder import (
 from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised
-from emulator.scenario.declared import declared_checks
+from emulator.scenario.own_functions import declared_checks
 from vnet.runtime.environment import arithmetic
 
 

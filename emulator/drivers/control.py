@@ -19,8 +19,7 @@ import zenoh
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.status import Course, fault_state
-from emulator.scenario.fault_families import OwnRule
-from emulator.scenario.faults import parse_fault
+from emulator.scenario.faults import OwnRule, parse_fault
 from emulator.viewer.sinks import ServeAt, Sinks
 from vnet.errors import ScenarioError, TransportError, VnetError
 from vnet.transport import keys

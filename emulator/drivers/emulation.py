@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 
 from emulator.drivers.backbone import BackboneNetwork, NewsFeed
 from emulator.drivers.orders import Orders
-from emulator.faults.plan import FaultPlan, PlannedFault
-from emulator.faults.selectors import Nodes
-from emulator.radio.connectivity import connectivity_of
+from emulator.faults.plan import FaultPlan, Nodes, PlannedFault
 from emulator.radio.dot11p import abilities_of
 from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
 from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
+from emulator.radio.topology import connectivity_of
 from emulator.records.background_table import background_table
 from emulator.records.costs import Costs
 from emulator.records.driven_table import driven_table
@@ -36,11 +35,9 @@ from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.fault_families import Fault, Infrastructure, OwnRule, ProcessFault
-from emulator.scenario.lookahead import least_latency_ns
-from emulator.scenario.program import Program
-from emulator.scenario.roadside import RoadsideUnit
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
+from emulator.scenario.program import Program, RoadsideUnit
+from emulator.scenario.scenario import Scenario, least_latency_ns
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
 from emulator.world.gnss_faults import FaultyGnss, clock_of

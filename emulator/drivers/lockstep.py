@@ -24,7 +24,7 @@ from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.processes import Processes, ProtocolError, check_yield
-from emulator.scenario.lookahead import lookahead_ns
+from emulator.scenario.scenario import lookahead_ns
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import Fix
 from vnet.radio import Packet

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from emulator.radio.outcomes import Stage, decided_at
 from emulator.records.exchanges import sent_by_programs
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.world.link_table import COLUMNS, LinkTable
+from emulator.world.radio_inputs import COLUMNS, LinkTable
 from vnet.types import IntArray, Mask
 from vnet.units import NS_PER_S
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.learning.episode import ENTRY, Act, Behaviour, Ends, Observe, Reward
-from emulator.scenario.source import Source, hinting, scenario_of
+from emulator.scenario.loading import Source, hinting, scenario_of
 from vnet.errors import VnetError, shown
 
 if TYPE_CHECKING:

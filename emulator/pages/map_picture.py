@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from emulator.pages.palette import PALETTE
-from emulator.world.maps.classes import NAMES
-from emulator.world.maps.roads import Roads
+from emulator.world.maps.roads import NAMES, Roads
 from vnet.types import Array
 
 LANES_SHOWN_M = 800.0

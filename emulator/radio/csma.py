@@ -31,36 +31,41 @@ decided as it ends, and not when somebody asks.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import NamedTuple
 
 from emulator.radio.congestion import CongestionControl, congestion_control_of
 from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
-from emulator.radio.frames import BROADCAST, Frame
-from emulator.radio.mac import Throttle
+from emulator.radio.frames import BROADCAST, CopyNumbers, Receptions, Transmission
+from emulator.radio.mac import Mac, Throttle
 from emulator.radio.medium import WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
-from emulator.radio.reception import Threshold, milliwatts
-from emulator.radio.signals import BACKOFF, JITTER, NEXT_BACKOFF, Signals, sender_draw
+from emulator.radio.reception import BACKOFF, JITTER, NEXT_BACKOFF, Signals, Threshold, milliwatts, sender_draw
+from emulator.radio.topology import Topology
+from emulator.radio.trace import Trace
 from emulator.radio.unicast import (
+    ACK_BYTES,
     ACK_TIMEOUT_NS,
     MOST_ATTEMPTS,
     Deferral,
     Unicasts,
     acknowledgement_of,
+    address,
     retry_of,
 )
-from emulator.scenario.lookahead import least_latency_ns
-from emulator.scenario.radio import Mac, Receiver
-from emulator.scenario.scenario import Radio
+from emulator.scenario.radio import Mac as MacSection
+from emulator.scenario.radio import Receiver
+from emulator.scenario.scenario import Radio, least_latency_ns
+from vnet.types import Array
 from vnet.units import NS_PER_MS
 
-END, ACK_END, ACK_TIMEOUT, READY, SLOWLY_READY, ACCESS, ACK_BEGIN = range(7)
+HEARD, ACK_HEARD, END, ACK_END, ACK_TIMEOUT, READY, SLOWLY_READY, ACCESS, ACK_BEGIN = range(9)
+"""Kinds of events, in the order in which those of one time are processed: what has ended is heard at once."""
 
-_Event = tuple[int, int, int, int, Frame | None]
-"""An event: its time in ns, kind, sender, number among the sender's events, and frame."""
+_Event = tuple[int, int, int, int, Transmission | None]
+"""An event: its time in ns, kind, sender, number among the sender's events, and transmission."""
 
 
 @dataclass(slots=True, eq=False)
@@ -76,7 +81,7 @@ class _Station:
     """
 
     node: int
-    queue: deque[Frame] = field(default_factory=deque)
+    queue: deque[Transmission] = field(default_factory=deque)
     coming: int = 0
     ready_ns: int = 0
     held: bool = False
@@ -88,8 +93,8 @@ class _Station:
     busy: bool = False
     planned: int = 0
     access: int = 0
-    awaiting: Frame | None = None
-    acking: Frame | None = None
+    awaiting: Transmission | None = None
+    acking: Transmission | None = None
 
     @property
     def access_ns(self) -> int:
@@ -112,78 +117,89 @@ class EdcaParameters(NamedTuple):
         return min((self.window + 1 << attempts) - 1, self.max_window)
 
 
-def edca_parameters(mac: Mac) -> EdcaParameters:
+def edca_parameters(mac: MacSection) -> EdcaParameters:
     """Return the parameters of the access category that a scenario configures."""
     aifsn, window = AIFSN_AND_CW[mac.access_category]
     return EdcaParameters(SIFS_NS + aifsn * SLOT_NS, window, MAX_WINDOW[mac.access_category])
 
 
-class Csma:
+class Csma(Mac):
     """MAC of `count` vehicles that share one medium; see the module's docstring.
 
-    The engine sets what is decided outside of the MAC: `judge` notes in a frame that ends who could read it,
-    `next_copy` numbers the copies of a sender's frame, `is_up` tells of vehicles that are up, and
-    `acknowledged` is called when the acknowledgement of a frame begins, or reaches its sender.
+    It asks the `topology` who is up, notes acknowledgements in the `trace`, numbers retries among `copies`, and
+    tells `unicasts` what became of frames to single vehicles.
     """
 
-    judge: Callable[[Frame], None]
-    next_copy: Callable[[int, int], int]
-    is_up: Callable[[int], bool]
-    acknowledged: Callable[[Frame], None]
+    shares_medium = True
 
-    def __init__(self, mac: Mac, radio: Radio, signals: Signals, count: int, seed: int) -> None:
+    def __init__(
+        self,
+        radio: Radio,
+        signals: Signals,
+        topology: Topology,
+        trace: Trace,
+        copies: CopyNumbers,
+        unicasts: Unicasts,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        mac = radio.mac
+        assert mac is not None
         self._edca = edca_parameters(mac)
         self._aifs_ns = self._edca.aifs_ns
-        self.has_eifs = mac.eifs
-        """True if vehicles wait for EIFS after broadcasts, too."""
-        self._deferral = Deferral(count) if mac.eifs else None
-        self._count = count
-        self.unicasts = Unicasts(least_latency_ns(radio))
+        self._has_eifs = mac.eifs  # after broadcasts, too
+        self._count = signals.count
+        self._deferral = Deferral(self._count) if mac.eifs else None
+        self._unicasts = unicasts
         self._signals = signals
+        self._topology = topology
+        self._trace = trace
+        self._copies = copies
         self._jitter_ns = radio.access_jitter_ms * NS_PER_MS
         self._limit = radio.queue_frames
         threshold = Threshold(radio.receiver or Receiver())
         remembered_ns = 2 * least_latency_ns(radio) + 2 * WINDOW_NS  # what programs may ask for, and more
-        self.medium = Medium(count, milliwatts(mac.carrier_sense_dbm), threshold, remembered_ns)
-        self._congestion = congestion_control_of(radio.congestion, count, seed)
-        if self._congestion is not None:
-            self.medium.listen(self._congestion.observe)
+        self._congestion = congestion_control_of(radio.congestion, self._count, seed)
+        listener = self._congestion.observe if self._congestion is not None else None
+        carrier_sense_mw = milliwatts(mac.carrier_sense_dbm)
+        self._medium = Medium(self._count, carrier_sense_mw, threshold, remembered_ns, listener)
         self._throttle = Throttle()
         self._events: list[_Event] = []
         self._stations: dict[int, _Station] = {}
         self._counting: dict[int, _Station] = {}
         """Stations that count down or hold a backoff."""
         self._now_ns = 0
-        self.sent: list[Frame] = []
+        self._ended_ack: Transmission | None = None
 
     def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
         """Throttle exactly these senders from now on: their frames reach the MAC at these bitrates."""
         self._throttle.set(bitrate_mbps)
 
-    def enqueue(self, frame: Frame) -> None:
+    def enqueue(self, sent: Transmission) -> None:
         """Take a frame; it is ready after its access jitter, and not before the sender's earlier frames."""
+        frame = sent.frame
         station = self._station(frame.sender)
-        if frame.attempt and self._deferral is None:
+        if sent.attempt and self._deferral is None:
             self._deferral = Deferral(self._count)
-        frame.signal = self._signals.of(frame)
+        sent.signal = self._signals.of(frame)
         ready_ns = frame.sent_ns
         if self._jitter_ns:
-            ready_ns += int(self._jitter_ns * sender_draw(frame, JITTER))
+            ready_ns += int(self._jitter_ns * sender_draw(sent, JITTER))
         if self._throttle.slows(frame.sender):
             slow_ns = self._throttle.put(frame, ready_ns, self._limit)
             if slow_ns is None:
-                self._leave(frame, Outcome.queue_full, frame.sent_ns)
+                self._leave(sent, Outcome.queue_full, frame.sent_ns)
             else:
-                self._plan(slow_ns, SLOWLY_READY, station, frame)
+                self._plan(slow_ns, SLOWLY_READY, station, sent)
         elif self._is_full(station):
-            self._leave(frame, Outcome.queue_full, frame.sent_ns)
+            self._leave(sent, Outcome.queue_full, frame.sent_ns)
         else:
             station.ready_ns = max(ready_ns, station.ready_ns)
             if station.ready_ns == frame.sent_ns and self._is_quiet(frame.sent_ns):
-                self._ready(station, frame, frame.sent_ns)
+                self._ready(station, sent, frame.sent_ns)
             else:
                 station.coming += 1
-                self._plan(station.ready_ns, READY, station, frame)
+                self._plan(station.ready_ns, READY, station, sent)
 
     def _station(self, node: int) -> _Station:
         station = self._stations.get(node)
@@ -201,57 +217,73 @@ class Csma:
         """
         return self._now_ns <= time_ns and (not self._events or self._events[0][:2] > (time_ns, READY))
 
-    def _leave(self, frame: Frame, sender_outcome: Outcome, time_ns: int) -> None:
-        frame.sender_outcome, frame.end_ns = sender_outcome, time_ns
-        self.sent.append(frame)
+    def _leave(self, sent: Transmission, sender_outcome: Outcome, time_ns: int) -> None:
+        sent.sender_outcome, sent.end_ns = sender_outcome, time_ns
+        self.sent.append(sent)
 
-    def _plan(self, time_ns: int, kind: int, station: _Station, frame: Frame | None = None) -> None:
+    def _plan(self, time_ns: int, kind: int, station: _Station, sent: Transmission | None = None) -> None:
         station.planned += 1
         if kind == ACCESS:
             station.access = station.planned
         if time_ns < self._now_ns:  # in real time a frame may reach the emulator a little after its time
             time_ns = self._now_ns
-        heappush(self._events, (time_ns, kind, station.node, station.planned, frame))
+        heappush(self._events, (time_ns, kind, station.node, station.planned, sent))
 
     def next_ns(self) -> int | None:
         """Return the time of the next event, or None."""
         return self._events[0][0] if self._events else None
 
-    def run(self, time_ns: int | None) -> None:
-        """Process all events before `time_ns`, or all events if it is None."""
+    def run(self, time_ns: int | None) -> Transmission | None:
+        """Process all events before `time_ns`, or all if it is None; stop after one that `judge` must hear of."""
         events = self._events
         while events and (time_ns is None or events[0][0] < time_ns):
-            self._process(*heappop(events))
+            if (ended := self.step()) is not None:
+                return ended
         if time_ns is not None and time_ns > self._now_ns:
             self._now_ns = time_ns
+        return None
 
-    def step(self) -> None:
-        """Process the next event."""
-        self._process(*heappop(self._events))
-
-    def _process(self, now_ns: int, kind: int, node: int, plan: int, frame: Frame | None) -> None:
+    def step(self) -> Transmission | None:
+        """Process the next event; return the transmission that it ends, if the events after it depend on it."""
+        now_ns, kind, node, plan, sent = heappop(self._events)
         self._now_ns = now_ns
         station = self._stations[node]
         if kind == ACCESS:
             if station.access == plan:
                 self._begin(station, now_ns)
-        elif kind == END:
-            assert frame is not None
-            self._end(station, frame, now_ns)
-        elif kind in (ACK_BEGIN, ACK_END, ACK_TIMEOUT):
-            assert frame is not None
-            self._exchange(kind, station, frame, now_ns)
-        elif kind == SLOWLY_READY and self._is_full(station):
-            assert frame is not None
-            self._leave(frame, Outcome.queue_full, now_ns)
+        elif kind == READY:
+            station.coming -= sent is not None
+            self._ready(station, sent, now_ns)
         else:
-            station.coming -= kind == READY and frame is not None
-            self._ready(station, frame, now_ns)
+            assert sent is not None
+            if kind == END:
+                return self._end(station, sent, now_ns)
+            if kind == ACK_END:
+                return self._end_ack(station, sent, now_ns)
+            self._process(kind, station, sent, now_ns)
+        return None
 
-    def _ready(self, station: _Station, frame: Frame | None, now_ns: int) -> None:
+    def _process(self, kind: int, station: _Station, sent: Transmission, now_ns: int) -> None:
+        if kind == HEARD:
+            self._hear(sent, now_ns)
+            self._after(station, sent, now_ns)
+        elif kind == ACK_HEARD:
+            self._hear_ack(sent, now_ns)
+        elif kind == ACK_BEGIN:
+            if self._topology.is_up(station.node) and not station.on_air and station.acking is None:
+                self._begin_ack(station, sent, now_ns)
+        elif kind == ACK_TIMEOUT:
+            if station.awaiting is sent and not self._is_hearing_ack(station, sent):
+                self._conclude(station, sent, now_ns)
+        elif self._is_full(station):  # a throttled sender's frame
+            self._leave(sent, Outcome.queue_full, now_ns)
+        else:
+            self._ready(station, sent, now_ns)
+
+    def _ready(self, station: _Station, sent: Transmission | None, now_ns: int) -> None:
         """Process a frame that is ready, or (None) poll the sender's congestion control again."""
-        if frame is not None:
-            station.queue.append(frame)
+        if sent is not None:
+            station.queue.append(sent)
         if station.queue and not station.contends and not station.on_air and station.awaiting is None:
             self._contend(station, now_ns)
 
@@ -261,7 +293,7 @@ class Csma:
         A frame that was held back waits for its access jitter before it reaches the MAC, like any other. Otherwise
         frames that collided once would be ready, after equal pauses, at the same time again.
         """
-        self.medium.count(now_ns)
+        self._medium.count(now_ns)
         next_poll_ns = congestion.next_poll_ns(station.node, now_ns)
         if next_poll_ns <= now_ns:
             held, station.held = station.held, False
@@ -292,12 +324,12 @@ class Csma:
             return
         self._counting[node] = station
         station.slots = 0
-        station.busy = self.medium.is_sensed(node)
-        noticed_ns = self.medium.busy_ns(node) + DETECTION_NS
+        station.busy = self._medium.is_sensed(node)
+        noticed_ns = self._medium.busy_ns(node) + DETECTION_NS
         if station.busy and noticed_ns <= now_ns:
             station.slots = self._draw(station.queue[0], BACKOFF)
             return
-        free_ns = self._free_ns(node, int(self.medium.idle_ns[node]))
+        free_ns = self._free_ns(node, int(self._medium.idle_ns[node]))
         if self._deferral is not None and not station.busy and self._deferral.reserved_ns(node) > now_ns:
             station.slots, station.from_ns = self._draw(station.queue[0], BACKOFF), free_ns
             self._plan(station.access_ns, ACCESS, station)
@@ -306,8 +338,8 @@ class Csma:
         if not station.busy or station.from_ns < noticed_ns:
             self._plan(station.from_ns, ACCESS, station)
 
-    def _draw(self, frame: Frame, which: int, attempts: int = 0) -> int:
-        return int(sender_draw(frame, which) * (self._edca.window_after(attempts) + 1))
+    def _draw(self, sent: Transmission, which: int, attempts: int = 0) -> int:
+        return int(sender_draw(sent, which) * (self._edca.window_after(attempts) + 1))
 
     def _free_ns(self, node: int, idle_ns: int) -> int:
         """Return when AIFS is over at a vehicle whose medium is idle since `idle_ns`."""
@@ -318,52 +350,75 @@ class Csma:
         if station.acking is not None:  # which it does not sense: its own transmission ends before it counts on
             station.slots, station.busy, station.access = 0, True, 0
             return
-        frame = station.queue.popleft()
+        sent = station.queue.popleft()
         station.contends, station.on_air = False, True
         self._counting.pop(station.node, None)
-        frame.on_air_ns = now_ns
-        airtime = airtime_ns(frame.size_bytes, frame.bitrate_mbps)
+        sent.on_air_ns = now_ns
+        airtime = airtime_ns(sent.frame.size_bytes, sent.frame.bitrate_mbps)
         if self._congestion is not None:
             self._congestion.record_transmission(station.node, now_ns, airtime)
-        self.medium.begin(frame, now_ns)
-        self._plan(now_ns + airtime, END, station, frame)
+        self._medium.begin(sent, now_ns)
+        self._plan(now_ns + airtime, END, station, sent)
         self._update_backoffs(now_ns)
 
-    def _end(self, station: _Station, frame: Frame, now_ns: int) -> None:
-        """End a transmission; its sender draws a backoff before its next frame, or waits for an acknowledgement."""
+    def _end(self, station: _Station, sent: Transmission, now_ns: int) -> Transmission | None:
+        """End a transmission; return it if who could read it decides what comes next."""
         station.on_air = False
-        self.medium.end(frame, now_ns)
-        self._leave(frame, Outcome.pending, now_ns)
-        if frame.attempt or self.has_eifs:
-            self._hear(frame, now_ns)
-        if not frame.attempt:
-            self._back_off(station, frame, now_ns)
+        self._medium.end(sent, now_ns)
+        self._leave(sent, Outcome.pending, now_ns)
+        if sent.attempt or self._has_eifs:
+            self._plan(now_ns, HEARD, station, sent)
+            return sent
+        self._after(station, sent, now_ns)
+        return None
+
+    def _after(self, station: _Station, sent: Transmission, now_ns: int) -> None:
+        """Have a sender draw a backoff before its next frame, or wait for an acknowledgement."""
+        if not sent.attempt:
+            self._back_off(station, sent, now_ns)
             return
-        station.awaiting = frame
-        if frame.decoded is not None and frame.decoded[frame.to]:
-            self._plan(now_ns + SIFS_NS, ACK_BEGIN, self._station(frame.to), frame)
-        self._plan(now_ns + ACK_TIMEOUT_NS, ACK_TIMEOUT, station, frame)
+        station.awaiting = sent
+        if sent.decoded is not None and sent.decoded[sent.frame.to]:
+            self._plan(now_ns + SIFS_NS, ACK_BEGIN, self._station(sent.frame.to), sent)
+        self._plan(now_ns + ACK_TIMEOUT_NS, ACK_TIMEOUT, station, sent)
         self._update_backoffs(now_ns)
 
-    def _hear(self, frame: Frame, now_ns: int) -> None:
-        """Decide who could read a frame that ends, and how long others therefore keep silent."""
+    def judge(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
+        """Note who could read frames where others act on it, and what becomes of those to single vehicles."""
+        for index, sent in enumerate(transmissions):
+            frame, is_sent = sent.frame, sent.sender_outcome == Outcome.pending
+            if frame.ticket and not (sent.attempt and is_sent):
+                self._unicasts.leave(sent)  # it is over, or an older one was broadcast in its place
+            if not (sent.attempt or self._has_eifs or sent is self._ended_ack):
+                continue
+            outcome = receptions.outcome[index]
+            if is_sent:
+                is_up = frame.to == BROADCAST or self._topology.is_up(frame.to)
+                address(sent, outcome, self._medium.locked(sent), receptions.cause[index], is_up)
+            elif sent.attempt:
+                outcome[:] = Outcome.out_of_range.value
+                outcome[frame.to] = (
+                    sent.sender_outcome.value
+                )  # also if its addressee is out of range: it was not sent
+
+    def _hear(self, sent: Transmission, now_ns: int) -> None:
+        """Decide how long those who could read a transmission that ends, or could not, keep silent."""
         assert self._deferral is not None
-        self.judge(frame)
-        self._deferral.hear(frame, now_ns)
-        if frame.to == BROADCAST:
+        self._deferral.hear(sent, now_ns)
+        if not sent.attempt:
             return
         for node, station in self._counting.items():  # who has read it without sensing it counts, and stops
             reserved = self._deferral.reserved_ns(node) > now_ns
             if reserved and not station.busy and station.access_ns > now_ns:
                 station.slots -= max(0, (now_ns - station.from_ns) // SLOT_NS + 1)
-                station.from_ns = self._free_ns(node, int(self.medium.idle_ns[node]))
+                station.from_ns = self._free_ns(node, int(self._medium.idle_ns[node]))
                 if station.contends:
                     self._plan(station.access_ns, ACCESS, station)
 
-    def _back_off(self, station: _Station, frame: Frame, now_ns: int, attempts: int = 0) -> None:
+    def _back_off(self, station: _Station, sent: Transmission, now_ns: int, attempts: int = 0) -> None:
         """Draw a backoff after a frame, which had so many attempts without an acknowledgement."""
-        station.slots = self._draw(frame, NEXT_BACKOFF, attempts)
-        station.busy, station.from_ns = self.medium.is_sensed(station.node), self._free_ns(station.node, now_ns)
+        station.slots = self._draw(sent, NEXT_BACKOFF, attempts)
+        station.busy, station.from_ns = self._medium.is_sensed(station.node), self._free_ns(station.node, now_ns)
         self._counting[station.node] = station
         self._update_backoffs(now_ns)
         if station.queue:
@@ -371,60 +426,71 @@ class Csma:
 
     # Acknowledgements.
 
-    def _exchange(self, kind: int, station: _Station, frame: Frame, now_ns: int) -> None:
-        """Process what follows a frame to one vehicle: the acknowledgement begins, ends, or has not come."""
-        if kind == ACK_BEGIN:
-            if self.is_up(station.node) and not station.on_air and station.acking is None:
-                self._begin_ack(station, frame, now_ns)
-        elif kind == ACK_END:
-            self._end_ack(station, frame, now_ns)
-        elif station.awaiting is frame and not self._is_hearing_ack(station, frame):
-            self._conclude(station, frame, now_ns)
-
-    def _begin_ack(self, station: _Station, frame: Frame, now_ns: int) -> None:
-        station.acking, frame.ack = frame, acknowledgement_of(frame)
-        frame.ack.signal = self._signals.of(frame.ack)
-        frame.ack.on_air_ns = now_ns
-        self.acknowledged(frame)
-        self.medium.begin(frame.ack, now_ns)
-        self._plan(now_ns + airtime_ns(frame.ack.size_bytes, frame.ack.bitrate_mbps), ACK_END, station, frame)
+    def _begin_ack(self, station: _Station, sent: Transmission, now_ns: int) -> None:
+        station.acking, sent.ack = sent, acknowledgement_of(sent)
+        ack = sent.ack
+        ack.signal = self._signals.of(ack.frame)
+        ack.on_air_ns = now_ns
+        self._trace.acknowledge(sent.row, now_ns, False)
+        self._medium.begin(ack, now_ns)
+        self._plan(now_ns + airtime_ns(ACK_BYTES, ack.frame.bitrate_mbps), ACK_END, station, sent)
         self._update_backoffs(now_ns)
 
-    def _is_hearing_ack(self, station: _Station, frame: Frame) -> bool:
+    def _is_hearing_ack(self, station: _Station, sent: Transmission) -> bool:
         """Return true if the sender of a frame receives its acknowledgement, which decides when it ends."""
-        return frame.ack is not None and bool(self.medium.locked(frame.ack)[station.node])
+        return sent.ack is not None and bool(self._medium.locked(sent.ack)[station.node])
 
-    def _end_ack(self, station: _Station, frame: Frame, now_ns: int) -> None:
-        assert frame.ack is not None
-        station.acking, frame.ack.end_ns = None, now_ns
-        self.medium.end(frame.ack, now_ns)
-        self._hear(frame.ack, now_ns)
-        sender = self._stations[frame.sender]
-        if sender.awaiting is not frame:
+    def _end_ack(self, station: _Station, sent: Transmission, now_ns: int) -> Transmission:
+        """End the acknowledgement of a transmission, and return it."""
+        assert sent.ack is not None
+        station.acking, sent.ack.end_ns = None, now_ns
+        self._ended_ack = sent.ack
+        self._medium.end(sent.ack, now_ns)
+        self._plan(now_ns, ACK_HEARD, station, sent)
+        return sent.ack
+
+    def _hear_ack(self, sent: Transmission, now_ns: int) -> None:
+        """Have the sender of a transmission act on its acknowledgement, if it could read it."""
+        ack, sender = sent.ack, self._stations[sent.frame.sender]
+        assert ack is not None and ack.decoded is not None
+        self._hear(ack, now_ns)
+        if sender.awaiting is not sent:
             self._update_backoffs(now_ns)
             return
-        assert frame.ack.decoded is not None
-        frame.acked = bool(frame.ack.decoded[frame.sender])
-        self.acknowledged(frame)
-        self._conclude(sender, frame, now_ns)
+        sent.acked = bool(ack.decoded[sender.node])
+        self._trace.acknowledge(sent.row, ack.on_air_ns, sent.acked)
+        self._conclude(sender, sent, now_ns)
 
-    def _conclude(self, station: _Station, frame: Frame, now_ns: int) -> None:
+    def _conclude(self, station: _Station, sent: Transmission, now_ns: int) -> None:
         """End an attempt: tell its result, or transmit the frame again after a longer backoff."""
         station.awaiting = None
         attempts = 0
-        if frame.acked or frame.attempt >= MOST_ATTEMPTS:
-            self.unicasts.finish(frame, now_ns)
+        if sent.acked or sent.attempt >= MOST_ATTEMPTS:
+            self._unicasts.finish(sent, now_ns)
         else:
-            attempts = frame.attempt
-            retry = retry_of(frame, self.next_copy(frame.sender, frame.seq))
-            retry.signal = self._signals.of(retry)
+            attempts = sent.attempt
+            retry = retry_of(sent, self._copies.next(sent.frame.sender, sent.frame.seq))
+            retry.signal = self._signals.of(retry.frame)
             station.queue.appendleft(retry)
-        self._back_off(station, frame, now_ns, attempts)
+        self._back_off(station, sent, now_ns, attempts)
+
+    # How busy the medium is.
+
+    def busy_ratios(self, time_ns: int) -> list[Array]:
+        """See `Mac`."""
+        self._medium.count(time_ns)
+        return self._medium.windows[: time_ns // WINDOW_NS]
+
+    def busy_ratios_at(self, time_ns: int) -> Array:
+        """See `Mac`; the time is no more than two lookaheads and a window back."""
+        return self._medium.busy_ratios_at(time_ns)
+
+    # Backoffs.
 
     def _update_backoffs(self, now_ns: int) -> None:
         """Update every backoff after the medium changed: freeze, resume or end it."""
         over = []
-        sensed = self.medium.sensed
+        sensed = self._medium.sensed
         for station in self._counting.values():
             busy = sensed is not None and bool(sensed[station.node])
             if busy == station.busy:

@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.radio import RATES_MBPS
-from emulator.scenario.roadside import RoadsideUnit
 from emulator.scenario.scenario import Radio
 from vnet.radio import RadioAbilities
 from vnet.types import Array

@@ -11,36 +11,39 @@ after it has been sent, over all frames at once that have been sent since the la
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
-from emulator.radio.byte_flips import flipped
-from emulator.radio.choices import Choices, allowed_choices
-from emulator.radio.connectivity import connectivity_of
 from emulator.radio.csma import Csma
-from emulator.radio.frames import BROADCAST, Frame, Receptions, Stage
+from emulator.radio.faults import LinkFaults, SenderFaults
+from emulator.radio.frames import (
+    BROADCAST,
+    CopyNumbers,
+    Frame,
+    Receptions,
+    Result,
+    Stage,
+    Transmission,
+    allowed_choices,
+    flipped,
+)
 from emulator.radio.in_flight import NO_ARRIVAL_NS, Deliveries, Delivery, InFlight
-from emulator.radio.link_faults import LinkFaults
 from emulator.radio.mac import Mac, TransmitQueue
-from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
 from emulator.radio.propagation import transmit_powers_dbm
-from emulator.radio.reception import Reception
-from emulator.radio.sender_faults import Outgoing, SenderFaults
-from emulator.radio.signals import Signals
+from emulator.radio.reception import Reception, Signals
 from emulator.radio.stages import Latency, Loss, change_by_faults, in_range, lose_by_faults, peer_cap, sender_side
-from emulator.radio.topology import Topology
+from emulator.radio.topology import Topology, connectivity_of
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
-from emulator.radio.unicast import Result, address, address_all
-from emulator.scenario.lookahead import MIN_LATENCY_NS
-from emulator.scenario.scenario import Radio
+from emulator.radio.unicast import Unicasts
+from emulator.scenario.scenario import MIN_LATENCY_NS, Radio, least_latency_ns
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
 from vnet.radio import SendOptions
@@ -51,9 +54,10 @@ NO_OPTIONS: Mapping[int, SendOptions] = {}
 __all__ = ["Deliveries", "Delivery", "Engine"]
 
 _COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
-_CHOICES = attrgetter(*CHOSEN)
-_OF_FRAME = attrgetter("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "end_ns")
-"""Returns a frame's values of `_COLUMNS` of the trace."""
+_CHOICES = attrgetter(*(f"frame.{name}" for name in CHOSEN))
+_OF_FRAME = ("frame.sent_ns", "frame.sender", "frame.seq", "frame.size_bytes", "frame.copy")
+_VALUES = attrgetter(*_OF_FRAME, "on_air_ns", "end_ns")
+"""Returns a transmission's values of `_COLUMNS` of the trace."""
 
 
 class Engine:
@@ -79,34 +83,33 @@ class Engine:
         signals = Signals(seed, radio.fading, count) if radio.is_physical else None
         nakagami = signals.nakagami if signals is not None else None
         self._topology = Topology(position_m, connectivity_of(radio, seed, inputs), radio.max_peers, nakagami)
-        self._csma = (
-            Csma(radio.mac, radio, signals, count, seed) if radio.mac is not None and signals is not None else None
-        )
-        self._mac: Mac = self._csma or TransmitQueue(seed, radio)
-        if self._csma is not None:
-            self._csma.judge, self._csma.next_copy = self._judge, self._next_copy
-            self._csma.is_up, self._csma.acknowledged = self._topology.is_up, self._acknowledged
+        self._trace = Trace(node_ids, radio.mac is not None, knows_power=radio.path_loss is not None)
+        self._copies = CopyNumbers()
+        self._unicasts = Unicasts(least_latency_ns(radio), self._trace)
+        if radio.mac is not None and signals is not None:
+            self._mac: Mac = Csma(radio, signals, self._topology, self._trace, self._copies, self._unicasts, seed)
+        else:
+            self._mac = TransmitQueue(seed, radio)
         self._rules = rules or OwnRules(seed, node_ids)
         self._rules.tx_power_dbm = transmit_powers_dbm(radio.path_loss, count, inputs.units if inputs else ())
         self._links = LinkFaults(seed, self._mac, count, self._rules)
-        self._senders = SenderFaults(self._node_ids, self._next_copy, self._ask_sender)
+        ask = partial(self._rules.ask_sender, max_bytes=radio.max_payload_bytes)
+        self._senders = SenderFaults(self._node_ids, self._copies, ask)
         self._reception = Reception(radio, signals) if signals is not None else None
-        self.chain: list[Stage] = [
+        self.deciding: list[Stage] = [
             in_range,
             sender_side,
             peer_cap,
             lose_by_faults,
             *([self._reception] if self._reception is not None else []),
             Loss(seed, radio.loss),
-            Latency(seed, radio),
-            change_by_faults,
         ]
-        self._trace = Trace(node_ids, self._csma is not None, knows_power=radio.path_loss is not None)
+        """Stages that decide which receptions succeed."""
+        self.timing: list[Stage] = [Latency(seed, radio), change_by_faults]
+        """Stages after them, which say when and how often those arrive, and with which bytes."""
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
-        self._default_choices = Choices(0.0, radio.bitrate_mbps)
         self._number = {node: number for number, node in enumerate(node_ids)}
-        self._copies: Counter[tuple[int, int]] = Counter()
         self._in_flight = InFlight(len(node_ids))
         self.on_payload: Callable[[int, int, int, bytes], None] | None = None
         """Called with time in ns, node, number and payload of each frame that a program sends."""
@@ -135,8 +138,8 @@ class Engine:
     def set_up(self, node: int, up: bool) -> None:
         """Set a node up or down. A node that is down sends nothing; what arrives there is `receiver_down`."""
         self._topology.set_up(node, up)
-        if not up and self._csma is not None:
-            self._csma.unicasts.forget(node)
+        if not up:
+            self._unicasts.forget(node)
 
     def set_faults(self, active: Sequence[PlannedFault], time_ns: int) -> None:
         """Let exactly these faults act from `time_ns` on. Receptions in flight are not affected."""
@@ -144,13 +147,6 @@ class Engine:
             self._trace.name_cause(planned.number, planned.label)
         self._links.update(active, time_ns)
         self._senders.update(active)
-
-    def _next_copy(self, sender: int, seq: int) -> int:
-        self._copies[sender, seq] += 1
-        return self._copies[sender, seq]
-
-    def _ask_sender(self, planned: PlannedFault, time_ns: int, node: int, outgoing: Outgoing) -> list[bytes]:
-        return self._rules.ask_sender(planned, self._frame(time_ns, node, outgoing), self._max_payload_bytes)
 
     # Enqueueing.
 
@@ -167,130 +163,128 @@ class Engine:
         """
         if not self._topology.is_up(node):
             return
-        self._mac.run(time_ns)
+        self._run(time_ns)
         self._topology.advance(time_ns)
         for index, payload in enumerate(payloads):
-            choices = self._chosen(time_ns, node, options[index]) if index in options else self._default_choices
-            if choices is None:
-                continue
-            seq, self._next_seq[node] = self._next_seq[node], self._next_seq[node] + 1
+            frame = Frame(
+                sender=node,
+                seq=self._next_seq[node],
+                sent_ns=time_ns,
+                payload=payload,
+                topology=self._topology.now,
+                effects=self._links.effects,
+                bitrate_mbps=self._radio.bitrate_mbps,
+                name=self._node_ids[node],
+            )
+            if index in options:
+                chosen = self._chosen(frame, options[index])
+                if chosen is None:
+                    continue
+                frame = chosen
+            self._next_seq[node] += 1
             if self.on_payload is not None:
-                self.on_payload(time_ns, node, seq, payload)
-            original = Outgoing(payload, seq, choices)
+                self.on_payload(time_ns, node, frame.seq, payload)
             if not self._senders.misbehave:
-                self._enqueue(time_ns, node, original)
+                self._enqueue(frame)
                 continue
             self._settle()  # duplicates of frames sent before are numbered before the copies sent now
-            for outgoing in self._senders.frames(time_ns, node, original):
-                self._enqueue(time_ns, node, outgoing)
+            for each in self._senders.frames(frame):
+                self._enqueue(each)
 
-    def _chosen(self, time_ns: int, node: int, options: SendOptions) -> Choices | None:
-        """Return the choices for the next frame; None for one to nobody, which is not sent."""
-        choices = allowed_choices(self._radio, options, self._rules.largest_dbm(node))
-        is_chosen = choices != self._default_choices
+    def _chosen(self, frame: Frame, options: SendOptions) -> Frame | None:
+        """Return a frame with what its program has chosen; None for one to nobody, which is not sent."""
+        node = frame.sender
+        gain_db, bitrate_mbps = allowed_choices(self._radio, options, self._rules.largest_dbm(node))
+        to, ticket = BROADCAST, 0
         if options.to is not None:
             to = self._number.get(options.to, BROADCAST)
-            if self._csma is None:
+            if not self._mac.shares_medium:
                 return None
             if to in (node, BROADCAST):
-                self._csma.unicasts.refuse(node, options.number, time_ns)
+                self._unicasts.refuse(node, options.number, frame.sent_ns)
                 return None
-            self._trace.acknowledges = True
-            choices = choices._replace(to=to, ticket=self._csma.unicasts.register(node, options.number))
-        if is_chosen:
+            ticket, self._trace.acknowledges = self._unicasts.register(node, options.number), True
+        if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
-        return choices
+        return replace(frame, gain_db=gain_db, bitrate_mbps=bitrate_mbps, to=to, ticket=ticket)
 
-    def _frame(self, time_ns: int, node: int, outgoing: Outgoing) -> Frame:
-        return Frame(
-            sender=node,
-            bitrate_mbps=(choices := outgoing.choices).bitrate_mbps,
-            gain_db=choices.gain_db,
-            seq=outgoing.seq,
-            sent_ns=time_ns,
-            size_bytes=len(outgoing.payload),
-            topology=self._topology.now,
-            effects=self._links.effects,
-            copy=outgoing.copy,
-            draw=outgoing.draw,
-            payload=outgoing.payload,
-            name=outgoing.alias or self._node_ids[node],
-            cause=outgoing.cause,
-            to=choices.to,
-            attempt=int(choices.to != BROADCAST),
-            ticket=0 if outgoing.copy else choices.ticket,
-        )
-
-    def _enqueue(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
-        frame = self._frame(time_ns, node, outgoing)
-        if outgoing.dropped or frame.size_bytes > self._max_payload_bytes:  # the MAC never sees it
-            frame.sender_outcome = Outcome.fault if outgoing.dropped else Outcome.oversize
-            frame.end_ns = time_ns
-            self._mac.sent.append(frame)
+    def _enqueue(self, frame: Frame) -> None:
+        sent = Transmission(frame, attempt=int(frame.to != BROADCAST))
+        if frame.dropped or frame.size_bytes > self._max_payload_bytes:  # the MAC never sees it
+            sent.sender_outcome = Outcome.fault if frame.dropped else Outcome.oversize
+            sent.end_ns = frame.sent_ns
+            self._mac.sent.append(sent)
         else:
-            self._mac.enqueue(frame)
+            self._mac.enqueue(sent)
         if frame.effects.copy:  # its duplicates are numbered before those of the next frame
             self._settle()
 
     # Frames that have been sent.
 
+    def _run(self, time_ns: int | None) -> None:
+        """Have the MAC process its events before `time_ns`, or all of them."""
+        while (ended := self._mac.run(time_ns)) is not None:
+            self._judge(ended)
+
+    def _judge(self, ended: Transmission) -> None:
+        """Tell the MAC who could read a transmission that ends now; an acknowledgement has no rows."""
+        self._settle()
+        if ended.decoded is None:
+            self._mac.judge([ended], self._decided([ended]))
+
+    def _decided(self, transmissions: Sequence[Transmission]) -> Receptions:
+        receptions = Receptions.of(transmissions, len(self._node_ids))
+        for stage in self.deciding:
+            stage(transmissions, receptions)
+        return receptions
+
     def _settle(self) -> None:
         """Run the stages over the frames that have been sent."""
-        if frames := self._mac.sent:
+        if transmissions := self._mac.sent:
             self._mac.sent = []
-            receptions = Receptions.of(frames, len(self._node_ids))
-            for stage in self.chain:
-                stage(frames, receptions)
-            if self._csma is not None:
-                address_all(frames, receptions, self._csma)
-            self._book(frames, receptions)
+            receptions = self._decided(transmissions)
+            for stage in self.timing:
+                stage(transmissions, receptions)
+            self._mac.judge(transmissions, receptions)
+            self._book(transmissions, receptions)
 
-    def _judge(self, frame: Frame) -> None:
-        """Decide the receptions of a frame that ends now, or of an acknowledgement, which has no rows."""
-        if self._mac.sent:
-            self._settle()
-        if frame.decoded is None:
-            receptions = Receptions.of([frame], len(self._node_ids))
-            for stage in self.chain[:-2]:  # without latency
-                stage([frame], receptions)
-            if self._csma is not None:
-                address(frame, receptions.outcome[0], self._csma.medium.locked(frame), receptions.cause[0])
-
-    def _acknowledged(self, frame: Frame) -> None:
-        assert frame.ack is not None
-        self._trace.acknowledge(frame.row, frame.ack.on_air_ns, frame.acked)
-
-    def _book(self, frames: Sequence[Frame], receptions: Receptions) -> None:
+    def _book(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
         """Append the receptions in range to the trace, and put the pending ones in flight."""
         for (number, column), flips in receptions.flips.items():
-            receiver_number = int(receptions.receivers()[number, column])
-            frames[number].altered[receiver_number] = flipped(frames[number].payload, flips)
+            sent, receiver_number = transmissions[number], int(receptions.receivers()[number, column])
+            sent.altered[receiver_number] = flipped(sent.frame.payload, flips)
         near = receptions.outcome != OUT_OF_RANGE
-        addressed = [number for number, frame in enumerate(frames) if frame.attempt]
+        addressed = [number for number, sent in enumerate(transmissions) if sent.attempt]
         for number in addressed:  # its row stands also if nobody could receive it
-            near[number, frames[number].to] = True
+            near[number, transmissions[number].frame.to] = True
         each = near.sum(axis=1)
         column = near.nonzero()[1]
         receiver = column if receptions.receiver is None else receptions.receiver[near]
         near_ones = len(receiver) - int(each[addressed].sum())
-        broadcasts = len(frames) - len(addressed)
+        broadcasts = len(transmissions) - len(addressed)
         self._counts[Outcome.out_of_range] += broadcasts * (len(self._node_ids) - 1) - near_ones
-        self._enter(
-            frames, each, receiver, receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]
-        )
-        for number, copied, later_ns, cause in receptions.copies:
+        outcome, arrival_ns, cause = receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]
+        self._enter(transmissions, each, receiver, outcome, arrival_ns, cause)
+        for number, copied, later_ns, planned in receptions.copies:
             again = np.flatnonzero(copied & (receptions.outcome[number] == PENDING))
             if len(again):
-                frame = frames[number]
-                frame = replace(frame, copy=self._next_copy(frame.sender, frame.seq), cause=cause)
+                frame = transmissions[number].frame
+                frame = replace(frame, copy=self._copies.next(frame.sender, frame.seq), cause=planned)
                 each, pending = np.array([len(again)]), np.full(len(again), PENDING, np.uint8)
                 arrival_ns = receptions.arrival_ns[number, again] + later_ns
                 receiver = receptions.receivers()[number, again]
-                self._enter([frame], each, receiver, pending, arrival_ns, np.int16(cause))
+                self._enter(
+                    [replace(transmissions[number], frame=frame)],
+                    each,
+                    receiver,
+                    pending,
+                    arrival_ns,
+                    np.int16(planned),
+                )
 
     def _enter(
         self,
-        frames: Sequence[Frame],
+        transmissions: Sequence[Transmission],
         each: NDArray[np.intp],
         receiver: NDArray[np.intp],
         outcome: NDArray[np.uint8],
@@ -302,29 +296,33 @@ class Engine:
         `each` (K,) is the number of receptions of each frame; the other arrays (n,) hold those of the first frame,
         then those of the second, and so on.
         """
-        columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
+        columns = dict(zip(_COLUMNS, np.array([_VALUES(sent) for sent in transmissions], np.int64).T, strict=True))
         if self._trace.chooses:
-            columns.update(zip(CHOSEN, np.array([_CHOICES(frame) for frame in frames]).T, strict=True))
+            columns.update(zip(CHOSEN, np.array([_CHOICES(sent) for sent in transmissions]).T, strict=True))
         if self._trace.acknowledges:
-            columns["attempt"] = np.array([frame.attempt for frame in frames])
-        columns["payload_digest"] = np.array([payload_digest(frame.payload) for frame in frames], np.uint64)
-        frame_index = np.repeat(np.arange(len(frames)), each)
+            columns["attempt"] = np.array([sent.attempt for sent in transmissions])
+        columns["payload_digest"] = np.array(
+            [payload_digest(sent.frame.payload) for sent in transmissions], np.uint64
+        )
+        frame_index = np.repeat(np.arange(len(transmissions)), each)
         powers_db = None
         if self._reception is not None and self._trace.knows_power:
-            powers_db = self._reception.powers_db(frames, frame_index, receiver)
+            powers_db = self._reception.powers_db(transmissions, frame_index, receiver)
         first = self._trace.append(columns, each, receiver, outcome, cause, arrival_ns, powers_db)
-        for number, frame in enumerate(frames):
-            frame.row = first + int(each[: number + 1].sum()) - 1 if frame.attempt else -1
-            for node, payload in frame.altered.items():
+        for number, sent in enumerate(transmissions):
+            sent.row = first + int(each[: number + 1].sum()) - 1 if sent.attempt else -1
+            for node, payload in sent.altered.items():
                 for row in np.flatnonzero((frame_index == number) & (receiver == node)).tolist():
                     self._trace.alter(first + row, payload_digest(payload))
         for kind, number in enumerate(np.bincount(outcome).tolist()):
             if number:
                 self._counts[Outcome(kind)] += number
-        if self._csma is not None and self._trace.acknowledges:
-            self._csma.unicasts.note_duplicates(frames, first, outcome, arrival_ns, self._trace)
+        if self._trace.acknowledges:
+            self._unicasts.note_duplicates(transmissions, first, outcome, arrival_ns)
         flying = np.flatnonzero(outcome == PENDING)
-        self._in_flight.add(frames, frame_index[flying], receiver[flying], first + flying, arrival_ns[flying])
+        self._in_flight.add(
+            transmissions, frame_index[flying], receiver[flying], first + flying, arrival_ns[flying]
+        )
 
     # Arrivals.
 
@@ -351,12 +349,13 @@ class Engine:
 
         The caller guarantees that no frame is enqueued before that.
         """
-        if self._csma is None:
+        if self._mac.next_ns() is None:
             return
         until_ns = self._first_ns(time_ns, nodes)
-        while (next_ns := self._csma.next_ns()) is not None and next_ns < until_ns:
-            self._csma.step()
-            if self._csma.sent or self._csma.unicasts.are_open:
+        while (next_ns := self._mac.next_ns()) is not None and next_ns < until_ns:
+            if (ended := self._mac.step()) is not None:
+                self._judge(ended)
+            if ended is not None or self._mac.sent or self._unicasts.are_open:
                 until_ns = self._first_ns(time_ns, nodes)
 
     def _first_ns(self, time_ns: int, nodes: Sequence[int] | IntArray) -> int:
@@ -367,14 +366,14 @@ class Engine:
 
     def next_result_ns(self) -> int | None:
         """Return the time of the next result of a frame to a single vehicle, as far as it is known, or None."""
-        if self._csma is None or not self._csma.unicasts.are_open:
+        if not self._unicasts.are_open:
             return None
         self._settle()
-        return self._csma.unicasts.next_ns()
+        return self._unicasts.next_ns()
 
     def take_results(self, time_ns: int) -> list[Result]:
         """Remove and return the results up to `time_ns` of frames to single vehicles, in order."""
-        return [] if self.next_result_ns() is None or self._csma is None else self._csma.unicasts.take(time_ns)
+        return [] if self.next_result_ns() is None else self._unicasts.take(time_ns)
 
     def pending_rows(self) -> list[int]:
         """Return the row numbers of the trace whose receptions are in flight."""
@@ -383,8 +382,8 @@ class Engine:
 
     def advance(self, time_ns: int) -> Deliveries:
         """Return all packets that arrive up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
-        self._mac.run(time_ns)
-        if any(frame.end_ns + MIN_LATENCY_NS <= time_ns for frame in self._mac.sent):
+        self._run(time_ns)
+        if any(sent.end_ns + MIN_LATENCY_NS <= time_ns for sent in self._mac.sent):
             self._settle()
         return self._arrive(time_ns)
 
@@ -399,8 +398,7 @@ class Engine:
 
     def _arrive(self, time_ns: int) -> Deliveries:
         arrived = self._take_arrivals(time_ns)
-        if self._csma is not None:
-            self._csma.unicasts.miss_duplicates(time_ns, self._topology.up, self._trace, self._counts)
+        self._unicasts.miss_duplicates(time_ns, self._topology.up, self._counts)
         return arrived
 
     def _take_arrivals(self, time_ns: int) -> Deliveries:
@@ -422,24 +420,22 @@ class Engine:
 
         No frame may be enqueued before `time_ns` after this call.
         """
-        if self._csma is None:
-            return []
-        self._csma.run(time_ns)
-        self._csma.medium.count(time_ns)
-        return self._csma.medium.windows[: time_ns // WINDOW_NS]
+        self._run(time_ns)
+        return self._mac.busy_ratios(time_ns)
 
     @property
     def shares_medium(self) -> bool:
         """True if the vehicles share a medium, which they sense."""
-        return self._csma is not None
+        return self._mac.shares_medium
 
     def busy_ratios_at(self, time_ns: int) -> NDArray[np.float64]:
         """Return the channel busy ratios (N,) of the 100 ms before `time_ns`, a multiple of `SLICE_NS`.
 
         All events before it have been processed, and it lies no more than a lookahead and a window back.
         """
-        assert self._csma is not None
-        return self._csma.medium.busy_ratios_at(time_ns)
+        busy_ratios = self._mac.busy_ratios_at(time_ns)
+        assert busy_ratios is not None
+        return busy_ratios
 
     def lose(self, delivery: Delivery) -> None:
         """Change a delivery that never reached its process (real time only) to `transport`; call once for each."""
@@ -453,6 +449,6 @@ class Engine:
 
     def drain(self) -> None:
         """End the run: complete every transmission and reception, without waking a program."""
-        self._mac.run(None)
+        self._run(None)
         self._settle()
         self._arrive(NO_ARRIVAL_NS - 1)

@@ -1,4 +1,4 @@
-"""Frames, and their receptions: one for each frame and receiver.
+"""Frames, their transmissions, and the receptions: one for each transmission and receiver.
 
 A frame keeps the state of the network at the time it was enqueued (connectivity, acting faults). So its outcomes do
 not depend on changes while it waits or is on air, nor on the steps in which the engine's time advances.
@@ -6,7 +6,9 @@ not depend on changes while it waits or is on air, nor on the steps in which the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -14,8 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.outcomes import PENDING, Outcome
-from emulator.radio.rule_answers import Answered
+from emulator.radio.propagation import DIGITS
 from emulator.radio.topology import TopologySnapshot
+from emulator.scenario.radio import RATES_MBPS
+from emulator.scenario.scenario import Radio
+from vnet.radio import MIN_POWER_DBM, SendOptions
 from vnet.types import Mask
 
 NO_CAUSE = -1
@@ -24,6 +29,46 @@ NOT_ON_AIR = -1
 """Start of the transmission of a frame that was never transmitted, or whose start is not modelled."""
 BROADCAST = -1
 """Addressee of a frame to all."""
+
+
+def random_flips(draw: float, size_bytes: int, count: int) -> Iterator[tuple[int, int]]:
+    """Return `count` bytes of a frame to alter, as position and XOR mask, from a uniform draw in [0, 1).
+
+    All bytes of a shorter frame are altered.
+    """
+    rng = np.random.default_rng(int(draw * 2**53))
+    positions = rng.choice(size_bytes, size=min(count, size_bytes), replace=False)
+    masks = rng.integers(1, 256, size=len(positions))
+    return zip(positions.tolist(), masks.tolist(), strict=True)
+
+
+def flips_between(sent: bytes, arrived: bytes) -> Iterator[tuple[int, int]]:
+    """Yield where two payloads of one length differ, as position and XOR mask."""
+    for position, (before, after) in enumerate(zip(sent, arrived, strict=True)):
+        if before != after:
+            yield position, before ^ after
+
+
+def flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:
+    """Return a payload with these bytes altered."""
+    changed = bytearray(payload)
+    for position, mask in flips:
+        changed[position] ^= mask
+    return bytes(changed)
+
+
+def allowed_choices(radio: Radio, options: SendOptions, largest_dbm: float | None) -> tuple[float, float]:
+    """Return the power above `largest_dbm` in dB and the bit rate in Mbit/s that a program has chosen for a frame.
+
+    They are those that the radio has. `largest_dbm` is the sender's largest power, None without a path loss.
+    """
+    gain_db, bitrate_mbps = 0.0, radio.bitrate_mbps
+    if options.power_dbm is not None and largest_dbm is not None and math.isfinite(options.power_dbm):
+        power_dbm = max(options.power_dbm, MIN_POWER_DBM)
+        gain_db = round(min(power_dbm - largest_dbm, 0.0), DIGITS)
+    if radio.is_physical and options.rate_mbps in RATES_MBPS:
+        bitrate_mbps = float(options.rate_mbps or bitrate_mbps)
+    return gain_db, bitrate_mbps
 
 
 @dataclass(slots=True, eq=False)
@@ -45,59 +90,105 @@ class Signal:
     pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True)
+class Answered:
+    """Answer of a rule of the user's own to a frame: arrays (n,) over its receivers, and payloads by index."""
+
+    drop: Mask
+    delay_ns: NDArray[np.int64]
+    corrupt: NDArray[np.int64]
+    payload: Mapping[int, bytes]
+    copies: NDArray[np.int64]
+    copy_delay_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Frame:
-    """One transmission. `sender` is a node's number; `seq` counts the sender's frames.
+    """A frame, as it is sent. `sender` is a node's number; `seq` counts the sender's frames.
 
-    `copy` counts the times that a fault sends the frame again. Such a copy has rows and random draws of its own:
-    `draw` distinguishes its draws from the original's, and depends only on the fault and on the repeated frame. Its
-    sender's name is `name`, and `cause` is the number of the fault that sends or changes it.
+    `copy` counts the times that a fault sends the frame again, or that its sender transmits it again. Such a copy
+    has rows and random draws of its own: `draw` tells its draws from the original's, and depends only on the
+    fault and on the repeated frame. Its sender's name is `name`, and `cause` is the number of the fault that sends
+    or changes it. A frame that a rule has `dropped` is recorded, but not sent.
 
-    It is sent at `bitrate_mbps`, with a power of `gain_db` above that of the scenario.
+    It is sent at `bitrate_mbps`, with a power of `gain_db` above that of the scenario. `to` is the number of its
+    addressee, or BROADCAST; then `ticket` names what its program waits for.
 
-    `topology` and `effects` are those of the time it was enqueued. `sender_outcome` is decided at the sender:
-    oversize, queue_full, held_back, fault (a rule dropped it), or pending for a frame that is sent. The frame is
-    on air from `on_air_ns` (NOT_ON_AIR if that is not modelled) to `end_ns`.
-
-    `to` is the number of its addressee, or BROADCAST; then it is transmission number `attempt`, from 1 on, and
-    `row` is its row of the trace, and `ticket` names what its program waits for. `received_as` is the earlier
-    attempt that was received, and `is_missed` says that an addressee was down when it arrived. `decoded` marks the
-    vehicles (N,) that could read this one, `garbled` those that could not, although they were locked on it. `ack`
-    is its acknowledgement, and `acked` says that its sender received that.
-
-    `altered` are the payloads that arrive with other bytes, by receiver. `answers` are those of rules of the user's
-    own, by fault, with the columns that they speak of.
+    `topology` and `effects` are those of the time it was enqueued.
     """
 
     sender: int
     seq: int
     sent_ns: int
-    size_bytes: int
+    payload: bytes
     topology: TopologySnapshot
     effects: LinkEffects
     bitrate_mbps: float
     gain_db: float = 0.0
     copy: int = 0
     draw: int = 0
-    payload: bytes = b""
     name: str = ""
     cause: int = NO_CAUSE
+    dropped: bool = False
+    to: int = BROADCAST
+    ticket: int = 0
+
+    @property
+    def size_bytes(self) -> int:
+        """Length of the payload."""
+        return len(self.payload)
+
+
+@dataclass(slots=True, eq=False)
+class Transmission:
+    """One transmission of a frame, and what becomes of it.
+
+    `sender_outcome` is decided at the sender: oversize, queue_full, held_back, fault (a rule dropped it); pending
+    for a frame that is sent. The frame is on air from `on_air_ns` (NOT_ON_AIR if that is not modelled) to `end_ns`.
+
+    To one vehicle it is transmission number `attempt` of its frame, from 1 on, and `row` is its row of the trace.
+    `received_as` is the earlier attempt that was received, and `is_missed` says that an addressee was down when it
+    arrived. `decoded` marks the vehicles (N,) that could read this one, `garbled` those that could not, although
+    they were locked on it. `ack` is its acknowledgement, and `acked` says that its sender received that.
+
+    `altered` are the payloads that arrive with other bytes, by receiver. `answers` are those of rules of the user's
+    own, by fault, with the columns that they speak of.
+    """
+
+    frame: Frame
+    attempt: int = 0
     sender_outcome: Outcome = Outcome.pending
     on_air_ns: int = NOT_ON_AIR
     end_ns: int = 0
     signal: Signal | None = None
-    to: int = BROADCAST
-    attempt: int = 0
     row: int = -1
-    received_as: Frame | None = None
+    received_as: Transmission | None = None
     is_missed: bool = False
-    ticket: int = 0
     decoded: NDArray[np.bool_] | None = None
     garbled: NDArray[np.bool_] | None = None
-    ack: Frame | None = None
+    ack: Transmission | None = None
     acked: bool = False
     altered: dict[int, bytes] = field(default_factory=dict)
     answers: dict[int, tuple[NDArray[np.intp], Answered]] = field(default_factory=dict)
+
+
+class CopyNumbers(Counter[tuple[int, int]]):
+    """Numbers of the copies of each frame, by its sender and its number."""
+
+    def next(self, sender: int, seq: int) -> int:
+        """Return the number of another copy."""
+        self[sender, seq] += 1
+        return self[sender, seq]
+
+
+class Result(NamedTuple):
+    """Result of frame `number` of the node number `sender` to one vehicle, which its node learns at `time_ns`."""
+
+    time_ns: int
+    sender: int
+    number: int
+    delivered: bool
+    attempts: int
 
 
 class LinkEffects(Protocol):
@@ -115,15 +206,15 @@ class LinkEffects(Protocol):
     def copy(self) -> bool:
         """True if a reception may arrive more than once."""
 
-    def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
+    def losses(self, sent: Transmission) -> Iterator[tuple[int, Mask]]:
         """Yield, in the order in which faults act, a fault's number and the columns (M,) that lose the frame."""
 
-    def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
-        """Delay, duplicate or alter the pending receptions of frame number `index`."""
+    def changes(self, sent: Transmission, index: int, receptions: Receptions) -> None:
+        """Delay, duplicate or alter the pending receptions of transmission number `index`."""
 
 
 class Copied(NamedTuple):
-    """Duplicates of frame number `frame_index`: mask of columns (M,), delay in ns, and number of the fault."""
+    """Duplicates of transmission number `frame_index`: mask of columns (M,), delay in ns, number of the fault."""
 
     frame_index: int
     receivers: NDArray[np.bool_]
@@ -133,7 +224,7 @@ class Copied(NamedTuple):
 
 @dataclass(slots=True)
 class Receptions:
-    """The receptions of K frames: arrays (K, M), whose columns are those of their frames' topology snapshots.
+    """The receptions of K transmissions: arrays (K, M), whose columns are those of their topology snapshots.
 
     `receiver` holds the receivers' numbers; if it is None, then M = N, and the columns are receivers' numbers.
 
@@ -151,14 +242,14 @@ class Receptions:
     flips: dict[tuple[int, int], list[tuple[int, int]]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], count: int) -> Receptions:
-        """Return the receptions of frames among `count` nodes, all pending."""
-        receiver = None if frames[0].topology.receiver is None else rows(frames, "receiver")
-        shape = (len(frames), count) if receiver is None else receiver.shape
+    def of(cls, transmissions: Sequence[Transmission], count: int) -> Receptions:
+        """Return the receptions of transmissions among `count` nodes, all pending."""
+        receiver = None if transmissions[0].frame.topology.receiver is None else rows(transmissions, "receiver")
+        shape = (len(transmissions), count) if receiver is None else receiver.shape
         arrival_ns = np.zeros(shape, np.int64)
-        arrival_ns += _column(frame.end_ns for frame in frames)
+        arrival_ns += _column(sent.end_ns for sent in transmissions)
         cause = np.zeros(shape, np.int16)
-        cause += _column(frame.cause for frame in frames).astype(np.int16)
+        cause += _column(sent.frame.cause for sent in transmissions).astype(np.int16)
         return cls(np.zeros(shape, np.uint8), arrival_ns, cause, receiver)
 
     def receivers(self) -> NDArray[np.intp]:
@@ -182,11 +273,12 @@ class Receptions:
         self.cause[index, :width][decided] = cause
 
 
-def rows(frames: Sequence[Frame], name: str) -> NDArray[Any]:
+def rows(transmissions: Sequence[Transmission], name: str) -> NDArray[Any]:
     """Return (K, M): for each frame, its sender's row of the array `name` of its topology snapshot.
 
     Shorter rows are filled up with zeros, or False.
     """
+    frames = [sent.frame for sent in transmissions]
     first = frames[0].topology
     if all(frame.topology is first for frame in frames):
         return np.asarray(getattr(first, name)[[frame.sender for frame in frames]])
@@ -201,5 +293,5 @@ def _column(numbers: Iterable[int]) -> NDArray[np.int64]:
     return np.array([*numbers], np.int64)[:, None]
 
 
-Stage = Callable[[Sequence[Frame], Receptions], None]
+Stage = Callable[[Sequence[Transmission], Receptions], None]
 """One step of the channel: decides receptions, or changes when they arrive."""

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from emulator.radio.frames import Frame
+from emulator.radio.frames import Transmission
 from emulator.radio.trace import Trace
 from vnet.radio import Packet
 from vnet.types import IntArray
@@ -44,7 +44,7 @@ class Deliveries(Sequence[Delivery]):
     """
 
     _table: IntArray
-    _frames: dict[int, Frame]
+    _frames: dict[int, Transmission]
     _trace: Trace
     _built: list[Delivery] | None = field(default=None, init=False)
 
@@ -86,12 +86,12 @@ class Deliveries(Sequence[Delivery]):
     def _packets(self, table: IntArray) -> list[Packet]:
         """Return the packets of these columns (4, n) of the table, as they stand."""
         arrivals_ns, receivers, _, numbers = table.tolist()
-        frames = [self._frames[number] for number in numbers]
+        transmissions = [self._frames[number] for number in numbers]
         packets = [
-            Packet(frame.name, frame.sent_ns, arrival_ns, frame.altered.get(receiver, frame.payload))
-            if frame.altered
-            else Packet(frame.name, frame.sent_ns, arrival_ns, frame.payload)
-            for frame, arrival_ns, receiver in zip(frames, arrivals_ns, receivers, strict=True)
+            Packet(sent.frame.name, sent.frame.sent_ns, arrival_ns, sent.altered.get(receiver, sent.frame.payload))
+            if sent.altered
+            else Packet((frame := sent.frame).name, frame.sent_ns, arrival_ns, frame.payload)
+            for sent, arrival_ns, receiver in zip(transmissions, arrivals_ns, receivers, strict=True)
         ]
         if not self._trace.knows_power:
             return packets
@@ -121,7 +121,7 @@ class InFlight:
     def __init__(self, count: int) -> None:
         self._table: IntArray = np.zeros((4, INITIAL_CAPACITY), np.int64)
         self._length = 0
-        self._frames: dict[int, Frame] = {}
+        self._frames: dict[int, Transmission] = {}
         self._frames_kept = 64
         self._next_frame = 0
         self._by_receiver: IntArray = np.full(count, NO_ARRIVAL_NS)
@@ -131,13 +131,13 @@ class InFlight:
 
     def add(
         self,
-        frames: Sequence[Frame],
+        transmissions: Sequence[Transmission],
         frame_index: NDArray[np.intp],
         receiver: IntArray,
         row: IntArray,
         arrival_ns: IntArray,
     ) -> None:
-        """Add receptions, arrays (n,) each; `frame_index` are indices into `frames`, `row` rows of the trace.
+        """Add receptions, arrays (n,) each: `frame_index` are indices into `transmissions`, `row` is in the trace.
 
         None of them arrives by a time up to which arrivals have been foreseen.
         """
@@ -149,8 +149,8 @@ class InFlight:
         new = self._table[:, self._length : self._length + len(row)]
         new[_ARRIVAL], new[_RECEIVER], new[_ROW] = arrival_ns, receiver, row
         new[_FRAME] = frame_index + self._next_frame
-        self._frames.update(enumerate(frames, self._next_frame))
-        self._next_frame += len(frames)
+        self._frames.update(enumerate(transmissions, self._next_frame))
+        self._next_frame += len(transmissions)
         self._length += len(row)
         self._soonest_ns = min(self._soonest_ns, soonest_ns)
 
@@ -206,7 +206,7 @@ class InFlight:
         return taken
 
     def miss(self, table: IntArray) -> None:
-        """Note in frames to single vehicles that these receptions, which `take` returned, found nobody."""
+        """Note in transmissions to single vehicles that these receptions, which `take` returned, found nobody."""
         for number in table[_FRAME].tolist():
             self._frames[number].is_missed = True
 

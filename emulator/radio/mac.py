@@ -1,40 +1,68 @@
-"""MAC interface, and the default MAC: a transmit queue for each sender, without a shared medium."""
+"""Interface of the MAC, and the default MAC: a transmit queue for each sender, without a shared medium."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar
 
 from emulator.radio.dot11p import airtime_ns
-from emulator.radio.frames import Frame
+from emulator.radio.frames import Frame, Receptions, Transmission
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio
+from vnet.types import Array
 from vnet.units import NS_PER_MS
 
 
-class Mac(Protocol):
-    """Interface of a MAC. `sent` holds the frames that have left their senders since the engine last took them.
+class Mac:
+    """A MAC: it takes frames, and decides when each is on air. What it does not have, it answers with "none".
+
+    `sent` holds the transmissions that have left their senders since the engine last took them.
 
     A MAC may have events of its own, at which no program runs. `run` processes the events strictly before a time,
-    so that all frames enqueued at this time are there before its events are processed.
+    so that all frames enqueued at this time are there before its events are processed. Where what a MAC does next
+    depends on who can read a transmission that has ended, `run` and `step` return it. Its receptions must then be
+    judged, and those of all others in `sent`, before the next call.
     """
 
-    sent: list[Frame]
+    shares_medium: ClassVar[bool] = False
+    """True if the vehicles share a medium: they sense how busy it is, and acknowledge frames to one of them."""
 
-    def enqueue(self, frame: Frame) -> None:
-        """Take a frame sent at `frame.sent_ns`; set its `sender_outcome` and `end_ns` before it is in `sent`."""
+    def __init__(self) -> None:
+        self.sent: list[Transmission] = []
 
-    def next_ns(self) -> int | None:
-        """Return the time of the next event, or None."""
-
-    def run(self, time_ns: int | None) -> None:
-        """Process all events before `time_ns`, or all events if it is None."""
+    def enqueue(self, sent: Transmission) -> None:
+        """Take a frame sent at `sent_ns`; set `sender_outcome` and `end_ns` before it is in `sent`."""
+        raise NotImplementedError
 
     def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
         """Throttle exactly these senders, to these bitrates, from now on."""
+        raise NotImplementedError
+
+    def next_ns(self) -> int | None:
+        """Return the time of the next event, or None."""
+        return None
+
+    def run(self, time_ns: int | None) -> Transmission | None:
+        """Process all events before `time_ns`, or all if it is None; return a transmission to judge first."""
+        return None
+
+    def step(self) -> Transmission | None:
+        """Process the next event; return a transmission that must be judged before the event after it."""
+        return None
+
+    def judge(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
+        """Note who could read transmissions, and what becomes of those to single vehicles."""
+
+    def busy_ratios(self, time_ns: int) -> list[Array]:
+        """Return the channel busy ratios (N,) of every window that ends by `time_ns`, which `run` has reached."""
+        return []
+
+    def busy_ratios_at(self, time_ns: int) -> Array | None:
+        """Return the channel busy ratios (N,) of the 100 ms before `time_ns`, or None without a medium."""
+        return None
 
 
 @dataclass
@@ -58,7 +86,7 @@ class _Backlog:
         return self.busy_until_ns
 
 
-class TransmitQueue:
+class TransmitQueue(Mac):
     """A transmit queue for each sender: random access delay, airtime, and at most `radio.queue_frames` waiting.
 
     The airtime is the frame's bits at its bit rate; with a physical radio it is that of 802.11p. A frame's
@@ -66,6 +94,7 @@ class TransmitQueue:
     """
 
     def __init__(self, seed: int, radio: Radio) -> None:
+        super().__init__()
         self._draws = Draws(seed, "access")
         self._access_jitter_ns = radio.access_jitter_ms * NS_PER_MS
         self._is_physical = radio.is_physical
@@ -73,7 +102,6 @@ class TransmitQueue:
         self._backlogs: dict[int, _Backlog] = {}
         self._throttled_mbps: dict[int, float] = {}
         self._unthrottled: dict[int, _Backlog] = {}
-        self.sent: list[Frame] = []
 
     def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
         """Throttle exactly these senders, to these bitrates, from now on.
@@ -88,8 +116,9 @@ class TransmitQueue:
             self._unthrottled[sender] = _Backlog(backlog.starts_ns.copy(), backlog.busy_until_ns)
         self._throttled_mbps = dict(bitrate_mbps)
 
-    def enqueue(self, frame: Frame) -> None:
+    def enqueue(self, sent: Transmission) -> None:
         """Decide `queue_full`, or the time at which the frame's transmission ends."""
+        frame = sent.frame
         jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.draw)[0])
         bitrate_mbps = frame.bitrate_mbps
         if (unthrottled := self._unthrottled.get(frame.sender)) is not None:
@@ -98,10 +127,10 @@ class TransmitQueue:
         backlog = self._backlogs.setdefault(frame.sender, _Backlog())
         end_ns = self._put(frame, backlog, jitter_ns, bitrate_mbps)
         if end_ns is None:
-            frame.sender_outcome, frame.end_ns = Outcome.queue_full, frame.sent_ns
+            sent.sender_outcome, sent.end_ns = Outcome.queue_full, frame.sent_ns
         else:
-            frame.end_ns = end_ns
-        self.sent.append(frame)
+            sent.end_ns = end_ns
+        self.sent.append(sent)
 
     def _put(self, frame: Frame, backlog: _Backlog, jitter_ns: int, bitrate_mbps: float) -> int | None:
         if not backlog.room(frame.sent_ns, self._limit):
@@ -110,13 +139,6 @@ class TransmitQueue:
         if self._is_physical:  # a throttled sender takes even longer
             airtime = max(airtime_ns(frame.size_bytes, frame.bitrate_mbps), airtime)
         return backlog.take(frame.sent_ns + jitter_ns, airtime)
-
-    def next_ns(self) -> int | None:
-        """Return None: this MAC has no events."""
-        return None
-
-    def run(self, time_ns: int | None) -> None:
-        """Do nothing: this MAC has no events."""
 
 
 class Throttle:

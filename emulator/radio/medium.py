@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.dot11p import DETECTION_NS
-from emulator.radio.frames import Frame, Signal
+from emulator.radio.frames import Signal, Transmission
 from emulator.radio.reception import Threshold
 from vnet.types import Array
 
@@ -33,14 +33,20 @@ class Medium:
     `sensed` (N,) marks the vehicles at which the medium is busy: those that transmit, and those at which the sum of
     all powers is at least `carrier_sense_mw`. It is None if nothing is on air. `idle_ns` (N,) is the time at which
     the medium last became idle. Busy times of the last `remembered_ns` are kept.
+    `listener` is called at the end of each slice.
     """
 
     def __init__(
-        self, count: int, carrier_sense_mw: float, threshold: Threshold, remembered_ns: int = WINDOW_NS
+        self,
+        count: int,
+        carrier_sense_mw: float,
+        threshold: Threshold,
+        remembered_ns: int = WINDOW_NS,
+        listener: Listener | None = None,
     ) -> None:
         self._carrier_sense_mw = carrier_sense_mw
         self._threshold = threshold
-        self._frames: list[Frame] = []
+        self._frames: list[Transmission] = []
         self._total_mw: Array = np.zeros(count)
         self.sensed: NDArray[np.bool_] | None = None
         self._busy_ns = np.full(count, LONG_AGO_NS)
@@ -51,7 +57,7 @@ class Medium:
         self._slice_ends_ns = SLICE_NS
         self._slices: deque[NDArray[np.int64]] = deque(maxlen=max(remembered_ns, WINDOW_NS) // SLICE_NS)
         self._window_ns = np.zeros(count, np.int64)
-        self._listener: Listener | None = None
+        self._listener = listener
         self.windows: list[Array] = []
         """Channel busy ratios (N,) of the windows that have ended."""
 
@@ -70,22 +76,22 @@ class Medium:
             np.copyto(self._busy_ns, self._busy_since_ns, where=self.sensed)
             self._busy_since_ns = None
 
-    def begin(self, frame: Frame, time_ns: int) -> None:
-        """Start the transmission of a frame, with the powers of `frame.signal`."""
+    def begin(self, sent: Transmission, time_ns: int) -> None:
+        """Start the transmission of a frame, with the powers of `sent.signal`."""
         self.count(time_ns)
-        signal = _signal(frame)
+        signal = _signal(sent)
         before_mw, others = self._total_mw, self._frames
         if others:
             total_mw = before_mw + signal.power_mw
-            self._lock(frame, signal, total_mw)
+            self._lock(sent, signal, total_mw)
             for other in others:
                 _signal(other).pieces.append((time_ns, before_mw))
         else:
             total_mw = signal.power_mw
-        others.append(frame)
+        others.append(sent)
         self._sense(total_mw, time_ns)
 
-    def _lock(self, frame: Frame, signal: Signal, total_mw: Array) -> None:
+    def _lock(self, sent: Transmission, signal: Signal, total_mw: Array) -> None:
         """Lock receivers on a new signal: those that detect it and are not locked on another one yet.
 
         A receiver releases a signal that began less than `DETECTION_NS` ago if, with the new one as interference,
@@ -96,22 +102,22 @@ class Medium:
             known = _signal(other)
             if known.locked is None:
                 known.locked = known.power_mw >= self._threshold.alone_mw
-            if other.on_air_ns + DETECTION_NS > frame.on_air_ns:
+            if other.on_air_ns + DETECTION_NS > sent.on_air_ns:
                 known.locked &= self._threshold.detects(known.power_mw, total_mw)
-            known.locked[frame.sender] = False
+            known.locked[sent.frame.sender] = False
             taken |= known.locked
         signal.locked = self._threshold.detects(signal.power_mw, total_mw) & ~taken
 
-    def locked(self, frame: Frame) -> NDArray[np.bool_]:
+    def locked(self, sent: Transmission) -> NDArray[np.bool_]:
         """Return the mask (N,) of the receivers that are locked on a frame, or were until it ended."""
-        signal = _signal(frame)
+        signal = _signal(sent)
         return signal.power_mw >= self._threshold.alone_mw if signal.locked is None else signal.locked
 
-    def end(self, frame: Frame, time_ns: int) -> None:
+    def end(self, sent: Transmission, time_ns: int) -> None:
         """End the transmission of a frame."""
         self.count(time_ns)
-        signal, before_mw = _signal(frame), self._total_mw
-        self._frames.remove(frame)
+        signal, before_mw = _signal(sent), self._total_mw
+        self._frames.remove(sent)
         if signal.pieces or self._frames:
             signal.pieces.append((time_ns, before_mw))
         if not self._frames:
@@ -128,8 +134,8 @@ class Medium:
 
     def _sense(self, total_mw: Array, time_ns: int) -> None:
         sensed, before = total_mw >= self._carrier_sense_mw, self.sensed
-        for frame in self._frames:
-            sensed[frame.sender] = True  # half duplex
+        for sent in self._frames:
+            sensed[sent.frame.sender] = True  # half duplex
         if before is None:
             self._busy_since_ns = time_ns
         else:
@@ -177,11 +183,7 @@ class Medium:
         some = [self._slices[number - first] for number in range(max(begin, 0), end)]
         return np.asarray(np.sum(some, axis=0) / WINDOW_NS) if some else np.zeros(len(self._window_ns))
 
-    def listen(self, listener: Listener) -> None:
-        """Call `listener` at the end of each slice with its number and the busy time (N,) in ns."""
-        self._listener = listener
 
-
-def _signal(frame: Frame) -> Signal:
-    assert frame.signal is not None
-    return frame.signal
+def _signal(sent: Transmission) -> Signal:
+    assert sent.signal is not None
+    return sent.signal

@@ -10,32 +10,139 @@ A rule that raises, answers nonsense or does not answer is told once, and then l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from emulator.faults.plan import PlannedFault
-from emulator.radio.byte_flips import flips_between, random_flips
-from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions
+from emulator.radio.frames import (
+    NO_CAUSE,
+    Answered,
+    Copied,
+    Frame,
+    Receptions,
+    Transmission,
+    flips_between,
+    random_flips,
+)
 from emulator.radio.outcomes import PENDING
 from emulator.radio.propagation import DIGITS
-from emulator.radio.rule_answers import Answer, Answered, answered_by_link, answered_by_sender
 from emulator.radio.topology import TopologySnapshot
 from emulator.scenario import rule_watch
-from emulator.scenario.fault_families import OwnRule
-from emulator.scenario.own_functions import load_function
+from emulator.scenario.faults import OwnRule
+from emulator.scenario.own_functions import NonsenseError, load_function
 from emulator.scenario.program import Program
 from emulator.scenario.random_streams import Draws, frame_stream
 from vnet.errors import shown
 from vnet.runtime.programs import search_programs_in
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
+
+LONGEST_DELAY_S = 60.0
+MOST_COPIES = 20
+MOST_FLIPS = 65_000
+MOST_FRAMES = 200
+"""Frames that a sender may send in place of one."""
+
+
+class Answer(NamedTuple):
+    """The answer of a rule on links. Each value is one for all receivers, or one for each (n,)."""
+
+    drop: ArrayLike = False
+    """True: the frame is lost, outcome `fault`."""
+    delay_s: ArrayLike = 0.0
+    """Extra latency in seconds, 0 to 60."""
+    corrupt: ArrayLike = 0
+    """Number of bytes that arrive altered, chosen by chance, 0 to 65000; all bytes of a shorter frame."""
+    payload: Mapping[str, bytes] = {}
+    """Bytes that arrive instead, by the receiver's id; as many as were sent."""
+    copies: ArrayLike = 0
+    """Number of further arrivals, 0 to 20."""
+    copy_delay_s: float = 0.01
+    """Time from one of these arrivals to the next in seconds, more than 0 and up to 60."""
+
+
+def answered_by_link(answer: Any, receivers: Sequence[str], size_bytes: int) -> Answered:
+    """Return the answer of a rule on links to a frame of `size_bytes`. Raises NonsenseError."""
+    if not isinstance(answer, Answer):
+        raise NonsenseError(f"{shown(answer)}: Answer(…) is needed, or None to let the frame pass")
+    count = len(receivers)
+    delay_s = _numbers("delay_s", answer.delay_s, count, LONGEST_DELAY_S, float)
+    return Answered(
+        drop=_array("drop", answer.drop, count, np.bool_, "True or False"),
+        delay_ns=np.round(delay_s * NS_PER_S).astype(np.int64),
+        corrupt=_numbers("corrupt", answer.corrupt, count, MOST_FLIPS, int).astype(np.int64),
+        payload=_payloads(answer.payload, receivers, size_bytes),
+        copies=_numbers("copies", answer.copies, count, MOST_COPIES, int).astype(np.int64),
+        copy_delay_ns=_copy_delay_ns(answer.copy_delay_s),
+    )
+
+
+def answered_by_sender(answer: Any, max_bytes: int) -> list[bytes]:
+    """Return the payloads that a rule at a sender answers; none if it drops the frame. Raises NonsenseError."""
+    if not isinstance(answer, (list, tuple)):
+        raise NonsenseError(f"{shown(answer)}: a list of payloads is needed, or None to change nothing")
+    if len(answer) > MOST_FRAMES:
+        raise NonsenseError(f"{len(answer)} payloads: {MOST_FRAMES} at most")
+    for payload in answer:
+        if not isinstance(payload, bytes):
+            raise NonsenseError(f"the payload {shown(payload)}: bytes are needed")
+        if len(payload) > max_bytes:
+            raise NonsenseError(f"a payload of {len(payload)} bytes: radio.max_payload_bytes = {max_bytes}")
+    return list(answer)
+
+
+def _array(name: str, given: Any, count: int, kind: type[np.generic], needed: str) -> NDArray[Any]:
+    """Return values (n,) of one kind."""
+    try:
+        values = np.asarray(given)
+    except ValueError:
+        raise NonsenseError(f"{name} = {shown(given)}: {needed} is needed, or {count} of them") from None
+    if not np.issubdtype(values.dtype, kind):
+        raise NonsenseError(f"{name} = {shown(given)}: {needed} is needed, or {count} of them")
+    if values.shape not in ((), (count,)):
+        raise NonsenseError(f"{name} of shape {values.shape}: one value is needed, or {count}, one a receiver")
+    return np.broadcast_to(values, (count,))
+
+
+def _numbers(name: str, given: Any, count: int, most: float, kind: type[int | float]) -> NDArray[Any]:
+    """Return numbers (n,) from 0 to `most`."""
+    whole = kind is int
+    needed = f"{'a whole number' if whole else 'a number'} from 0 to {most:g}"
+    values = _array(name, given, count, np.integer if whole else np.number, needed)
+    wrong = values[~((values >= 0) & (values <= most))] if values.dtype.kind in "iuf" else values
+    if len(wrong):
+        raise NonsenseError(f"{name} = {wrong[0]}: {needed} is needed")
+    return values
+
+
+def _payloads(given: Any, receivers: Sequence[str], size_bytes: int) -> dict[int, bytes]:
+    if not isinstance(given, Mapping):
+        raise NonsenseError(f"payload = {shown(given)}: a dict is needed, from a receiver's id to bytes")
+    index = {node: number for number, node in enumerate(receivers)}
+    for node, payload in given.items():
+        if node not in index:
+            raise NonsenseError(f"payload[{shown(node)}]: is none of the frame's receivers")
+        if not isinstance(payload, bytes) or len(payload) != size_bytes:
+            raise NonsenseError(f"payload[{shown(node)}] = {shown(payload)}: {size_bytes} bytes are needed")
+    return {index[node]: payload for node, payload in given.items()}
+
+
+def _copy_delay_ns(given: Any) -> int:
+    is_number = isinstance(given, (int, float, np.integer, np.floating)) and not isinstance(given, bool)
+    if not is_number or not math.isfinite(given) or not 0 < given <= LONGEST_DELAY_S:
+        raise NonsenseError(
+            f"copy_delay_s = {shown(given)}: a number over 0 and up to {LONGEST_DELAY_S:g} is needed"
+        )
+    return max(1, round(float(given) * NS_PER_S))
+
 
 __all__ = ["Answer", "OwnRules", "RadioFrame", "RuleFailure", "RuledLinks"]
 
@@ -194,29 +301,29 @@ class RuledLinks:
     draws: Draws
     rules: OwnRules
 
-    def lost(self, frame: Frame) -> Mask:
+    def lost(self, sent: Transmission) -> Mask:
         """Return the columns (M,) at which the rule drops a frame; what else it answers is kept for `change`."""
-        topology, sender, links = frame.topology, frame.sender, self.planned.links
+        topology, sender, links = sent.frame.topology, sent.frame.sender, self.planned.links
         assert links is not None
         drop = np.zeros(topology.in_range.shape[1], dtype=bool)
         near = topology.in_range[sender] & topology.admitted[sender] & links[sender][topology.receivers(sender)]
         columns = np.flatnonzero(near)
-        if frame.sender_outcome or not len(columns):
+        if sent.sender_outcome or not len(columns):
             return drop
-        answered = self.rules.ask_link(self.planned, frame, columns)
+        answered = self.rules.ask_link(self.planned, sent.frame, columns)
         if answered is not None:
             drop[columns] = answered.drop
-            frame.answers[self.planned.number] = columns, answered
+            sent.answers[self.planned.number] = columns, answered
         return drop
 
-    def change(self, frame: Frame, index: int, receptions: Receptions) -> None:
-        """Delay, alter and duplicate the pending receptions of frame number `index` as the rule has answered."""
-        if self.planned.number not in frame.answers:
+    def change(self, sent: Transmission, index: int, receptions: Receptions) -> None:
+        """Delay, alter and duplicate the pending receptions of transmission number `index` as the rule says."""
+        if self.planned.number not in sent.answers:
             return
-        columns, answered = frame.answers[self.planned.number]
+        columns, answered = sent.answers[self.planned.number]
         pending = receptions.outcome[index, columns] == PENDING
         self._delay(answered.delay_ns, columns[pending], pending, index, receptions)
-        self._alter(answered, frame, index, columns, pending, receptions)
+        self._alter(answered, sent.frame, index, columns, pending, receptions)
         copied = np.where(pending, answered.copies, 0)
         for number in range(int(copied.max())):
             mask = np.zeros(receptions.outcome.shape[1], dtype=bool)

@@ -1,4 +1,7 @@
-"""The receiver: detection and decoding of frames, and the cause of each loss.
+"""Signals of frames at receivers, their detection and decoding, and the cause of each loss.
+
+A frame has a word of 64 random bits for each receiver: 16 bits for its fading, 16 for its latency, and 32 for its
+reception. The word of its sender, which receives nothing, is used by the MAC.
 
 One draw decides about a frame at a receiver, both with the interference that it met and without. A frame that would
 not have been received without interference has `faded`; one that would have been, but is not, has `collided`.
@@ -12,12 +15,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.dot11p import COST_STEPS, PREAMBLE_NS, airtime_ns, cost
-from emulator.radio.frames import Frame, Receptions, Signal
+from emulator.radio.frames import Frame, Receptions, Signal, Transmission
 from emulator.radio.outcomes import Outcome
-from emulator.radio.signals import Signals, Words, reception_draws
-from emulator.scenario.radio import Receiver
+from emulator.radio.propagation import QUANTILES, Nakagami
+from emulator.scenario.radio import Fading, Receiver
+from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio
 from vnet.types import Array, IntArray
+
+Words = NDArray[np.uint64]
+
+JITTER, BACKOFF, NEXT_BACKOFF = 0, 16, 32
+"""Lowest of 16 bits each in a sender's word: access jitter, backoff before the frame, backoff after it."""
+_STEPS = 1 << 16
+_LAST = np.array(_STEPS - 1, np.uint64)
+_LATENCY, _RECEPTION = np.uint64(16), np.uint64(32)
+
+assert QUANTILES == _STEPS
+
+
+def latency_draws(random_draws: Words) -> Array:
+    """Return the latency draws in [0, 1) of words of any shape."""
+    return np.asarray((random_draws >> _LATENCY & _LAST) / _STEPS)
+
+
+def reception_draws(random_draws: Words) -> Array:
+    """Return the reception draws in (0, 1) of words of any shape."""
+    return np.asarray(((random_draws >> _RECEPTION) + 0.5) / (1 << 32))
+
+
+def sender_draw(sent: Transmission, lowest_bit: int) -> float:
+    """Return a draw in [0, 1) of a frame's sender: JITTER, BACKOFF or NEXT_BACKOFF."""
+    assert sent.signal is not None
+    return (sent.signal.sender_draws >> lowest_bit & _STEPS - 1) / _STEPS
+
+
+class Signals:
+    """Factory of the signals of frames at `count` receivers."""
+
+    def __init__(self, seed: int, fading: Fading | None, count: int) -> None:
+        self._draws = Draws(seed, "radio")
+        self.nakagami = Nakagami(fading)
+        self.count = count
+
+    def of(self, frame: Frame) -> Signal:
+        """Return the signal of a frame."""
+        random_draws = self._draws.words(frame.sender, frame.seq, self.count, frame.draw)
+        topology, sender = frame.topology, frame.sender
+        assert topology.power_mw is not None
+        assert topology.fading is not None
+        mean_mw = topology.power_mw[sender]
+        steps = (random_draws & _LAST).view(np.int64)  # of the type of an index, which numpy need not convert
+        power_mw = mean_mw * self.nakagami.factor(topology.fading[sender], steps)
+        power_mw[sender] = mean_mw[sender]
+        if frame.gain_db:
+            power_mw *= 10 ** (frame.gain_db / 10)
+        return Signal(random_draws, power_mw, random_draws.item(sender))
 
 
 def milliwatts(dbm: float) -> float:
@@ -48,22 +101,23 @@ class Reception:
         self._signals = signals
         self._threshold = Threshold(radio.receiver or Receiver())
 
-    def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
+    def __call__(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
         """Decide the receptions of the frames that were sent."""
-        sent = [index for index, frame in enumerate(frames) if frame.sender_outcome == Outcome.pending]
+        sent = [index for index, one in enumerate(transmissions) if one.sender_outcome == Outcome.pending]
         if not sent:
             return
-        signals = [self._signal(frames[index]) for index in sent]
+        frames = [transmissions[index].frame for index in sent]
+        signals = [self._signal(transmissions[index]) for index in sent]
         power_mw = np.array([signal.power_mw for signal in signals])
         random_draws = np.array([signal.random_draws for signal in signals])
-        rates_mbps = np.array([frames[index].bitrate_mbps for index in sent])
-        on_air_ns = np.array([airtime_ns(frames[index].size_bytes, frames[index].bitrate_mbps) for index in sent])
+        rates_mbps = np.array([frame.bitrate_mbps for frame in frames])
+        on_air_ns = np.array([airtime_ns(frame.size_bytes, frame.bitrate_mbps) for frame in frames])
         alone = self._received_alone(power_mw, random_draws, on_air_ns - PREAMBLE_NS, rates_mbps)
         faded = np.zeros_like(receptions.outcome, bool)
         faded[sent] = ~alone
         receptions.decide(faded, Outcome.faded)
         if interfered := [number for number, signal in enumerate(signals) if signal.pieces]:
-            some = [frames[sent[number]] for number in interfered]
+            some = [transmissions[sent[number]] for number in interfered]
             locked = np.array([signals[number].locked for number in interfered], dtype=bool)
             candidates = alone[interfered] & locked
             lost = alone[interfered] & ~locked
@@ -72,34 +126,34 @@ class Reception:
             collided[[sent[number] for number in interfered]] = lost
             receptions.decide(collided, Outcome.collided)
 
-    def powers_db(self, frames: Sequence[Frame], frame_index: IntArray, receiver: IntArray) -> Array:
+    def powers_db(self, transmissions: Sequence[Transmission], frame_index: IntArray, receiver: IntArray) -> Array:
         """Return received powers in dBm, and their ratios to noise and interference in dB, as an array (2, n).
 
         `frame_index` and `receiver` (n,) name the receptions. Interference is averaged over the payload. Both are
         NaN for a frame that was not sent, and out of range.
         """
-        own_mw, others_mw = np.full((2, len(frames), self._signals.count), np.nan)
-        for index, frame in enumerate(frames):
-            if frame.sender_outcome == Outcome.pending:
-                signal = self._signal(frame)
+        own_mw, others_mw = np.full((2, len(transmissions), self._signals.count), np.nan)
+        for index, sent in enumerate(transmissions):
+            if sent.sender_outcome == Outcome.pending:
+                signal = self._signal(sent)
                 own_mw[index] = signal.power_mw
-                others_mw[index] = self._threshold.noise_mw + self._interference_mw(frame, signal)
+                others_mw[index] = self._threshold.noise_mw + self._interference_mw(sent, signal)
         power_mw = own_mw[frame_index, receiver]
         power_mw[power_mw == 0] = np.nan
         return np.asarray(10 * np.log10([power_mw, power_mw / others_mw[frame_index, receiver]]))
 
-    def _interference_mw(self, frame: Frame, signal: Signal) -> Array | float:
+    def _interference_mw(self, sent: Transmission, signal: Signal) -> Array | float:
         """Return the mean power (N,) of all other signals during a frame's payload."""
-        if not (pieces := [*self._pieces(frame)]):
+        if not (pieces := [*self._pieces(sent)]):
             return 0.0
         lengths_ns = np.array([length_ns for length_ns, _ in pieces])
         others_mw = np.maximum(np.array([total_mw for _, total_mw in pieces]) - signal.power_mw, 0.0)
         return np.asarray(lengths_ns @ others_mw / lengths_ns.sum())
 
-    def _signal(self, frame: Frame) -> Signal:
-        if frame.signal is None:  # without a shared medium nothing needed it before
-            frame.signal = self._signals.of(frame)
-        return frame.signal
+    def _signal(self, sent: Transmission) -> Signal:
+        if sent.signal is None:  # without a shared medium nothing needed it before
+            sent.signal = self._signals.of(sent.frame)
+        return sent.signal
 
     def _received_alone(
         self, power_mw: Array, random_draws: Words, payload_ns: IntArray, rates_mbps: Array
@@ -117,31 +171,35 @@ class Reception:
         return alone
 
     def _destroyed(
-        self, frames: Sequence[Frame], candidates: NDArray[np.bool_], power_mw: Array, random_draws: Words
+        self,
+        transmissions: Sequence[Transmission],
+        candidates: NDArray[np.bool_],
+        power_mw: Array,
+        random_draws: Words,
     ) -> NDArray[np.bool_]:
         """Return the mask (M, N) of those `candidates` (M, N) that their interference destroys.
 
         The other arguments are those of the frames: powers and words (M, N).
         """
-        pieces = [[*self._pieces(frame)] for frame in frames]
+        pieces = [[*self._pieces(sent)] for sent in transmissions]
         each = [len(some) for some in pieces]
         lengths_ns = np.array([length_ns for some in pieces for length_ns, _ in some])
         total_mw = np.array([total_mw for some in pieces for _, total_mw in some])
-        frame_of = np.repeat(np.arange(len(frames)), each)
+        frame_of = np.repeat(np.arange(len(transmissions)), each)
         own_mw = power_mw[frame_of]
         others_mw = np.maximum(total_mw - own_mw, 0.0)
         snr = np.where(candidates[frame_of], own_mw / (self._threshold.noise_mw + others_mw), np.inf)
-        rates_mbps = np.array([frame.bitrate_mbps for frame in frames])[frame_of]
+        rates_mbps = np.array([sent.frame.bitrate_mbps for sent in transmissions])[frame_of]
         costs = _costs(snr, rates_mbps) * lengths_ns[:, None]
         spent = np.add.reduceat(costs, np.cumsum([0, *each[:-1]]), axis=0)
         destroyed: NDArray[np.bool_] = spent > 0
         destroyed[destroyed] = spent[destroyed] >= _max_cost(random_draws[destroyed])
         return destroyed
 
-    def _pieces(self, frame: Frame) -> Iterator[tuple[int, Array]]:
+    def _pieces(self, sent: Transmission) -> Iterator[tuple[int, Array]]:
         """Yield the pieces of a frame's payload: time in ns, and the sum of all powers (N,) in mW."""
-        begin_ns = frame.on_air_ns + PREAMBLE_NS
-        for until_ns, total_mw in self._signal(frame).pieces:
+        begin_ns = sent.on_air_ns + PREAMBLE_NS
+        for until_ns, total_mw in self._signal(sent).pieces:
             if until_ns > begin_ns:
                 yield until_ns - begin_ns, total_mw
                 begin_ns = until_ns

@@ -12,61 +12,60 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.frames import Frame, Receptions, rows
+from emulator.radio.frames import Receptions, Transmission, rows
 from emulator.radio.outcomes import PENDING, Outcome
-from emulator.radio.signals import latency_draws
-from emulator.scenario.lookahead import MIN_LATENCY_NS
+from emulator.radio.reception import latency_draws
 from emulator.scenario.random_streams import Draws
-from emulator.scenario.scenario import Radio
+from emulator.scenario.scenario import MIN_LATENCY_NS, Radio
 from vnet.types import Array
 from vnet.units import NS_PER_MS
 
 
-def frame_draws(draws: Draws, frames: Sequence[Frame], receptions: Receptions) -> Array:
+def frame_draws(draws: Draws, transmissions: Sequence[Transmission], receptions: Receptions) -> Array:
     """Return the draws of the pending receptions, and 1 for the others (K, M)."""
     drawn = np.ones(receptions.outcome.shape)
     if receptions.receiver is None:
         count = receptions.outcome.shape[1]
-        for index, frame in enumerate(frames):
-            drawn[index] = draws.uniform(frame.sender, frame.seq, count, frame.draw)
+        for index, sent in enumerate(transmissions):
+            drawn[index] = draws.uniform(sent.frame.sender, sent.frame.seq, count, sent.frame.draw)
         return drawn
     pending = receptions.outcome == PENDING
-    keys = np.array([(frame.sender, frame.seq, frame.draw) for frame in frames], np.uint64)
+    keys = np.array([(s.frame.sender, s.frame.seq, s.frame.draw) for s in transmissions], np.uint64)
     drawn[pending] = draws.uniform_at(keys, pending.sum(axis=1), receptions.receiver[pending])
     return drawn
 
 
-def in_range(frames: Sequence[Frame], receptions: Receptions) -> None:
+def in_range(transmissions: Sequence[Transmission], receptions: Receptions) -> None:
     """Decide `out_of_range` for receivers that a frame cannot reach."""
-    receptions.decide(~rows(frames, "in_range"), Outcome.out_of_range)
+    receptions.decide(~rows(transmissions, "in_range"), Outcome.out_of_range)
 
 
-def sender_side(frames: Sequence[Frame], receptions: Receptions) -> None:
+def sender_side(transmissions: Sequence[Transmission], receptions: Receptions) -> None:
     """Give the receptions of a frame that its sender did not send the sender's outcome."""
-    for index, frame in enumerate(frames):
-        if frame.sender_outcome:
+    for index, sent in enumerate(transmissions):
+        if sent.sender_outcome:
             row = receptions.outcome[index]
-            row[row == PENDING] = frame.sender_outcome
+            row[row == PENDING] = sent.sender_outcome
 
 
-def peer_cap(frames: Sequence[Frame], receptions: Receptions) -> None:
+def peer_cap(transmissions: Sequence[Transmission], receptions: Receptions) -> None:
     """Decide `peer_cap` for senders beyond a receiver's nearest `radio.max_peers` live ones in range."""
-    receptions.decide(~rows(frames, "admitted"), Outcome.peer_cap)
+    receptions.decide(~rows(transmissions, "admitted"), Outcome.peer_cap)
 
 
-def lose_by_faults(frames: Sequence[Frame], receptions: Receptions) -> None:
+def lose_by_faults(transmissions: Sequence[Transmission], receptions: Receptions) -> None:
     """Decide `fault` where a fault cuts the link or loses the frame."""
-    for index, frame in enumerate(frames):
-        if frame.effects.lose:
-            for number, lost in frame.effects.losses(frame):
+    for index, sent in enumerate(transmissions):
+        if sent.frame.effects.lose:
+            for number, lost in sent.frame.effects.losses(sent):
                 receptions.fault(index, lost, number)
 
 
-def change_by_faults(frames: Sequence[Frame], receptions: Receptions) -> None:
+def change_by_faults(transmissions: Sequence[Transmission], receptions: Receptions) -> None:
     """Apply, after the latency, the faults that do not lose receptions: delays, duplicates, altered bytes."""
-    for index, frame in enumerate(frames):
-        if frame.effects.change:
-            frame.effects.changes(frame, index, receptions)
+    for index, sent in enumerate(transmissions):
+        if sent.frame.effects.change:
+            sent.frame.effects.changes(sent, index, receptions)
 
 
 class Loss:
@@ -76,11 +75,11 @@ class Loss:
         self._draws = Draws(seed, "loss")
         self._loss = loss
 
-    def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
+    def __call__(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
         """Decide `lost`."""
-        loss = self._loss if frames[0].topology.loss is None else rows(frames, "loss")
+        loss = self._loss if transmissions[0].frame.topology.loss is None else rows(transmissions, "loss")
         if loss > 0 if isinstance(loss, float) else (loss > 0).any():
-            receptions.decide(frame_draws(self._draws, frames, receptions) < loss, Outcome.lost)
+            receptions.decide(frame_draws(self._draws, transmissions, receptions) < loss, Outcome.lost)
 
 
 class Latency:
@@ -92,18 +91,20 @@ class Latency:
         self._jitter_ns = radio.jitter_ms * NS_PER_MS
         self._tick_ns = radio.delivery_tick_us * 1_000
 
-    def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
+    def __call__(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
         """Set the arrival time of each reception."""
-        draws = self._draws_of(frames, receptions)
+        draws = self._draws_of(transmissions, receptions)
         latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
         arrival_ns = receptions.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
         if self._tick_ns:
             arrival_ns = -(-arrival_ns // self._tick_ns) * self._tick_ns
         receptions.arrival_ns = arrival_ns
 
-    def _draws_of(self, frames: Sequence[Frame], receptions: Receptions) -> NDArray[np.float64]:
+    def _draws_of(self, transmissions: Sequence[Transmission], receptions: Receptions) -> NDArray[np.float64]:
         """Return the latency draws (K, M), from the frames' signals if they have any."""
-        if all(frame.signal is None for frame in frames):
-            return frame_draws(self._draws, frames, receptions)
+        if all(sent.signal is None for sent in transmissions):
+            return frame_draws(self._draws, transmissions, receptions)
         zeros = np.zeros(receptions.outcome.shape[1], np.uint64)
-        return latency_draws(np.array([zeros if f.signal is None else f.signal.random_draws for f in frames]))
+        return latency_draws(
+            np.array([zeros if s.signal is None else s.signal.random_draws for s in transmissions])
+        )

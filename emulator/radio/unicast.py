@@ -7,18 +7,16 @@ transmitted again after a backoff from a window that doubles, up to the short re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from heapq import heappop, heappush
-from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.dot11p import PREAMBLE_NS, SIFS_NS, SLOT_NS, airtime_ns
-from emulator.radio.frames import BROADCAST, NO_CAUSE, Frame, Receptions
-from emulator.radio.link_faults import ActiveLinkFaults
-from emulator.radio.medium import Medium
+from emulator.radio.faults import ActiveLinkFaults
+from emulator.radio.frames import BROADCAST, NO_CAUSE, Frame, Result, Transmission
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from vnet.types import IntArray, Mask
@@ -27,6 +25,7 @@ MOST_ATTEMPTS = 7
 """Transmissions of a frame without an acknowledgement: dot11ShortRetryLimit (802.11-2020, annex C)."""
 ACK_BYTES = 14
 """Length of an acknowledgement."""
+_ACKNOWLEDGEMENT = bytes(ACK_BYTES)
 BASIC_RATES_MBPS = (3.0, 6.0, 12.0)
 """Mandatory bit rates in 10 MHz; an acknowledgement has the highest that is not above that of its frame."""
 ACK_TIMEOUT_NS = SIFS_NS + SLOT_NS + PREAMBLE_NS
@@ -43,16 +42,6 @@ _ACK_DRAW, _ATTEMPT_BITS, _SENDER_BITS = 1 << 62, 48, 40
 """Places of what distinguishes the random draws of attempts and acknowledgements."""
 
 
-class Result(NamedTuple):
-    """Result of frame `number` of the node number `sender`, which learns it at `time_ns`."""
-
-    time_ns: int
-    sender: int
-    number: int
-    delivered: bool
-    attempts: int
-
-
 def ack_rate_mbps(bitrate_mbps: float) -> float:
     """Return the bit rate of the acknowledgement of a frame."""
     return max(rate for rate in BASIC_RATES_MBPS if rate <= bitrate_mbps)
@@ -63,44 +52,34 @@ def ack_airtime_ns(bitrate_mbps: float) -> int:
     return airtime_ns(ACK_BYTES, ack_rate_mbps(bitrate_mbps))
 
 
-def acknowledgement_of(frame: Frame) -> Frame:
-    """Return the acknowledgement of a frame, as its addressee sends it, at the scenario's power.
+def acknowledgement_of(sent: Transmission) -> Transmission:
+    """Return the acknowledgement of a transmission, as its addressee sends it, at the scenario's power.
 
     It has the topology and the faults of its frame, but for rules of the user's own, which see programs' frames.
     """
-    effects = frame.effects
+    frame, effects = sent.frame, sent.frame.effects
     if isinstance(effects, ActiveLinkFaults):
         effects = replace(effects, ruled=())
-    return Frame(
-        sender=frame.to,
-        seq=(frame.sender + 1 << _SENDER_BITS) + frame.seq,
-        sent_ns=frame.end_ns,
-        size_bytes=ACK_BYTES,
-        topology=frame.topology,
-        effects=effects,
-        bitrate_mbps=ack_rate_mbps(frame.bitrate_mbps),
-        draw=frame.draw + _ACK_DRAW,
+    return Transmission(
+        Frame(
+            sender=frame.to,
+            seq=(frame.sender + 1 << _SENDER_BITS) + frame.seq,
+            sent_ns=sent.end_ns,
+            payload=_ACKNOWLEDGEMENT,
+            topology=frame.topology,
+            effects=effects,
+            bitrate_mbps=ack_rate_mbps(frame.bitrate_mbps),
+            draw=frame.draw + _ACK_DRAW,
+        )
     )
 
 
-def retry_of(frame: Frame, copy: int) -> Frame:
+def retry_of(sent: Transmission, copy: int) -> Transmission:
     """Return the next attempt of a frame, which is copy number `copy` of it."""
-    assert frame.decoded is not None
-    return replace(
-        frame,
-        copy=copy,
-        draw=frame.draw + (1 << _ATTEMPT_BITS),
-        attempt=frame.attempt + 1,
-        row=-1,
-        received_as=frame.received_as or (frame if frame.decoded[frame.to] else None),
-        is_missed=False,
-        decoded=None,
-        garbled=None,
-        signal=None,
-        ack=None,
-        altered={},
-        answers={},
-    )
+    assert sent.decoded is not None
+    frame = replace(sent.frame, copy=copy, draw=sent.frame.draw + (1 << _ATTEMPT_BITS))
+    received_as = sent.received_as or (sent if sent.decoded[frame.to] else None)
+    return Transmission(frame, sent.attempt + 1, received_as=received_as)
 
 
 class Deferral:
@@ -110,15 +89,15 @@ class Deferral:
         self._nav_ns: IntArray = np.zeros(count, np.int64)
         self._eifs_ns: IntArray = np.zeros(count, np.int64)
 
-    def hear(self, frame: Frame, now_ns: int) -> None:
-        """Take note of a frame that ends: who could read it, and who could not."""
-        assert frame.decoded is not None and frame.garbled is not None
-        self._eifs_ns[frame.decoded] = now_ns
-        self._eifs_ns[frame.garbled] = now_ns + EIFS_NS
-        if frame.to != BROADCAST:
-            others = frame.decoded.copy()
-            others[frame.to] = False
-            until_ns = now_ns + SIFS_NS + ack_airtime_ns(frame.bitrate_mbps)
+    def hear(self, sent: Transmission, now_ns: int) -> None:
+        """Take note of a transmission that ends: who could read it, and who could not."""
+        assert sent.decoded is not None and sent.garbled is not None
+        self._eifs_ns[sent.decoded] = now_ns
+        self._eifs_ns[sent.garbled] = now_ns + EIFS_NS
+        if sent.attempt:
+            others = sent.decoded.copy()
+            others[sent.frame.to] = False
+            until_ns = now_ns + SIFS_NS + ack_airtime_ns(sent.frame.bitrate_mbps)
             self._nav_ns[others] = np.maximum(self._nav_ns[others], until_ns)
 
     def reserved_ns(self, node: int) -> int:
@@ -136,12 +115,13 @@ class Unicasts:
     A node learns a result `delay_ns` after its MAC knows it.
     """
 
-    def __init__(self, delay_ns: int) -> None:
+    def __init__(self, delay_ns: int, trace: Trace) -> None:
         self._delay_ns = delay_ns
+        self._trace = trace
         self._tickets = 0
         self._open: dict[int, tuple[int, int]] = {}
         self._results: list[Result] = []
-        self._duplicates: list[tuple[int, int, int, Frame]] = []
+        self._duplicates: list[tuple[int, int, int, Transmission]] = []
         """Heap of attempts received once more: arrival time, row, addressee, and the attempt received first."""
         self.counts = {"sent": 0, "delivered": 0, "attempts": 0}
         """Frames to single vehicles whose results are known, those acknowledged, and transmissions."""
@@ -161,13 +141,13 @@ class Unicasts:
         """Note that a frame is addressed to nobody."""
         self._conclude(self.register(sender, number), False, 0, time_ns)
 
-    def leave(self, frame: Frame) -> None:
-        """Note that a frame has left its queue at `frame.end_ns` without being transmitted."""
-        self._conclude(frame.ticket, False, 0, frame.end_ns)
+    def leave(self, sent: Transmission) -> None:
+        """Note that a frame has left its queue at `end_ns` without being transmitted."""
+        self._conclude(sent.frame.ticket, False, 0, sent.end_ns)
 
-    def finish(self, frame: Frame, time_ns: int) -> None:
+    def finish(self, sent: Transmission, time_ns: int) -> None:
         """Note that the last attempt of a frame is over."""
-        self._conclude(frame.ticket, frame.acked, frame.attempt, time_ns)
+        self._conclude(sent.frame.ticket, sent.acked, sent.attempt, time_ns)
 
     def _conclude(self, ticket: int, delivered: bool, attempts: int, time_ns: int) -> None:
         if asked := self._open.pop(ticket, None):
@@ -178,25 +158,24 @@ class Unicasts:
 
     def note_duplicates(
         self,
-        frames: Sequence[Frame],
+        transmissions: Sequence[Transmission],
         first_row: int,
         outcome: NDArray[np.uint8],
         arrival_ns: IntArray,
-        trace: Trace,
     ) -> None:
         """Note the attempts received once more; outcome and arrival (n,) are those of rows from the first on.
 
         One that would arrive before the attempt received first stays a duplicate: that may still find somebody.
         """
-        for frame in frames:
-            index = frame.row - first_row
-            first = frame.received_as
+        for sent in transmissions:
+            index = sent.row - first_row
+            first = sent.received_as
             if first is None or outcome[index] != Outcome.duplicate:
                 continue
-            if arrival_ns[index] >= trace.rows(np.array([first.row]))["arrival_ns"][0]:
-                heappush(self._duplicates, (int(arrival_ns[index]), frame.row, frame.to, first))
+            if arrival_ns[index] >= self._trace.rows(np.array([first.row]))["arrival_ns"][0]:
+                heappush(self._duplicates, (int(arrival_ns[index]), sent.row, sent.frame.to, first))
 
-    def miss_duplicates(self, time_ns: int, up: Mask, trace: Trace, counts: dict[Outcome, int]) -> None:
+    def miss_duplicates(self, time_ns: int, up: Mask, counts: dict[Outcome, int]) -> None:
         """Change attempts that would arrive by `time_ns` to `receiver_down`, where nobody got the one before.
 
         The addressee is down (`up` (N,)), and was so when the attempt arrived that was received first.
@@ -204,7 +183,7 @@ class Unicasts:
         while self._duplicates and self._duplicates[0][0] <= time_ns:
             arrival_ns, row, to, first = heappop(self._duplicates)
             if first.is_missed and not up[to]:
-                trace.miss(row, arrival_ns)
+                self._trace.miss(row, arrival_ns)
                 counts[Outcome.duplicate] -= 1
                 counts[Outcome.receiver_down] += 1
 
@@ -226,48 +205,24 @@ class Unicasts:
 
 
 def address(
-    frame: Frame, outcome: NDArray[np.uint8], locked: Mask, cause: NDArray[np.int16], is_up: bool = True
+    sent: Transmission, outcome: NDArray[np.uint8], locked: Mask, cause: NDArray[np.int16], is_up: bool
 ) -> None:
     """Note who could read a frame, and who not; of a frame to one vehicle keep its reception alone.
 
     `outcome` and `cause` (N,) are those of all vehicles, as if it were a broadcast, and are changed; `locked` marks
-    the vehicles whose receivers were locked on the frame.
+    the vehicles whose receivers were locked on the frame. `is_up` is true if its addressee is up.
     """
-    frame.decoded = outcome == Outcome.pending.value
+    to = sent.frame.to
+    sent.decoded = outcome == Outcome.pending.value
     in_error = np.zeros(len(outcome), bool)
     for each in IN_ERROR:
         in_error |= outcome == each
-    frame.garbled = locked & in_error
-    if frame.to == BROADCAST:
+    sent.garbled = locked & in_error
+    if to == BROADCAST:
         return
-    others = np.arange(len(outcome)) != frame.to
+    others = np.arange(len(outcome)) != to
     outcome[others], cause[others] = Outcome.out_of_range.value, NO_CAUSE
-    if frame.decoded[frame.to] and not is_up:  # whoever is down acknowledges nothing, and knows nothing again
-        frame.decoded[frame.to], outcome[frame.to] = False, Outcome.receiver_down.value
-    elif frame.decoded[frame.to] and frame.received_as is not None and not frame.received_as.is_missed:
-        outcome[frame.to] = Outcome.duplicate.value
-
-
-class SharedMedium(Protocol):
-    """Part of the MAC that decides what becomes of frames to single vehicles."""
-
-    has_eifs: bool
-    is_up: Callable[[int], bool]
-    medium: Medium
-    unicasts: Unicasts
-
-
-def address_all(frames: Sequence[Frame], receptions: Receptions, mac: SharedMedium) -> None:
-    """Note who could read frames where others act on it, and what becomes of those to single vehicles."""
-    for index, frame in enumerate(frames):
-        if frame.ticket and (not frame.attempt or frame.sender_outcome != Outcome.pending):
-            mac.unicasts.leave(frame)  # it is over, or an older one was broadcast in its place
-        if not (frame.attempt or mac.has_eifs):
-            continue
-        outcome, cause = receptions.outcome[index], receptions.cause[index]
-        if frame.sender_outcome == Outcome.pending:
-            is_up = frame.to == BROADCAST or mac.is_up(frame.to)
-            address(frame, outcome, mac.medium.locked(frame), cause, is_up)
-        elif frame.attempt:
-            outcome[:] = Outcome.out_of_range.value
-            outcome[frame.to] = frame.sender_outcome.value  # also if its addressee is out of range: it was not sent
+    if sent.decoded[to] and not is_up:  # whoever is down acknowledges nothing, and knows nothing again
+        sent.decoded[to], outcome[to] = False, Outcome.receiver_down.value
+    elif sent.decoded[to] and sent.received_as is not None and not sent.received_as.is_missed:
+        outcome[to] = Outcome.duplicate.value

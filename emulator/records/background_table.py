@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.records.tables import BACKGROUND
-from emulator.world.driven.background import Background
+from emulator.world.driven.stepped import Background
 from vnet.types import Array
 
 

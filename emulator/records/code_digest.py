@@ -45,7 +45,7 @@ def rule_digests(scenario: Scenario) -> dict[str, str]:
 
 def rules_of(scenario: Scenario) -> tuple[str, ...]:
     """Return the entries of a scenario's rules, sensors and network of the user's own, sorted."""
-    from emulator.scenario.fault_families import OwnRule  # whoever has a scenario has imported it
+    from emulator.scenario.faults import OwnRule
 
     entries = {fault.rule for fault in scenario.fault if isinstance(fault, OwnRule)}
     network = scenario.network.function

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.connectivity import Connectivity, distances_m
+from emulator.radio.topology import Connectivity, distances_m
 from emulator.world.neighbours import Links
 from vnet.errors import VnetError
 from vnet.types import Array, IntArray, Mask

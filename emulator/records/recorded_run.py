@@ -20,11 +20,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
-from emulator.faults.selectors import Nodes
-from emulator.radio.connectivity import connectivity_of
+from emulator.faults.plan import FaultPlan, Nodes, PlannedFault, swizzle_times_ns
 from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Stage, decided_at
+from emulator.radio.topology import connectivity_of
 from emulator.radio.trace import ACKNOWLEDGED, LATE
 from emulator.records.busy import busy_windows
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events
@@ -48,15 +47,11 @@ from emulator.records.run_tables import VALUES_AS_LIST, StatesReader, TableFile,
 from emulator.records.tables import BUSY, METRICS, PAYLOADS, STATES, TRACE, Condition, Table, always
 from emulator.records.verdict_file import Record, read_record
 from emulator.records.verdicts import MOST_ROWS
-from emulator.scenario.fault_families import ProcessFault, SenderFault
-from emulator.scenario.faults import Range, Swizzle
-from emulator.scenario.recorded import parse_recorded_scenario
-from emulator.scenario.scenario import Scenario, load_scenario
-from emulator.scenario.toml import LARGEST_BYTES
-from emulator.world.link_table import LinkTable
-from emulator.world.links import load_links
+from emulator.scenario.faults import ProcessFault, Range, SenderFault, Swizzle
+from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import Links
-from emulator.world.radio_inputs import RadioInputs
+from emulator.world.radio_inputs import LinkTable, RadioInputs, load_links
 from emulator.world.world import build_world
 from vnet.bounded import read_regular
 from vnet.errors import ScenarioError, VnetError, printable

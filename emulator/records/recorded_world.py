@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.world.arrays import read_arrays
 from emulator.world.buildings import LEAST_CORNERS, Buildings
-from emulator.world.link_table import LinkTable
-from emulator.world.radio_inputs import RadioInputs
+from emulator.world.input_files import read_arrays
+from emulator.world.radio_inputs import LinkTable, RadioInputs
 from emulator.world.world import World
 from vnet.bounded import open_regular
 from vnet.errors import ScenarioError, VnetError

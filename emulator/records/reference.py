@@ -14,9 +14,9 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.connectivity import component_links
+from emulator.radio.topology import component_links
 from emulator.records.recorded_run import RecordedRun
-from emulator.scenario.declared import declared, load_entry
+from emulator.scenario.own_functions import declared, load_entry
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import components
 from vnet.errors import VnetError

@@ -20,9 +20,9 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import BACKBONE, BACKGROUND, DRIVEN
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
-from emulator.scenario.fault_families import GnssFault
+from emulator.scenario.faults import GnssFault
 from emulator.scenario.scenario import Scenario
-from emulator.world.graph import components_of_links
+from emulator.world.neighbours import components_of_links
 from vnet.errors import VnetError, did_you_mean, first_names, shown
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S

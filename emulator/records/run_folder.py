@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 from emulator.records.atomic import atomically, disk_errors
 from emulator.records.code_digest import code_digests, rule_digests
 from emulator.records.events import Event, EventKind
-from emulator.scenario.scenario import Scenario, dump_scenario, input_digests
+from emulator.scenario.loading import dump_scenario, input_digests
+from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from emulator.records.run_folder import check_is_run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Finding, Verdict
 from emulator.report.source import Source
-from emulator.scenario.toml import parse_toml
+from emulator.scenario.loading import parse_toml
 
 A, B = "A", "B"
 NOT_APPLICABLE = "not applicable"

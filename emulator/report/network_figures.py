@@ -13,8 +13,8 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 
 from emulator.pages.canvas import BLUE, INK, RED, Canvas, canvas, legend, whole_numbers
-from emulator.radio.connectivity import component_links
 from emulator.radio.outcomes import DRAWN, Outcome
+from emulator.radio.topology import component_links
 from emulator.records.beliefs import WEIGHT
 from emulator.records.distributions import binomial_interval
 from emulator.records.radio_metrics import BIN_M

@@ -1,16 +1,17 @@
-"""The section `[program]`: the programs of the vehicles, their options, and the checks of the user's own."""
+"""`[program]`, `[[roadside]]` and `[backbone]`: programs, nodes beside the road, and the wire among them."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from emulator.scenario.sections import Section
-from vnet.errors import shown
+from emulator.scenario.sections import DAY_S, FAR_M, Section
+from vnet.errors import ScenarioError, shown
 
 _MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
@@ -86,3 +87,72 @@ class Program(OneProgram):
     def of(self, node: str) -> OneProgram:
         """Return the program of `node`."""
         return next((exception for exception in self.exceptions if node in exception.nodes), self)
+
+
+Coordinate = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
+NodeId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+
+
+class RoadsideUnit(Section):
+    """`[[roadside]]`: a node that stands, at a position that its program knows."""
+
+    position_m: tuple[Coordinate, Coordinate]
+    """Its position, east and north, in the metres of the network."""
+    id: NodeId | None = None
+    """Its name; `rsu01`, `rsu02`, … by its place in the file if left out."""
+    height_m: float = Field(6.0, ge=0, le=1000)
+    """Height of its antenna above the ground. It counts in path losses; that of vehicles is 1.5 m, or what the
+    two-ray model says."""
+    tx_power_dbm: float | None = Field(None, ge=-100, le=100)
+    """Its transmit power, antenna gain included; that of vehicles if left out."""
+    entry: Entry | None = Field(None, exclude=True)
+    """Its program, `package.module:function` or `file.py:function`; that of vehicles if left out."""
+    options: dict[str, Any] | None = Field(None, exclude=True)
+    """Options of a program of its own."""
+
+    @property
+    def name(self) -> str:
+        """Its id."""
+        assert self.id is not None  # a scenario has seen to it
+        return self.id
+
+    @model_validator(mode="after")
+    def _options_are_of_its_own_program(self) -> RoadsideUnit:
+        if self.options is not None and self.entry is None:
+            raise ValueError("options go with an entry: without one the unit runs the program of the vehicles")
+        return self
+
+
+class Backbone(Section):
+    """`[backbone]`: the wired network among roadside units. It keeps the order of messages between two units."""
+
+    latency_ms: float = Field(5.0, ge=0.001, le=1000 * DAY_S)
+    """Least time from sending to arrival."""
+    jitter_ms: float = Field(0.0, ge=0, le=1000 * DAY_S)
+    """Jitter of the latency: uniform from 0, drawn for each message and receiver."""
+    loss: float = Field(0.0, ge=0, le=1)
+    """Probability that a message is lost, independently at each receiver."""
+    max_message_bytes: int = Field(65_000, ge=1, le=1_000_000)
+    """A longer message is refused."""
+
+
+def with_names(units: Sequence[RoadsideUnit]) -> tuple[RoadsideUnit, ...]:
+    """Return units of which each has a name. Raise ValueError for a name that two have."""
+    named = [unit.model_copy(update={"id": unit.id or f"rsu{n:02d}"}) for n, unit in enumerate(units, start=1)]
+    for number, unit in enumerate(named):
+        if unit.id in [other.id for other in named[:number]]:
+            raise ValueError(f"another unit is named {unit.id}")
+    return tuple(named)
+
+
+def with_programs(program: Program, units: Sequence[RoadsideUnit]) -> Program:
+    """Return `[program]` with the programs of units as exceptions. Raise ScenarioError for a unit with two."""
+    excepted = {node for exception in program.exceptions for node in exception.nodes}
+    own = [unit for unit in units if unit.entry is not None]
+    for unit in own:
+        if unit.name in excepted:
+            raise ScenarioError(f"roadside: {unit.name} has an entry, and is in program.exceptions: leave one out")
+    added = [
+        ProgramException(nodes=(unit.name,), entry=unit.entry or "", options=unit.options or {}) for unit in own
+    ]
+    return program.model_copy(update={"exceptions": (*program.exceptions, *added)})

@@ -5,33 +5,19 @@ One frozen model a section. What is wrong becomes a `ScenarioError` of one line:
 
 from __future__ import annotations
 
-import hashlib
-import os
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import tomli_w
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from emulator.scenario.driven import Driven
 from emulator.scenario.faults import AnyFault
-from emulator.scenario.limits import DAY_S, FAR_M
-from emulator.scenario.modules import with_network, with_rules, with_sensors
-from emulator.scenario.network import Map, Network
-from emulator.scenario.overrides import apply_override, wrong_value
-from emulator.scenario.program import Program
+from emulator.scenario.network import Driven, Map, Network
+from emulator.scenario.program import Backbone, Program, RoadsideUnit, with_names
 from emulator.scenario.radio import RATES_MBPS, Buildings, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
-from emulator.scenario.renamed import with_new_names
-from emulator.scenario.roadside import Backbone, RoadsideUnit, with_names, with_programs
-from emulator.scenario.sections import Section, first_problem
-from emulator.scenario.shipped import find_scenario, shipped_names
-from emulator.scenario.sumo import input_files
-from emulator.scenario.sumo_loop import LIBSUMO, libsumo_build
-from emulator.scenario.toml import check_plain, read_toml
+from emulator.scenario.sections import DAY_S, FAR_M, Section
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
-from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
-from vnet.units import NS_PER_S
+from vnet.errors import shown
+from vnet.units import NS_PER_MS, NS_PER_S
 
 MANY = 1_000_000_000
 
@@ -271,171 +257,19 @@ class Scenario(Section):
         return round(NS_PER_S / self.world.gnss.rate_hz)
 
 
-def load_scenario(path: Path, overrides: Sequence[str] = (), checks: Sequence[str] = ()) -> Scenario:
-    """Read a scenario, from its path or by its name if it is shipped, and apply `section.key=value` overrides.
-
-    Values are in TOML syntax; bare words are strings. Relative paths of files are taken from the scenario's own
-    folder; programs and checks are looked for there, and then in the current folder. `checks` come after those of
-    the file. Raises `ScenarioError`.
-    """
-    path = find_scenario(path)
-    try:
-        data = read_toml(path)
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
-    except ValueError as error:
-        raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
-    if "inputs" in data:  # a run has recorded it
-        data = with_new_names(data)
-    recorded_digests, _ = data.pop("inputs", {}), data.pop("code", None)
-    if not isinstance(recorded_digests, dict):
-        raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
-    return scenario_from(data, path, overrides, recorded_digests, checks)
+MIN_LATENCY_NS = 1_000
+"""Least latency of a reception: time passes in every exchange between nodes."""
 
 
-def scenario_from(
-    data: dict[str, Any],
-    path: Path,
-    overrides: Sequence[str] = (),
-    digests: Mapping[str, str] | None = None,
-    checks: Sequence[str] = (),
-) -> Scenario:
-    """Return the scenario of plain data, which it changes by the overrides; `path` is what messages call it.
-
-    `checks` come after those of the data. Raises ScenarioError, also for an input file that has not the digest
-    recorded for it.
-    """
-    for override in overrides:
-        apply_override(data, override)
-    try:
-        check_plain(data)
-        scenario = Scenario.model_validate(data)
-    except ValidationError as error:
-        raise wrong_value(path, first_problem(error, Scenario), overrides) from None
-    except ValueError as error:
-        raise wrong_value(path, str(error), overrides) from None
-    scenario = _with_absolute_paths(scenario, path)
-    try:
-        scenario = with_own_modules(scenario, path.parent, checks, str(path))
-    except ScenarioError as error:
-        raise wrong_value(path, str(error).removeprefix(f"{path}: "), overrides) from None
-    recorded = digests or {}
-    for name, digest in input_digests(scenario).items():
-        if recorded.get(name, digest) != digest:
-            if name == LIBSUMO:
-                raise ScenarioError(f"{path}: recorded with libsumo {shown(recorded[name])}; here is {digest!r}")
-            raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
-    return scenario
+def least_latency_ns(radio: Radio) -> int:
+    """Return the shortest time from the end of a frame to its arrival: faults and jitter only add to it."""
+    return max(int(radio.latency_ms * NS_PER_MS), MIN_LATENCY_NS)
 
 
-def with_own_modules(
-    scenario: Scenario, base: Path | None, checks: Sequence[str] = (), source: str = ""
-) -> Scenario:
-    """Return a scenario whose files of the user's own are modules; programs of roadside units are exceptions.
-
-    The arguments and exceptions are those of `with_modules`.
-    """
-    program = with_programs(scenario.program, scenario.roadside)
-    program, faults = with_rules(program, scenario.fault, base, checks, source)
-    network, world = scenario.network, scenario.world
-    if network.function is not None:
-        program, function = with_network(program, network.function, base, source)
-        network = network.model_copy(update={"function": function})
-    if world.sensor:
-        program, world = with_sensors(program, world, base, source)
-    parts = {"program": program, "fault": faults, "network": network, "world": world}
-    return scenario.model_copy(update=parts)
-
-
-def _instead(path: Path) -> str:
-    """Return a hint at the file that may have been meant by a path."""
-    try:
-        inside = sorted(each.name for each in path.glob("*.toml"))
-        if inside:
-            return f"; in it there are {first_names(inside)}"
-        return did_you_mean(path.name, [*(each.name for each in path.parent.glob("*.toml")), *shipped_names()])
-    except (OSError, ValueError):
-        return ""
-
-
-def dump_scenario(scenario: Scenario, digests: Mapping[str, Mapping[str, str]] | None = None) -> str:
-    """The scenario as TOML with every default, and `digests`, by section; without any, those of its inputs."""
-    data = scenario.model_dump(mode="json", exclude_none=True)
-    data |= {"inputs": input_digests(scenario)} if digests is None else digests
-    return tomli_w.dumps(data)
-
-
-def input_files_of(scenario: Scenario) -> list[Path]:
-    """Return the files that the scenario names for its world and its radio."""
-    read = (
-        scenario.network.path,
-        scenario.radio.links,
-        scenario.radio.buildings and scenario.radio.buildings.path,
-        scenario.map and scenario.map.path,
-        scenario.world.common_error.path,
-    )
-    return [path for path in read if isinstance(path, Path)]
-
-
-def input_digests(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names.
-
-    Where SUMO is stepped with the run, `libsumo` is its version and build.
-    """
-    paths = input_files_of(scenario)
-    if isinstance(scenario.run.tape, Path):
-        paths.append(scenario.run.tape)
-    if scenario.network.kind == "sumo" and scenario.network.path is not None:
-        paths += input_files(scenario.network.path)
-    build = libsumo_build() if scenario.network.step else None
-    return {str(path): _sha256(path) for path in paths} | ({} if build is None else {LIBSUMO: build})
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
-    network, radio = scenario.network, scenario.radio
-    if network.path is not None:
-        path = _absolute(network.path, "network.path", scenario_path)
-        network = network.model_copy(update={"path": path})
-    if isinstance(radio.links, Path):
-        path = _absolute(radio.links, "radio.links", scenario_path)
-        radio = radio.model_copy(update={"links": path})
-    if radio.buildings is not None and radio.buildings.path is not None:
-        path = _absolute(radio.buildings.path, "radio.buildings.path", scenario_path)
-        radio = radio.model_copy(update={"buildings": radio.buildings.model_copy(update={"path": path})})
-    roads = scenario.map
-    if roads is not None:
-        roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})
-    run = scenario.run
-    if isinstance(run.tape, Path):
-        run = run.model_copy(update={"tape": _absolute(run.tape, "run.tape", scenario_path)})
-    world = _world_of(scenario, scenario_path)
-    return scenario.model_copy(
-        update={"run": run, "network": network, "radio": radio, "map": roads, "world": world}
-    )
-
-
-def _world_of(scenario: Scenario, scenario_path: Path) -> WorldSection:
-    common = scenario.world.common_error
-    if common.path is None:
-        return scenario.world
-    path = _absolute(common.path, "world.common_error.path", scenario_path)
-    return scenario.world.model_copy(update={"common_error": common.model_copy(update={"path": path})})
-
-
-def _absolute(given: Path, key: str, scenario_path: Path) -> Path:
-    problem = f"{scenario_path}: {key} = {shown(str(given))}"
-    try:
-        path = (scenario_path.parent / given).resolve()
-        found = path.is_file()
-    except (OSError, ValueError, RuntimeError):  # a name too long, with a NUL, or links that lead in a circle
-        raise ScenarioError(f"{problem}: cannot be the name of a file") from None
-    if not found:
-        raise ScenarioError(f"{problem}: no such file: {path}")
-    if not os.access(path, os.R_OK):
-        raise ScenarioError(f"{problem}: not readable: {path}")
-    return path
+def lookahead_ns(scenario: Scenario) -> int:
+    """Return the shortest time from sending to arrival: of frames, and of messages among roadside units."""
+    radio_ns = least_latency_ns(scenario.radio)
+    if len(scenario.roadside) < 2:
+        return radio_ns
+    backbone = scenario.backbone or Backbone()
+    return min(radio_ns, max(int(backbone.latency_ms * NS_PER_MS), MIN_LATENCY_NS))

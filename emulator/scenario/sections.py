@@ -1,4 +1,4 @@
-"""The base of all parts of a scenario, and the wording of what is wrong with one."""
+"""The base of all parts of a scenario, the bounds of their numbers, and the wording of what is wrong with one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,15 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from vnet.errors import did_you_mean, printable, shown
+
+DAY_S = 86_400
+"""No time in a scenario is longer, so that nanoseconds stay far within 64 bits."""
+FAR_M = 1e9
+"""No length in a scenario is larger, so that squares stay finite and millimetres mean something."""
+WILD_M = 1e5
+"""No standard deviation is larger, so that fixes stay near enough for frames to say."""
+FAR_S = 1e11
+"""Times of files, which may be seconds since 1970, are within ± three thousand years."""
 
 WORDS = {
     **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "a table is needed"),

@@ -7,10 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from emulator.scenario.driven import Driven, Ranging, control_step_ns
-from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
+from emulator.scenario.network import Driven, Ranging, control_step_ns
 from emulator.scenario.program import Entry
-from emulator.scenario.sections import Section
+from emulator.scenario.sections import DAY_S, FAR_M, FAR_S, WILD_M, Section
 from vnet.units import NS_PER_MS, NS_PER_S
 
 

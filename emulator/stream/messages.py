@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.radio.connectivity import component_links
 from emulator.radio.outcomes import Outcome
+from emulator.radio.topology import component_links
 from emulator.radio.trace import decided_ns
 from emulator.records.beliefs import WEIGHT, Beliefs, collect, is_cloud
 from emulator.records.events import Event

@@ -1,17 +1,25 @@
-"""A campaign: many runs of one scenario under random faults; failures are shrunk and kept.
+"""A campaign: many runs of one scenario under random faults; failures are shrunk, explained and kept.
 
 Run number i has the seed of the campaign plus i. The seed draws the network (if it is generated), the run and the
 schedule, so that it alone reproduces a failure. No failure stops a campaign; Ctrl-C keeps all finished runs.
+
+A failure that was seen before may be believed fixed after n green runs. If a run fails with probability p, n runs
+pass by chance with (1 - p)^n. That is at most alpha from n = ln(alpha) / ln(1 - p) on. The earlier campaign gives p
+by its lower confidence bound (Clopper and Pearson 1934, one-sided): the rate itself would promise too much
+after few failures.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import re
 import shlex
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -25,24 +33,238 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.checks.own import is_broken
+from emulator.pages.page import put_page, render, table
 from emulator.records.atomic import write_atomically
 from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
 from emulator.records.verdicts import Verdict
 from emulator.report.index import write_index
-from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.report.source import Source, maybe
+from emulator.report.timeline import timeline
+from emulator.scenario.loading import dump_scenario, load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import Plan
-from emulator.testing.credibility import after_a_fix, compared_with_before
 from emulator.testing.explanation import PARTING_FILE, Explanation, explain
-from emulator.testing.failure_kinds import FailureKind, failure_kinds
-from emulator.testing.failure_page import shown_parting, write_failure_page
-from emulator.testing.matrix import column_of, count_verdicts, page
-from emulator.testing.regression_test import TEST_FILE, regression_test
-from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
-from emulator.testing.shrinking_runs import MOST_ORDER_STEPS, order_text, shrink_order, shrink_run, with_faults
-from emulator.testing.trial import REPLAY, Trial, TrialPool
+from emulator.testing.shrinking import (
+    MOST_ORDER_STEPS,
+    MOST_STEPS,
+    Schedule,
+    order_text,
+    shrink,
+    shrink_order,
+    shrink_run,
+    with_faults,
+)
+from emulator.testing.trial import EMULATOR, HUNG, REPLAY, Trial, TrialPool
 from vnet.counted import counted
 from vnet.errors import VnetError
+
+WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
+NO_FAULTS = "no faults"
+"""Row of the runs without any fault."""
+Matrix = Mapping[str, Mapping[str, Counter[Verdict]]]
+
+
+def column_of(check: str) -> tuple[str, str | None]:
+    """Return the column of a check; and for the check of a single fault the kind in whose row alone it stands."""
+    match = re.fullmatch(r"(\w+):(\w+)-\d+", check)
+    return (f"{match[1]} (its own)", match[2]) if match else (check, None)
+
+
+def count_verdicts(runs: Iterable[tuple[Sequence[str], Mapping[str, Verdict]]]) -> Matrix:
+    """Count the verdicts by kind of fault and check, of runs with the kinds of their faults and their verdicts."""
+    matrix: dict[str, dict[str, Counter[Verdict]]] = {}
+    for kinds, verdicts in runs:
+        for kind in sorted(set(kinds)) or [NO_FAULTS]:
+            row = matrix.setdefault(kind, {})
+            for check, verdict in verdicts.items():
+                column, only = column_of(check)
+                if only in (None, kind):
+                    row.setdefault(column, Counter())[verdict] += 1
+    return dict(sorted(matrix.items()))
+
+
+def page(
+    title: str,
+    facts: Sequence[str],
+    matrix: Matrix,
+    failures: Sequence[Mapping[str, Any]],
+    failure_kinds: Sequence[object] = (),
+) -> str:
+    """Return the whole page.
+
+    A failure has `number`, `seed`, `checks` (texts by name), `schedule` (TOML), `order` (a phrase), `command`,
+    `folder` and `parting` (where it parts from a run that passes, or None); a kind of failures `check`, `text`,
+    `first` (a number) and `runs`.
+    """
+    columns = list(dict.fromkeys(column for row in matrix.values() for column in row))
+    kinds = {kind: [_cell(row.get(column, Counter())) for column in columns] for kind, row in matrix.items()}
+    return render(
+        "campaign.html.j2",
+        title=title,
+        facts=facts,
+        columns=columns,
+        kinds=kinds,
+        failures=failures,
+        failure_kinds=failure_kinds,
+    )
+
+
+def _cell(counts: Counter[Verdict]) -> tuple[Counter[Verdict], Verdict | None]:
+    """A cell of the matrix: how often each verdict was given, and the worst of them."""
+    return counts, next((verdict for verdict in WORST_FIRST if counts[verdict]), None)
+
+
+_NUMBERS = re.compile(r"(\.py:\d+)|\b0x[0-9a-f]+\b|\d+(?:[.,]\d+)*|'[^']*'")
+"""Parts of a text that differ from run to run: numbers, names of vehicles, and what is quoted; lines do not."""
+
+
+@dataclass(frozen=True)
+class FailureKind:
+    """Runs in which a check failed in one way: their count, and number and text of the first."""
+
+    check: str
+    text: str
+    first: str
+    runs: int = 1
+
+
+def failure_kinds(failures: Iterable[tuple[str, Mapping[str, str]]]) -> list[FailureKind]:
+    """Return the kinds of failures, given by number with their texts by check; the most frequent come first."""
+    kinds: dict[tuple[str, str], FailureKind] = {}
+    for number, texts in failures:
+        of_this_run: dict[tuple[str, str], FailureKind] = {}
+        for check, text in texts.items():
+            column = column_of(check)[0]
+            of_this_run.setdefault(
+                (column, _NUMBERS.sub(lambda part: part[1] or "#", text)), FailureKind(column, text, number)
+            )
+        for key, kind in of_this_run.items():
+            before = kinds.get(key)
+            kinds[key] = kind if before is None else replace(before, runs=before.runs + 1)
+    return sorted(kinds.values(), key=lambda kind: -kind.runs)
+
+
+ALPHA = 0.05
+"""Probability of error, both of the bound of the rate and of as many green runs by chance."""
+
+
+def green_runs_needed(failed: int, runs: int, alpha: float = ALPHA) -> int:
+    """Return how many runs in a row must pass, if `failed` (at least one) of so many have failed before."""
+    from scipy.stats import beta  # takes longer to import than most of a campaign's other modules
+
+    least_rate = float(beta.ppf(alpha, failed, runs - failed + 1))
+    return math.ceil(math.log(alpha) / math.log1p(-least_rate))
+
+
+def failures_by_check(results: Sequence[Mapping[str, Any]]) -> Counter[str]:
+    """Count the runs of `campaign.json` in which each check failed."""
+    counts: Counter[str] = Counter()
+    for row in results:
+        counts.update({column_of(name)[0] for name, verdict in _checks(row) if verdict == Verdict.INVALID})
+    return counts
+
+
+def _checks(row: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    checks = row.get("checks")
+    return list(checks.items()) if isinstance(checks, dict) else []
+
+
+def after_a_fix(results: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield a line for each check that failed: the runs that make its fix credible."""
+    for check, failed in failures_by_check(results).most_common():
+        needed = green_runs_needed(failed, len(results))
+        yield (
+            f"{check} failed in {failed} of {len(results)} runs: once it is fixed, {needed} runs without a failure "
+            f"make that credible ({1 - ALPHA:.0%})"
+        )
+
+
+def compared_with_before(before: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield a line for each check that failed before: whether it is credibly fixed now."""
+    failing = failures_by_check(now)
+    judged = {HUNG, EMULATOR} | {column_of(name)[0] for row in now for name, _ in _checks(row)}
+    for check, failed in failures_by_check(before).most_common():
+        was = f"{check} failed in {failed} of {len(before)} runs before"
+        if failing[check]:
+            yield f"{was}, and in {failing[check]} of {len(now)} now"
+            continue
+        if check not in judged:
+            yield f"{was}, and was judged in no run now"
+            continue
+        needed = green_runs_needed(failed, len(before))
+        if len(now) >= needed:
+            yield f"{was}, and in none of {len(now)} now: a fix is credible, for which {needed} runs are enough"
+        else:
+            yield f"{was}, and in none of {len(now)} now: a fix is credible from {needed} runs on ({1 - ALPHA:.0%})"
+
+
+TEST_FILE = "test_failure.py"
+TEXT = '''"""Failure {number} of a campaign: {checks}. Written by vnet; `pytest {file}` runs it."""
+
+from pathlib import Path
+
+from emulator.testing.campaign import failures
+
+
+def test_failure_{name}(tmp_path: Path) -> None:
+    scenario = Path(__file__).with_name("scenario.toml")
+    assert failures(scenario, tmp_path / "run", limit_s={limit_s:g}{twice}) == {{}}
+'''
+
+
+def regression_test(number: str, checks: Sequence[str], limit_s: float) -> str:
+    """Return the test of the failure of this number, of these checks, whose run may take `limit_s` seconds."""
+    name = "".join(character if character.isalnum() else "_" for character in number)
+    twice = ", twice=True" if REPLAY in checks else ""
+    return TEXT.format(
+        number=number, name=name, checks=", ".join(checks), file=TEST_FILE, limit_s=limit_s, twice=twice
+    )
+
+
+def failures(scenario: Path, folder: Path, limit_s: float, twice: bool = False) -> dict[str, str]:
+    """Simulate a scenario as a campaign does, and return the texts of the checks that fail by their names.
+
+    It runs in a process of its own, and its files stay in `folder`. One that takes more than `limit_s` seconds, or
+    ends its process, has failed; `twice` has it made again in another way. Raises VnetError if it cannot be run.
+    """
+    loaded = load_scenario(scenario)
+    pool = TrialPool(limit_s, loaded, twice=twice)
+    try:
+        trial = pool.run(loaded, folder)
+    finally:
+        pool.close()
+    return {name: trial.texts[name] for name in trial.failed}
+
+
+FAILURE_PAGE = "failure.html"
+NS_PER_US = 1000
+
+
+def write_failure_page(folder: Path, title: str, checks: Mapping[str, str], explanation: Explanation) -> Path:
+    """Write the page of a failure whose run is in `folder`; `checks` has the texts of those that failed.
+
+    Its timeline begins at the first failure of a program, else at the parting. Raises VnetError where the disk
+    refuses.
+    """
+    source = Source(folder)
+    first = explanation.partings[0].time_ns // NS_PER_US if explanation.partings else None
+    page = render(
+        "failure.html.j2",
+        title=title,
+        checks=checks,
+        parting=shown_parting(explanation),
+        timeline=maybe(lambda: timeline(source, at_us=first)),
+    )
+    return put_page(folder / FAILURE_PAGE, page)
+
+
+def shown_parting(explanation: Explanation) -> dict[str, Any]:
+    """Return the explanation as pages show it: its line, its table, and what came before."""
+    rows = table(explanation.rows()) if explanation.partings else None
+    node = explanation.partings[0].node if explanation.partings else ""
+    return {"line": explanation.line(), "rows": rows, "node": node, "until": explanation.until}
+
 
 FORMAT = 1
 WRITE_EVERY = 20

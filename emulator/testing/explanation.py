@@ -16,9 +16,10 @@ from typing import Any
 
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.scenario.loading import dump_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import with_seed
-from emulator.testing.shrinking_runs import with_faults, with_tape
+from emulator.testing.shrinking import with_faults, with_tape
 from emulator.testing.trial import TrialPool
 from vnet.errors import VnetError, printable
 from vnet.units import NS_PER_S

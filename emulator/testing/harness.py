@@ -32,9 +32,8 @@ from emulator.records.events import Event
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE
-from emulator.scenario.fault_families import LONGEST_S, Fault, OwnRule
-from emulator.scenario.faults import parse_fault
-from emulator.scenario.modules import with_rules
+from emulator.scenario.faults import LONGEST_S, Fault, OwnRule, parse_fault
+from emulator.scenario.loading import with_rules
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError, VnetError
 from vnet.units import NS_PER_S

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from emulator.scenario.scenario import Scenario, load_scenario, with_own_modules
+from emulator.scenario.loading import find_scenario, load_scenario, with_own_modules
+from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
-from emulator.scenario.shipped import find_scenario
 from vnet.errors import ScenarioError
 
 Source = str | Path | Mapping[str, Any] | Scenario

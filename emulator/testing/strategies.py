@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 from hypothesis import strategies as st
 
-from emulator.scenario.fault_families import Fault
+from emulator.scenario.faults import Fault
+from emulator.testing.campaign_plan import ScheduleConstraints, draw_fault, known_kinds
 from emulator.testing.scenarios import Source, make_scenario
-from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_kinds
 
 T = TypeVar("T")
 

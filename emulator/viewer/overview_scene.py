@@ -14,7 +14,7 @@ import rerun as rr
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import WARNING, EventKind, level_of
 from emulator.records.run_folder import SCENARIO_FILE
-from emulator.scenario.recorded import parse_recorded_scenario
+from emulator.scenario.loading import parse_recorded_scenario
 from emulator.stream.messages import unpack
 from emulator.viewer.drawing import (
     BLUE,

@@ -11,8 +11,8 @@ import pyarrow as pa
 
 from emulator.records.reference import Setting, reference_of
 from emulator.records.tables import STATES
-from emulator.scenario.declared import declared, load_entry
-from emulator.scenario.recorded import parse_recorded_scenario
+from emulator.scenario.loading import parse_recorded_scenario
+from emulator.scenario.own_functions import declared, load_entry
 from emulator.stream.messages import unpack
 from vnet.errors import VnetError
 from vnet.types import Array

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from emulator.faults.plan import PlannedFault, stream
-from emulator.scenario.fault_families import GnssFault
-from emulator.scenario.faults import Drift, GnssFreeze, GnssOutage, RandomPos, Skew
+from emulator.scenario.faults import Drift, GnssFault, GnssFreeze, GnssOutage, RandomPos, Skew
 from emulator.world.world import Instant, World
 from vnet.node import Fix
 from vnet.transport.wire import ClockError

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scenario.random_streams import NETWORK_KEY, philox
-from emulator.world.csv_file import check_columns, check_row_count, number_within, open_csv
+from emulator.world.input_files import check_columns, check_row_count, number_within, open_csv
 from vnet.errors import ScenarioError, shown
 from vnet.transport.keys import is_segment
 from vnet.types import Array

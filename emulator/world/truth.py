@@ -3,26 +3,43 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import Gnss
-from emulator.world.common_error import common_errors
-from emulator.world.links import load_links
+from emulator.world.gnss import MotionSensors, common_errors, further_error_m, noise_m, speed_mps
 from emulator.world.own_sensors import OwnSensors, Reading, SensedTruth
 from emulator.world.projection import Frame
-from emulator.world.radio_inputs import RadioInputs, load_buildings
-from emulator.world.receivers import MotionSensors, further_error_m, noise_m, speed_mps
-from emulator.world.roadside import with_units
+from emulator.world.radio_inputs import RadioInputs, load_buildings, load_links
 from emulator.world.trips.motion import Motion
-from vnet.errors import ScenarioError, first_names
+from vnet.errors import ScenarioError, first_names, shown
 from vnet.node import NOTHING_SENSED, Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
+
+
+def with_units(motion: Motion, units: Sequence[RoadsideUnit]) -> Motion:
+    """Return the motion of vehicles and units. Raise ScenarioError for a unit that has a vehicle's name."""
+    if not units:
+        return motion
+    names = tuple(unit.name for unit in units)
+    for number, name in enumerate(names):
+        if name in motion.node_ids:
+            raise ScenarioError(f"roadside.{number}.id = {shown(name)}: a vehicle has this name")
+    periods = len(motion.position_m)
+    position_m = np.tile([unit.position_m for unit in units], (periods, 1, 1))
+    return replace(
+        motion,
+        node_ids=(*motion.node_ids, *names),
+        position_m=np.concatenate([motion.position_m, position_m], axis=1),
+        heading_rad=np.concatenate([motion.heading_rad, np.full((periods, len(units)), np.nan)], axis=1),
+    )
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
-from emulator.world.driven.sumo_world import SumoWorld
-from emulator.world.driven.world import DrivenWorld
-from emulator.world.graph import components_of_links
-from emulator.world.lateral import lateral_offsets_m
-from emulator.world.neighbours import Links, links_within
+from emulator.world.driven.stepped import DrivenWorld
+from emulator.world.driven.sumo import SumoWorld
+from emulator.world.neighbours import Links, components_of_links, links_within
 from emulator.world.networks import Network, generate_network, load_network
 from emulator.world.projection import Frame
-from emulator.world.trips.motion import Motion
+from emulator.world.trips.motion import Motion, lateral_offsets_m
 from emulator.world.truth import Instant, World, periods_of
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
@@ -61,8 +59,7 @@ def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
 def _drive(scenario: Scenario) -> World:
     """Return a world in which vehicles drive recorded trips, or generated ones through a city or a map."""
     # Maps and trips need half of scipy, whose import takes longer than many a run of vehicles that stand.
-    from emulator.world.maps.around import lanes_around, notes_of
-    from emulator.world.maps.files import read_roads
+    from emulator.world.maps.files import lanes_around, notes_of, read_roads
     from emulator.world.trips.drive import drive, drive_through_city
 
     section, periods = scenario.map, periods_of(scenario)

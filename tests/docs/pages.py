@@ -26,7 +26,7 @@ from typing import Any
 
 import yaml
 
-from emulator.scenario.scenario import load_scenario
+from emulator.scenario.loading import load_scenario
 from tests.docs import commands
 from tests.docs.commands import DocsError
 from tests.docs.markdown import Block, blocks

@@ -24,17 +24,15 @@ from emulator.drivers.hosts import messages
 from emulator.drivers.status import Course
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.faults import parse_fault
-from emulator.scenario.network import Network
+from emulator.scenario.loading import dump_scenario, load_scenario
+from emulator.scenario.network import Network, input_files, read_begin_s
 from emulator.scenario.program import Program
-from emulator.scenario.scenario import Radio, Scenario, dump_scenario, load_scenario
-from emulator.scenario.sumo import input_files, read_begin_s
+from emulator.scenario.scenario import Radio, Scenario
 from emulator.world.buildings import LEAST_CORNERS
-from emulator.world.link_table import LinkTable
-from emulator.world.links import load_links
-from emulator.world.maps.files import read_roads
-from emulator.world.maps.outlines import read_buildings
+from emulator.world.maps.files import read_buildings, read_roads
 from emulator.world.networks import load_network
 from emulator.world.projection import Frame
+from emulator.world.radio_inputs import LinkTable, load_links
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
 from tests.fuzz.seeds import (

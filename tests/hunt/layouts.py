@@ -23,8 +23,8 @@ import tomli_w
 from emulator.cells.executors import each_done
 from emulator.drivers.session import Local, Session, with_order_steps
 from emulator.records.run_folder import RunFolder
+from emulator.scenario.loading import scenario_of
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.source import scenario_of
 
 VNET = [sys.executable, "-P", "-W", "ignore", "-m", "emulator.cli"]
 FAULTS: list[dict[str, Any]] = [

@@ -26,7 +26,7 @@ def main(folder: Path) -> None:
     from emulator.records.recorded_run import RecordedRun
     from emulator.report.timeline import marks_of
     from emulator.report.write import write_report
-    from emulator.scenario.scenario import load_scenario
+    from emulator.scenario.loading import load_scenario
     from emulator.terminal.dashboard import describe
     from emulator.viewer.overview_scene import OverviewScene
 

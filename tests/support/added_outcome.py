@@ -48,19 +48,20 @@ def jam_every_second_frame() -> None:
 
     lose = Loss.__call__
 
-    def jam(self: Any, frames: Any, receptions: Any) -> None:
-        for index, frame in enumerate(frames):
+    def jam(self: Any, transmissions: Any, receptions: Any) -> None:
+        for index, sent in enumerate(transmissions):
             row = receptions.outcome[index]
-            if frame.seq % 2:
+            if sent.frame.seq % 2:
                 row[row == PENDING] = Outcome["jammed"]
-        lose(self, frames, receptions)
+        lose(self, transmissions, receptions)
 
     Loss.__call__ = jam  # type: ignore[method-assign]
 
 
 def legend(vehicles: int) -> list[str]:
     """The names in the legend of a recording's map."""
-    from emulator.scenario.scenario import Scenario, dump_scenario
+    from emulator.scenario.loading import dump_scenario
+    from emulator.scenario.scenario import Scenario
     from emulator.viewer.overview_scene import draw_legend
 
     canvas = Mock()

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.faults.plan import FaultPlan
-from emulator.faults.selectors import Nodes
+from emulator.faults.plan import FaultPlan, Nodes
 from emulator.radio.engine import Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.scenario.scenario import Scenario

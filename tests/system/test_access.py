@@ -14,7 +14,7 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.scenario import load_scenario
+from emulator.scenario.loading import load_scenario
 from emulator.world.world import build_world
 from tests.support.paths import ROOT
 from tests.system.conftest import TIMEOUT_S

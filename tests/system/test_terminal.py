@@ -19,7 +19,7 @@ import pytest
 from emulator.cli.commands import app
 from emulator.drivers.control import ask, control_endpoint
 from emulator.drivers.status import Snapshot
-from emulator.scenario.scenario import load_scenario
+from emulator.scenario.loading import load_scenario
 from emulator.terminal.console import run_app
 from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT

@@ -27,8 +27,7 @@ from emulator.drivers.processes import Heard, Processes, ProtocolError, Stalled,
 from emulator.drivers.realtime import RealTime, take_what_comes
 from emulator.drivers.router import ROUTER
 from emulator.records.events import KINDS, EventKind
-from emulator.scenario.fault_families import Infrastructure
-from emulator.scenario.faults import EmulatorRestart
+from emulator.scenario.faults import EmulatorRestart, Infrastructure
 from emulator.viewer.sinks import Sinks
 from vnet.counted import counted
 from vnet.errors import ProgramError, TransportError, VnetError, WireError, first_names

@@ -5,9 +5,8 @@ Windows are as long as the least latency of the scenario's radio, so some grants
 
 from __future__ import annotations
 
-from emulator.scenario.lookahead import least_latency_ns
-from emulator.testing.conformance.joining import absence, ask_stack, orphan
-from emulator.testing.conformance.scene import QUIET_S, Scene, SceneOverError
+from emulator.scenario.scenario import least_latency_ns
+from emulator.testing.conformance.scene import QUIET_S, Scene, SceneOverError, absence, ask_stack, orphan
 from vnet.transport import wire
 from vnet.transport.wire import WireSendResult
 from vnet.units import NS_PER_S

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Literal
 
 from emulator.scenario.scenario import Scenario
-from emulator.testing.conformance import joining, lockstep, realtime
-from emulator.testing.conformance.bench import PLACEHOLDERS, AgentUnderTest, Bench
+from emulator.testing.conformance import lockstep, realtime, scene
 from emulator.testing.conformance.findings import Findings
-from emulator.testing.conformance.scene import Scene, SceneOverError
+from emulator.testing.conformance.scene import PLACEHOLDERS, AgentUnderTest, Bench, Scene, SceneOverError
 from emulator.world.world import build_world
 from vnet.errors import VnetError, did_you_mean
 from vnet.transport.access import Access, certifier, is_tls
@@ -23,8 +22,8 @@ PATIENCE_S = 5.0
 Pacing = Literal["lockstep", "realtime"]
 
 SCENES: dict[str, tuple[Pacing, Callable[[Scene], None]]] = {
-    "joining": ("lockstep", joining.joining),
-    "refusal": ("lockstep", joining.refusal),
+    "joining": ("lockstep", scene.joining),
+    "refusal": ("lockstep", scene.refusal),
     "lockstep": ("lockstep", lockstep.run),
     "lockstep-restart": ("lockstep", lockstep.restart),
     "lockstep-ended": ("lockstep", lockstep.ended),
@@ -53,10 +52,10 @@ class Conformance:
 
     def __post_init__(self) -> None:
         """Raises VnetError for an unknown scene, and for a command that cannot know where to connect."""
-        for scene in self.scenes:
-            if scene not in SCENES:
+        for name in self.scenes:
+            if name not in SCENES:
                 known = ", ".join(SCENES)
-                raise VnetError(f"--scene {scene}: unknown{did_you_mean(scene, SCENES)}; there are {known}")
+                raise VnetError(f"--scene {name}: unknown{did_you_mean(name, SCENES)}; there are {known}")
         for placeholder in PLACEHOLDERS:
             if not any(placeholder in word for word in self.command):
                 names = " ".join(PLACEHOLDERS)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import time
 
-from emulator.testing.conformance.bench import Said
-from emulator.testing.conformance.joining import absence, ask_stack, orphan
 from emulator.testing.conformance.lockstep import PACKET_AFTER_NS, say_malformed
-from emulator.testing.conformance.scene import Scene
+from emulator.testing.conformance.scene import Said, Scene, absence, ask_stack, orphan
 from vnet.transport import wire
 from vnet.units import NS_PER_S
 

@@ -1,4 +1,4 @@
-"""Worlds whose truth comes to be as the run goes on: what all have in common, whatever moves their vehicles."""
+"""Worlds whose truth is computed during the run, because programs drive; vehicles of others beside them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from emulator.scenario.network import control_step_ns
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
-from emulator.world.driven.background import Background
-from emulator.world.driven.vehicles import Happening, Log
+from emulator.world.driven.road import Start, start_on_single_road
+from emulator.world.driven.vehicles import DrivenVehicles, Happening, Log
+from emulator.world.gnss import MotionSensors
 from emulator.world.projection import Frame
-from emulator.world.receivers import MotionSensors
 from emulator.world.trips.motion import Motion
 from emulator.world.truth import World, periods_of
 from vnet.driving import Action
@@ -25,6 +27,25 @@ from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
+
+
+class Background:
+    """Positions of vehicles that have no program and no radio, in columns: there may be many."""
+
+    def __init__(self) -> None:
+        self.names: dict[str, int] = {}
+        """Number of each vehicle by its id, in the order in which they have come."""
+        self.time_ns: list[int] = []
+        self.numbers: list[NDArray[np.int32]] = []
+        """Numbers (k,) of those that were there, at each of the times."""
+        self.position_m: list[Array] = []
+        """Their positions (k, 2)."""
+
+    def add(self, time_ns: int, ids: Sequence[str], position_m: Array) -> None:
+        """Add the vehicles that are there at a time."""
+        self.time_ns.append(time_ns)
+        self.numbers.append(np.array([self.names.setdefault(each, len(self.names)) for each in ids], np.int32))
+        self.position_m.append(position_m)
 
 
 class SteppedVehicles(Protocol):
@@ -190,3 +211,61 @@ class SteppedWorld(World):
         if math.isnan(gap_m):
             return fix
         return replace(fix, gap_m=gap_m, gap_rate_m_s=self._gap_rate_mps[period, node].item())
+
+
+class DrivenWorld(SteppedWorld):
+    """A world of `vehicles` on a straight road, a ring or a map, where only programs drive."""
+
+    vehicles: DrivenVehicles
+
+    def __init__(self, scenario: Scenario) -> None:
+        node_ids = _node_ids(scenario.network.vehicles)
+        start, lanes, frame, notes = _start(scenario, len(node_ids))
+        self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz), start)
+        self._furthest_m = start.along_m + scenario.driven.max_speed_mps * scenario.run.duration_s
+        super().__init__(scenario, node_ids, lanes, notes, frame)
+        if scenario.run.nodes_per_process > 1 and self.may_leave:
+            raise ScenarioError(
+                f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 where vehicles may leave: "
+                f"they may come to the end of the road, after {self.vehicles.road.end_m.min():g} m"
+            )
+
+    @property
+    def may_leave(self) -> bool:
+        """True if a vehicle may come to the end of the road."""
+        return bool((self._furthest_m > self.vehicles.road.end_m).any())
+
+    @property
+    def has_traffic(self) -> bool:
+        """True if vehicles may leave during the run."""
+        return self.may_leave
+
+    @property
+    def vehicle_area_m(self) -> Array:
+        """Corners (2, 2) of the box in which vehicles can be during the run."""
+        return self.vehicles.road.area_m(self._furthest_m)
+
+
+def _node_ids(vehicles: int) -> tuple[str, ...]:
+    width = max(2, len(str(vehicles)))
+    return tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
+
+
+def _start(scenario: Scenario, count: int) -> tuple[Start, LaneMap | RoadMap, Frame | None, tuple[str, ...]]:
+    """Return where vehicles are at the start, the lanes that programs know, their frame, and notes for the user."""
+    if scenario.driven.road == "map":
+        from emulator.world.driven.map_driving import start_on_map
+
+        found = start_on_map(scenario)
+        return found.start, found.lanes, found.frame, found.notes
+    start = start_on_single_road(scenario.driven, count)
+    return start, _lane_map(scenario), None, ()
+
+
+def _lane_map(scenario: Scenario) -> LaneMap:
+    """Return the lanes that programs know: those of a straight road; of a ring none, as it is not straight."""
+    driven, half_width_m = scenario.driven, scenario.world.lateral.half_width_m
+    if driven.road == "ring":
+        return LaneMap(np.zeros((0, 2)), np.zeros(0), half_width_m)
+    point_m = np.column_stack([np.zeros(driven.lanes), np.arange(driven.lanes) * driven.lane_width_m])
+    return LaneMap(point_m, np.zeros(driven.lanes), half_width_m)

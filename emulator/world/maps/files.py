@@ -1,17 +1,314 @@
-"""Map files in all formats, distinguished by their names: reading and writing."""
+"""Map files in all formats, by their names: roads, buildings, and the part that programs get.
+
+OpenStreetMap's are closed ways and multipolygons with the tag `building`, GeoJSON's the polygons that have it as a
+property; `building=no` is none. Courts are rings of their own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from emulator.world.maps.geojson import read_geojson, write_geojson
+import msgspec
+import numpy as np
+
+from emulator.scenario.network import Map
+from emulator.world.buildings import LEAST_CORNERS, Buildings
+from emulator.world.input_files import check_columns, number_within, open_csv
+from emulator.world.maps.geojson import check_on_earth, read_collection, read_geojson, write_geojson
 from emulator.world.maps.graph import read_graph, write_graph
-from emulator.world.maps.osm import read_osm
-from emulator.world.maps.roads import Roads
-from emulator.world.maps.sumo import read_sumo
-from vnet.errors import ScenarioError
+from emulator.world.maps.roads import MAX_POINTS, Roads, RoadsBuilder, street
+from emulator.world.maps.sumo import read_sumo, read_sumo_polygons
+from emulator.world.networks import MAX_COORDINATE_M
+from emulator.world.projection import Frame
+from vnet.counted import counted
+from vnet.errors import ScenarioError, printable, shown
+from vnet.roads.road_map import RoadMap
+from vnet.types import Array
+
+if TYPE_CHECKING:
+    from osmium.osm import Way
+
+CLIPPED = "ways clipped where the file lacks their nodes"
+"""Count in `Roads.notes` of ways that leave the part of a map that was cut out."""
+_UNDEFINED_DEG = 200.0
+"""Nodes that a file lacks have a longitude beyond it."""
+_LONGEST_LINE = 1 << 16
+"""Bytes of a line that are searched at once."""
+
+
+def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
+    """Read roads; the origin is their centre unless given. Raise ScenarioError, naming the way, for a bad file."""
+    builder = RoadsBuilder(path)
+    with osm_errors(path):
+        import osmium
+
+        file = osmium.FileProcessor(path).with_locations().with_filter(osmium.filter.KeyFilter("highway"))
+        for entity in file:
+            if isinstance(entity, osmium.osm.Way):
+                _add_way(path, builder, entity)
+    if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
+        raise ScenarioError(f"{path}: it lacks the nodes of its {clipped} ways: extract maps with their nodes")
+    return builder.build_from_degrees(origin_deg)
+
+
+@contextmanager
+def osm_errors(path: Path) -> Iterator[None]:
+    """Raise ScenarioError in place of pyosmium's errors, also if it is not installed."""
+    try:
+        import osmium
+    except ImportError:
+        raise ScenarioError(
+            f"{path}: OpenStreetMap files need pyosmium, which is not installed: pip install 'vnet-emulator[maps]'"
+        ) from None
+    try:
+        yield
+    except osmium.InvalidLocationError as error:
+        value = str(error).partition("'")[2].removesuffix("'")
+        raise ScenarioError(f"{path}: {_line_of(path, value)}{printable(str(error), 300)}") from None
+    except (RuntimeError, ValueError, OSError) as error:
+        raise ScenarioError(f"{path}: not an OpenStreetMap file: {printable(str(error), 300)}") from None
+
+
+def _line_of(path: Path, value: str) -> str:
+    """Return `line N: ` of a quoted value in an XML file, or nothing: pyosmium gives lines only for bad XML."""
+    quoted, line = value.encode(), 1
+    with path.open("rb") as file:
+        while part := file.readline(_LONGEST_LINE):
+            if b'"' + quoted + b'"' in part or b"'" + quoted + b"'" in part:
+                return f"line {line}: "
+            line += part.endswith(b"\n")
+    return ""
+
+
+def _add_way(path: Path, builder: RoadsBuilder, way: Way) -> None:
+    found = street(dict(way.tags))
+    if found is None:
+        builder.note("ways not for cars")
+        return
+    name = f"way {way.id}"
+    if len(way.nodes) < 2:
+        raise ScenarioError(f"{path}: {name}: {len(way.nodes)} nodes; a road needs two")
+    pieces = _pieces(path, way)
+    if len(pieces) != 1 or len(pieces[0]) != len(way.nodes):
+        builder.note(CLIPPED)
+    for points in pieces:
+        if found.reversed:
+            points.reverse()
+        if len(points) > 1:
+            builder.add(name, points, found.kind, found.lanes, found.lane_width_m)
+
+
+def _pieces(path: Path, way: Way) -> list[list[tuple[int, tuple[float, float]]]]:
+    """Return the points of a way, (node, (longitude, latitude)), in pieces between nodes that the file lacks."""
+    pieces: list[list[tuple[int, tuple[float, float]]]] = [[]]
+    for node in way.nodes:
+        if node.location.valid():
+            pieces[-1].append((node.ref, (node.location.lon, node.location.lat)))
+        elif abs(node.location.lon_without_check()) > _UNDEFINED_DEG:
+            pieces.append([])
+        else:
+            raise ScenarioError(f"{path}: way {way.id}: node {node.ref} is not on the earth")
+    return [piece for piece in pieces if piece]
+
+
+FAR_M = 100.0
+"""Distance to the nearest lane beyond which a position is off the map."""
+SAMPLES = 5000
+"""Positions that are tested for it."""
+
+
+def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
+    """Return the lanes of `[map]`, read as `roads`, around the positions `course_m` (K, N, 2) of all vehicles.
+
+    Raise ScenarioError if most positions are off the map.
+    """
+    position_m = course_m[np.isfinite(course_m[..., 0])]
+    lanes = lanes_in_box(roads, section, position_m.min(axis=0), position_m.max(axis=0))
+    if lanes is None or _far_share(lanes, position_m) > 0.5:
+        (x, y), (left, low), (right, high) = np.median(position_m, axis=0), *_extent(roads)
+        raise ScenarioError(
+            f"{section.path}: most positions of vehicles are over {FAR_M:g} m from all roads: vehicles are around "
+            f"({x:.0f}, {y:.0f}) m, and the roads from ({left:.0f}, {low:.0f}) to ({right:.0f}, {high:.0f}) m; "
+            "check origin_deg and the projection"
+        )
+    return lanes
+
+
+def lanes_in_box(roads: Roads, section: Map, low_m: Array, high_m: Array) -> RoadMap | None:
+    """Return the lanes of `[map]` within its margin of the box from `low_m` to `high_m` (2,); None without any."""
+    part = roads.within(low_m - section.margin_m, high_m + section.margin_m)
+    if not len(part):
+        return None
+    lanes = part.lane_map(section.drive_on, section.sigma_m)
+    point_m = lanes.point_m
+    if section.aside_m:
+        point_m = point_m + section.aside_m * lanes.normal
+    if any(section.datum_m):
+        point_m = point_m + np.array(section.datum_m)
+    return replace(lanes, point_m=point_m, datum_sigma_m=section.datum_sigma_m)
+
+
+def notes_of(path: Path, roads: Roads) -> tuple[str, ...]:
+    """Return the line for the user about a map that was cut from a larger one."""
+    clipped = roads.notes.get(CLIPPED, 0)
+    return (f"{path}: {CLIPPED}: {clipped}",) if clipped else ()
+
+
+def _far_share(lanes: RoadMap, position_m: Array) -> float:
+    sample_m = position_m[:: max(1, len(position_m) // SAMPLES)]
+    row, _, _ = lanes.near(sample_m, np.full(len(sample_m), np.nan), np.full(len(sample_m), FAR_M))
+    return 1 - len(np.unique(row)) / len(sample_m)
+
+
+def _extent(roads: Roads) -> tuple[Array, Array]:
+    return roads.node_m.min(axis=0), roads.node_m.max(axis=0)
+
+
+COLUMNS = ("building", "x_m", "y_m")
+"""Columns of a CSV file: rows with one name in `building`, one after the other, are its corners."""
+_LONGEST_ROW = 1000
+"""Characters of a line of CSV."""
+
+Rings = list[Array]
+
+
+def read_buildings(path: Path, frame: Callable[[], Frame]) -> Buildings:
+    """Read buildings. `frame` returns the frame of the run's metres; it is called for a file in degrees.
+
+    Raise ScenarioError, in one line that names the file and the line or feature, for a bad file.
+    """
+    ending = path.suffix.lower()
+    if ending == ".csv":
+        return Buildings.of(_some(path, _read_csv(path)))
+    if path.name.lower().endswith(".poly.xml"):
+        return Buildings.of(_some(path, [[np.array(corners)] for corners in read_sumo_polygons(path)]))
+    if ending in (".osm", ".pbf"):
+        found = _read_osm(path)
+    elif ending in (".geojson", ".json"):
+        found = _read_geojson(path)
+    else:
+        raise ScenarioError(
+            f"{path}: no buildings are read from it; allowed are *.csv, *.osm, *.pbf, *.geojson, *.poly.xml"
+        )
+    return _projected(path, Buildings.of(_some(path, found)), frame())
+
+
+def _some(path: Path, buildings: list[Rings]) -> list[Rings]:
+    if not buildings:
+        raise ScenarioError(f"{path}: no buildings in it")
+    return buildings
+
+
+def _projected(path: Path, degrees: Buildings, frame: Frame) -> Buildings:
+    """Return buildings in metres; their corners are longitudes and latitudes."""
+    longitude, latitude = degrees.corner_m.T
+    corner_m = frame.to_local(latitude, longitude)
+    if not (np.abs(corner_m) <= MAX_COORDINATE_M).all():
+        raise ScenarioError(f"{path}: buildings are too far from the origin of the run's metres; check origin_deg")
+    return Buildings(corner_m, degrees.first, degrees.building)
+
+
+def _bounded(path: Path, corners: int) -> None:
+    if corners > MAX_POINTS:
+        raise ScenarioError(f"{path}: more than {MAX_POINTS} corners; cut out a part first")
+
+
+# Corners in metres.
+
+
+def _read_csv(path: Path) -> list[Rings]:
+    rows: list[tuple[str, int, tuple[float, float]]] = []
+    with open_csv(path, _LONGEST_ROW) as lines:
+        reader = csv.DictReader(lines)
+        check_columns(path, reader, COLUMNS)
+        for row in reader:
+            x_m, y_m = (
+                number_within(path, reader.line_num, row, column, MAX_COORDINATE_M) for column in COLUMNS[1:]
+            )
+            rows.append(((row["building"] or "").strip(), reader.line_num, (x_m, y_m)))
+            _bounded(path, len(rows))
+    rings: dict[str, tuple[str, Array]] = {}
+    for name, group in groupby(rows, key=lambda row: row[0]):
+        ring = list(group)
+        where = f"{path}: line {ring[0][1]}: building = {shown(name)}"
+        if not name:
+            raise ScenarioError(f"{where}: a name is needed")
+        if name in rings:
+            raise ScenarioError(f"{where}: its corners have to stand in rows one after the other")
+        rings[name] = where, np.array([corner for _, _, corner in ring])
+    return [[_open_ring(where, corners)] for where, corners in rings.values()]
+
+
+def _open_ring(where: str, corners: Array) -> Array:
+    """Return a ring without the repetition of its first corner at its end. Raise ScenarioError if it is no area."""
+    if len(corners) > 1 and (corners[0] == corners[-1]).all():
+        corners = corners[:-1]
+    if len(set(map(tuple, corners.tolist()))) < LEAST_CORNERS:  # np.unique takes ten times as long
+        raise ScenarioError(f"{where}: {counted(len(corners), 'corner')}; three different ones are needed")
+    return corners
+
+
+# Degrees.
+
+
+def _read_osm(path: Path) -> list[Rings]:
+    buildings: list[Rings] = []
+    corners = 0
+    with osm_errors(path):
+        import osmium
+
+        tagged = osmium.filter.KeyFilter("building")
+        for entity in osmium.FileProcessor(path).with_areas(tagged).with_filter(tagged):
+            if not isinstance(entity, osmium.osm.Area) or entity.tags["building"] == "no":
+                continue
+            rings = [
+                np.array([(node.lon, node.lat) for node in ring][:-1])
+                for outer in entity.outer_rings()
+                for ring in (outer, *entity.inner_rings(outer))
+            ]
+            if rings:  # an outline that crosses itself has none
+                buildings.append(rings)
+                corners += sum(map(len, rings))
+                _bounded(path, corners)
+    return buildings
+
+
+def _read_geojson(path: Path) -> list[Rings]:
+    buildings: list[Rings] = []
+    corners = 0
+    for number, feature in enumerate(read_collection(path).features):
+        geometry = feature.geometry
+        kind = (feature.properties or {}).get("building")
+        if geometry is None or kind in (None, False, "no") or geometry.type not in ("Polygon", "MultiPolygon"):
+            continue
+        polygons = [geometry.coordinates] if geometry.type == "Polygon" else geometry.coordinates
+        where = f"{path}: feature {number}"
+        for polygon in polygons:
+            buildings.append(_rings(where, polygon))
+            corners += sum(map(len, buildings[-1]))
+            _bounded(path, corners)
+    return buildings
+
+
+def _rings(where: str, polygon: Any) -> Rings:
+    """Return the rings (n, 2) of a polygon in GeoJSON, longitude and latitude."""
+    try:
+        found = msgspec.convert(polygon, list[list[list[float]]])
+        rings = [np.array([(x, y) for x, y, *_ in ring], dtype=float).reshape(-1, 2) for ring in found]
+    except ValueError:  # also a point of one number
+        rings = []
+    if not rings:
+        raise ScenarioError(f"{where}: its coordinates are not rings of three or more points")
+    for ring in rings:
+        check_on_earth(where, ring)
+    return [_open_ring(where, ring) for ring in rings]
+
 
 _T = TypeVar("_T")
 

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from emulator.world.maps.classes import (
+from emulator.world.maps.roads import (
     CLASSES,
     LANE_WIDTH_M,
     MAX_LANE_WIDTH_M,
@@ -21,9 +21,11 @@ from emulator.world.maps.classes import (
     NAMES,
     NUMBER,
     UNKNOWN,
+    Roads,
+    RoadsBuilder,
+    Street,
+    street,
 )
-from emulator.world.maps.roads import Roads, RoadsBuilder
-from emulator.world.maps.tags import Street, street
 from vnet.bounded import read_bounded
 from vnet.errors import ScenarioError, printable, shown
 from vnet.types import Array

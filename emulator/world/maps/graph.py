@@ -14,18 +14,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.world.arrays import read_arrays
-from emulator.world.maps.classes import (
+from emulator.world.input_files import read_arrays
+from emulator.world.maps.roads import (
     LANE_WIDTH_M,
     LANES,
     MAX_LANE_WIDTH_M,
     MAX_LANES,
+    MAX_POINTS,
     MIN_LANE_WIDTH_M,
     NAMES,
     NUMBER,
     UNKNOWN,
+    Ints,
+    Roads,
+    check_extent,
 )
-from emulator.world.maps.roads import MAX_POINTS, Ints, Roads, check_extent
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import Frame, project
 from vnet.errors import ScenarioError, shown

@@ -1,16 +1,154 @@
-"""Quality report of a map: its size, and counts of its likely errors, before a run meets them."""
+"""Problems of a map: its likely errors, and its shift and bias against recorded trips, before a run meets them.
+
+No filter can tell a shift of the map, its *datum*, from the common error of receivers: both move all vehicles
+alike. Recorded trips whose positions are true can. Where a vehicle drives at q, the nearest lane that fits its
+heading, with normal n and n·p = offset, leaves the residual r = n·q − offset, and over all vehicles and roads
+
+    r = aside + n·datum + e
+
+is fitted by least squares with weights that fall to 0 at 4.7 deviations (Tukey's biweight): a vehicle on a
+road that the map does not have says nothing. Residuals are alike within some 500 m, so that standard errors count
+squares of that side.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from emulator.world.maps.classes import NAMES
-from emulator.world.maps.roads import Ints, Roads
+from emulator.world.maps.roads import NAMES, Ints, Roads
+from emulator.world.trips.motion import Motion
+from vnet.errors import ScenarioError
+from vnet.roads.road_map import RoadMap
+from vnet.types import Array
+
+REACH_M = 25.0
+"""Distance (m) within which a lane is sought."""
+SPACING_M = 20.0
+"""Way (m) of a vehicle between two of its residuals: those closer together are the same."""
+PLACE_M = 500.0
+"""Side (m) of the squares whose residuals are taken for independent of each other."""
+MIN_PLACES = 10
+"""Least number of squares that make a calibration."""
+ROUNDS = 30
+"""Rounds of reweighting."""
+BIWEIGHT = 4.685
+"""Tukey's constant: 95 % as efficient as least squares where residuals are Gaussian."""
+NORMAL_MAD = 1.4826
+"""Deviation of a Gaussian relative to the median of absolute deviations."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals `metres` (n,) to the right of lanes with normals `normal` (n, 2), in squares `place` (n, 2).
+
+    vehicle: (n,), row numbers of the vehicles.
+    """
+
+    metres: Array
+    normal: Array
+    place: NDArray[np.intp]
+    vehicle: NDArray[np.intp]
+
+    def of(self, vehicles: NDArray[np.bool_]) -> Residuals:
+        """Return those of the vehicles of a mask (N,)."""
+        kept = vehicles[self.vehicle]
+        return Residuals(self.metres[kept], self.normal[kept], self.place[kept], self.vehicle[kept])
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Shift of a map as trips tell it; lengths in metres.
+
+    datum_m: (2,), by how much the map is to be moved east and north. error_m: (2,), its standard error.
+    aside_m: mean distance of the driven line to the right of the lanes. sigma_m: deviation of residuals.
+    places, samples: number of squares and of residuals.
+    """
+
+    datum_m: Array
+    error_m: Array
+    aside_m: float
+    sigma_m: float
+    places: int
+    samples: int
+
+
+def residuals(lanes: RoadMap, motion: Motion) -> Residuals:
+    """Return the residuals of all vehicles that drive near a lane that fits their heading."""
+    parts = []
+    for vehicle in range(len(motion.node_ids)):
+        position_m, heading_rad = motion.position_m[:, vehicle], motion.heading_rad[:, vehicle]
+        rows = _apart(position_m, heading_rad)
+        found, segment, _ = lanes.near(position_m[rows], heading_rad[rows], np.full(len(rows), REACH_M))
+        first = np.flatnonzero(np.diff(found, prepend=-1))  # the nearest of each
+        found, segment = rows[found[first]], segment[first]
+        off_m = (lanes.normal[segment] * position_m[found]).sum(axis=1) - lanes.offset_m[segment]
+        parts.append(
+            Residuals(
+                off_m,
+                lanes.normal[segment],
+                np.floor(position_m[found] / PLACE_M).astype(np.intp),
+                np.full(len(found), vehicle),
+            )
+        )
+    return Residuals(
+        np.concatenate([part.metres for part in parts]),
+        np.concatenate([part.normal for part in parts]),
+        np.concatenate([part.place for part in parts]),
+        np.concatenate([part.vehicle for part in parts]),
+    )
+
+
+def calibrate(found: Residuals) -> Calibration:
+    """Fit datum and mean offset to residuals. Raise ScenarioError if they are in too few places."""
+    where, index = np.unique(found.place, axis=0, return_inverse=True)
+    places = len(where)
+    if places < MIN_PLACES:
+        raise ScenarioError(
+            f"vehicles drive on its lanes in {places} squares of {PLACE_M:g} m: at least {MIN_PLACES} are needed"
+        )
+    regressors = np.column_stack([np.ones(len(found.metres)), found.normal])
+    weight = np.ones(len(found.metres))
+    for _ in range(ROUNDS):
+        weighted = regressors * weight[:, None]
+        inverse = np.linalg.pinv(weighted.T @ regressors)
+        fit = inverse @ weighted.T @ found.metres
+        off_m = found.metres - regressors @ fit
+        scale_m = NORMAL_MAD * float(np.median(np.abs(off_m))) + 1e-9
+        weight = np.maximum(0.0, 1 - (off_m / (BIWEIGHT * scale_m)) ** 2) ** 2
+    # Sums over each square are independent; residuals in it are not (White 1980, by clusters).
+    score = np.zeros((places, 3))
+    np.add.at(score, index.ravel(), weighted * off_m[:, None])
+    covariance = inverse @ score.T @ score @ inverse
+    return Calibration(
+        datum_m=fit[1:],
+        error_m=np.sqrt(np.diag(covariance)[1:]),
+        aside_m=float(fit[0]),
+        sigma_m=scale_m,
+        places=places,
+        samples=len(found.metres),
+    )
+
+
+def moved(lanes: RoadMap, east_north_m: tuple[float, float] | Array) -> RoadMap:
+    """Return the lanes moved by (2,)."""
+    return replace(lanes, point_m=lanes.point_m + np.asarray(east_north_m))
+
+
+def _apart(position_m: Array, heading_rad: Array) -> NDArray[np.intp]:
+    """Return the rows (n,) of a vehicle's positions that are `SPACING_M` apart, along its way."""
+    present = np.flatnonzero(np.isfinite(position_m[:, 0]) & np.isfinite(heading_rad))
+    if not len(present):
+        return present
+    steps_m = np.hypot(*np.diff(position_m[present], axis=0).T)
+    step = np.floor(np.append(0.0, np.cumsum(steps_m)) / SPACING_M)
+    return present[np.flatnonzero(np.diff(step, prepend=-1))]
+
 
 GAP_M = 1.0
 """A road's end this close to another point, but not joined to it, is more likely an error than a dead end."""

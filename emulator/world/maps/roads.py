@@ -1,4 +1,7 @@
-"""Roads: centre lines between shared points, with their attributes; the common result of all map readers.
+"""Roads of a map: their classes, tags, and lanes.
+
+The defaults are those of common design guides. `road` is a road of unknown class, `crossing` the inside of an
+intersection (SUMO's internal lanes).
 
 Lanes of a road lie side by side, with its centre line in the middle of all of them. The lanes in the road's own
 direction are on the side on which people drive.
@@ -6,19 +9,128 @@ direction are on the side on which people drive.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.world.maps.classes import NAMES, VEHICLE_WIDTH_M
 from emulator.world.projection import MAX_FROM_ORIGIN_M, Frame, outlier_index, project
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap, touch_box
 from vnet.types import Array
+
+
+@dataclass(frozen=True)
+class RoadClass:
+    """Defaults of a road class: width of a lane, and lanes in each direction."""
+
+    lane_width_m: float
+    lanes: int
+
+
+CLASSES = {
+    "motorway": RoadClass(3.6, 2),
+    "trunk": RoadClass(3.6, 2),
+    "primary": RoadClass(3.5, 1),
+    "secondary": RoadClass(3.5, 1),
+    "tertiary": RoadClass(3.3, 1),
+    "unclassified": RoadClass(3.0, 1),
+    "residential": RoadClass(3.0, 1),
+    "living_street": RoadClass(3.0, 1),
+    "service": RoadClass(2.8, 1),
+    "motorway_link": RoadClass(3.6, 1),
+    "trunk_link": RoadClass(3.6, 1),
+    "primary_link": RoadClass(3.5, 1),
+    "secondary_link": RoadClass(3.5, 1),
+    "tertiary_link": RoadClass(3.3, 1),
+    "road": RoadClass(3.5, 1),
+    "crossing": RoadClass(3.2, 1),
+}
+NAMES = tuple(CLASSES)
+"""Names of the classes, indexed by their numbers."""
+NUMBER = {name: number for number, name in enumerate(NAMES)}
+"""Number of a class by its name."""
+UNKNOWN = NUMBER["road"]
+"""Number of the class of a road whose class is unknown."""
+
+VEHICLE_WIDTH_M = 1.8
+"""Width of every vehicle: that of a passenger car."""
+MIN_LANE_WIDTH_M = 2.0
+"""Least width of a lane in a map."""
+MAX_LANE_WIDTH_M = 20.0
+"""Greatest width of a lane in a map: some maps have one strip for all lanes of a road."""
+MAX_LANES = 16
+"""Most lanes of a road in one direction."""
+
+LANE_WIDTH_M: Array = np.array([each.lane_width_m for each in CLASSES.values()])
+"""Default lane widths, indexed by class."""
+LANES = np.array([each.lanes for each in CLASSES.values()])
+"""Default numbers of lanes in each direction, indexed by class."""
+
+
+_ONE_WAY_CLASSES = {"motorway", "motorway_link"}
+"""Classes whose ways are one-way unless tagged otherwise."""
+_ROUND = {"roundabout", "circular"}
+"""Values of `junction` whose ways are one-way unless tagged otherwise."""
+_WIDTH = re.compile(r"(\d{1,4}(?:\.\d{1,9})?)\s*m?")
+
+
+@dataclass(frozen=True)
+class Street:
+    """A way for cars. `lanes` are those in and against its direction.
+
+    `reversed` is true if the direction is against the order of the way's points.
+    """
+
+    kind: int
+    lanes: tuple[int, int]
+    lane_width_m: float
+    reversed: bool
+
+
+def street(tags: Mapping[str, str]) -> Street | None:
+    """Return the attributes of a way, or None if it is not for cars. Invalid values of tags are ignored."""
+    name = tags.get("highway", "")
+    kind = NUMBER.get(name)
+    if kind is None or name == "crossing" or tags.get("area") == "yes" or _closed_to_cars(tags):
+        return None
+    lanes, is_reversed = _lanes(tags, name)
+    lane_width_m = float(LANE_WIDTH_M[kind])
+    width = _WIDTH.fullmatch(tags.get("width", ""))
+    if width and MIN_LANE_WIDTH_M <= float(width[1]) / sum(lanes) <= MAX_LANE_WIDTH_M:
+        lane_width_m = float(width[1]) / sum(lanes)
+    return Street(kind, lanes, lane_width_m, is_reversed)
+
+
+def _closed_to_cars(tags: Mapping[str, str]) -> bool:
+    for key in ("motorcar", "motor_vehicle", "vehicle", "access"):  # the most specific decides
+        if key in tags:
+            return tags[key] == "no"
+    return False
+
+
+def _lanes(tags: Mapping[str, str], name: str) -> tuple[tuple[int, int], bool]:
+    """Return the lanes forward and backward, and true if forward is against the order of the way's points."""
+    is_one_way = name in _ONE_WAY_CLASSES or tags.get("junction") in _ROUND
+    one_way = tags.get("oneway", "yes" if is_one_way else "no")
+    usual, total = CLASSES[name].lanes, _count(tags.get("lanes"))
+    if one_way in ("yes", "true", "1", "-1", "reverse"):
+        return (total or usual, 0), one_way in ("-1", "reverse")
+    forward, backward = _count(tags.get("lanes:forward")), _count(tags.get("lanes:backward"))
+    if total:
+        forward = forward or (max(1, total - backward) if backward else max(1, (total + 1) // 2))
+        backward = backward or max(1, total - forward)
+    return (forward or usual, backward or usual), False
+
+
+def _count(text: str | None) -> int:
+    """Return a number of lanes, or 0 if the tag is missing or invalid."""
+    return int(text) if text and re.fullmatch("[0-9]{1,3}", text) and 1 <= int(text) <= MAX_LANES else 0
+
 
 MAX_POINTS = 5_000_000
 """Most points of a map: ten times those of a large city."""

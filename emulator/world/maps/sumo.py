@@ -14,8 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from emulator.world.buildings import LEAST_CORNERS
-from emulator.world.maps.classes import MAX_LANE_WIDTH_M, MIN_LANE_WIDTH_M, NUMBER, UNKNOWN
-from emulator.world.maps.roads import MAX_POINTS, Roads, RoadsBuilder
+from emulator.world.maps.roads import (
+    MAX_LANE_WIDTH_M,
+    MAX_POINTS,
+    MIN_LANE_WIDTH_M,
+    NUMBER,
+    UNKNOWN,
+    Roads,
+    RoadsBuilder,
+)
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import Frame
 from vnet.errors import ScenarioError, printable, shown

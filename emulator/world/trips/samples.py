@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from emulator.scenario.limits import FAR_S
-from emulator.scenario.node_ids import node_id
+from emulator.scenario.network import node_id
+from emulator.scenario.sections import FAR_S
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import middle_deg, project
 from vnet.errors import ScenarioError, first_names, shown

@@ -17,7 +17,7 @@ from emulator.records.reference import after, reference_series
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from emulator.scenario.scenario import Scenario
-from emulator.world.lateral import lateral_offsets_m
+from emulator.world.trips.motion import lateral_offsets_m
 from vnet.errors import VnetError
 from vnet.node import Node
 from vnet.types import Array

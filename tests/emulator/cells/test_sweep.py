@@ -14,9 +14,9 @@ from emulator.cells import sweep as subject
 from emulator.cells.cells import Cell, compute
 from emulator.cells.measure import WALL_CLOCK, judged_figures
 from emulator.cells.sweep import SweepPlan, parse_shard
-from emulator.cli.sweep import sweep as command
+from emulator.cli.studies import sweep as command
 from emulator.report.sweep_page import Mean, figures_of, heading, mean_of, sweep_page
-from emulator.scenario.source import scenario_of
+from emulator.scenario.loading import scenario_of
 from tests.support.cells import compute_here
 from tests.support.cli import command_app
 from vnet.errors import VnetError

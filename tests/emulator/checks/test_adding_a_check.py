@@ -17,7 +17,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.records.verdicts import CheckResult, Finding, result, unknown
 from emulator.scenario.scenario import Scenario
-from emulator.testing.matrix import count_verdicts
+from emulator.testing.campaign import count_verdicts
 from emulator.world.world import build_world
 
 LIMIT_BYTES = 100

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from emulator.checks.judge import Verdict, check_run, judge
 from emulator.cli.commands import app
 from emulator.records.recorded_run import RecordedRun
-from emulator.scenario.recorded import recorded_code
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario, recorded_code
+from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.harness import RunHarness
 from emulator.testing.scenarios import make_scenario

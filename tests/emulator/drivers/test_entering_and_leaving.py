@@ -16,7 +16,8 @@ from emulator.checks.judge import NotExercised, RecordedRun, Verdict, judge
 from emulator.drivers.simulate import simulate
 from emulator.drivers.status import Course
 from emulator.records.events import Event
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import unpack
 from emulator.stream.playback import messages
 from emulator.viewer.recorder import Recorder

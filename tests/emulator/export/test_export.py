@@ -21,7 +21,7 @@ from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
-from emulator.world.link_table import read_link_table
+from emulator.world.radio_inputs import read_link_table
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.exchange_programs import COPYING, exchange_run
 from tests.support.motion import along, scenario_of_trips, still, write_trips

@@ -8,10 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.faults.plan import FaultPlan, PlannedFault, stream, swizzle_times_ns
-from emulator.faults.selectors import Nodes, partitioned_links, select
-from emulator.scenario.fault_families import Selector
-from emulator.scenario.faults import Partition
+from emulator.faults.plan import FaultPlan, Nodes, PlannedFault, partitioned_links, select, stream, swizzle_times_ns
+from emulator.scenario.faults import Partition, Selector
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
 

@@ -17,7 +17,7 @@ from emulator.pages.text import LONGEST_TEXT, as_text, cell
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import Chart
 from emulator.report.timeline import Timeline
-from emulator.testing.matrix import page as campaign_page
+from emulator.testing.campaign import page as campaign_page
 from tests.support.paths import ROOT
 
 TEMPLATES = ROOT / "emulator" / "pages" / "templates"

@@ -1,6 +1,5 @@
 """The stages of the channel one by one: each decides what is its business, and draws only what it must."""
 
-from dataclasses import replace
 from typing import NamedTuple
 from unittest.mock import Mock
 
@@ -11,14 +10,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from emulator.radio.connectivity import Disc
 from emulator.radio.engine import Engine
-from emulator.radio.frames import Frame, Receptions, Stage
-from emulator.radio.link_faults import ActiveLinkFaults
+from emulator.radio.faults import ActiveLinkFaults
+from emulator.radio.frames import Frame, Receptions, Stage, Transmission
 from emulator.radio.mac import TransmitQueue
 from emulator.radio.outcomes import Outcome
 from emulator.radio.stages import Latency, Loss, in_range, peer_cap, sender_side
-from emulator.radio.topology import Topology
+from emulator.radio.topology import Disc, Topology
 from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of
 from emulator.scenario.scenario import Radio
 
@@ -41,10 +39,19 @@ class Row(NamedTuple):
 
 def frame_of(
     sender: int = 0, seq: int = 0, sent_ns: int = 0, size: int = 100, among: Topology | None = None
-) -> Frame:
+) -> Transmission:
     """A frame that has been sent without taking any time."""
     topology = (among or Topology(np.zeros((1, 2)), Disc(1.0), 1)).now
-    return Frame(sender, seq, sent_ns, size, topology, ActiveLinkFaults(), 6.0, end_ns=sent_ns)
+    frame = Frame(
+        sender=sender,
+        seq=seq,
+        sent_ns=sent_ns,
+        payload=bytes(size),
+        topology=topology,
+        effects=ActiveLinkFaults(),
+        bitrate_mbps=8.0,
+    )
+    return Transmission(frame, end_ns=sent_ns)
 
 
 def sent(
@@ -59,7 +66,7 @@ def sent(
 
 def queued(queue: TransmitQueue, seq: int, sender: int = 0, time_ns: int = 0, size: int = 100) -> int | None:
     """Enqueue a frame of 8 Mb/s; return the end of its transmission, or None if the queue was full."""
-    frame = replace(frame_of(sender, seq, time_ns, size), bitrate_mbps=8.0)
+    frame = frame_of(sender, seq, time_ns, size)
     queue.enqueue(frame)
     assert queue.sent.pop() is frame
     return frame.end_ns if frame.sender_outcome == Outcome.pending else None
@@ -128,10 +135,10 @@ def test_seed_stage_sender_and_sequence_each_give_other_draws() -> None:
 
 def test_a_pair_that_is_decided_stays_decided() -> None:
     strict = radio(loss=1.0, max_payload_bytes=10, max_peers=1)
-    chain = Engine(["a", "b", "c"], strict, 1, np.zeros((3, 2)), None).chain
+    engine = Engine(["a", "b", "c"], strict, 1, np.zeros((3, 2)), None)
     among = Topology(np.zeros((3, 2)), Disc(1.0), 1)
     for decided in set(Outcome) - {Outcome.pending}:
-        for stage in chain:
+        for stage in (*engine.deciding, *engine.timing):
             frame = frame_of(size=11, among=among)
             frame.sender_outcome = Outcome.oversize
             subject = Receptions.of([frame], 3)

@@ -14,8 +14,7 @@ from emulator.faults.plan import PlannedFault
 from emulator.radio.dot11p import AIFSN_AND_CW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome
-from emulator.scenario.fault_families import Fault
-from emulator.scenario.faults import DataReplay, DoS, Duplicate, StaleMessages, Throttle
+from emulator.scenario.faults import DataReplay, DoS, Duplicate, Fault, StaleMessages, Throttle
 from emulator.scenario.scenario import Radio
 
 MS = 1_000_000

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.radio.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
-from emulator.radio.signals import reception_draws
+from emulator.radio.reception import reception_draws
 from emulator.scenario.radio import (
     RATES_MBPS,
 )

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.engine import Engine
-from emulator.radio.obstacles import Obstacles
+from emulator.radio.propagation import Obstacles
+from emulator.radio.topology import connectivity_of, distances_m
 from emulator.scenario.radio import Buildings as Section
 from emulator.scenario.scenario import Radio
 from emulator.world.buildings import Buildings

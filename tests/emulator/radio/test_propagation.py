@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from emulator.radio.connectivity import distances_m
 from emulator.radio.propagation import QUANTILES, Nakagami, ShadowField, loss_db
+from emulator.radio.topology import distances_m
 from emulator.scenario.radio import (
     DualSlope,
     Fading,

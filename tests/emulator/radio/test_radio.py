@@ -11,12 +11,12 @@ from scipy.integrate import quad
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.outcomes import Outcome
 from emulator.radio.propagation import MeanPower, Nakagami
-from emulator.radio.topology import Topology
+from emulator.radio.topology import Topology, connectivity_of, distances_m
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.scenario import Radio, Scenario, dump_scenario, load_scenario
+from emulator.scenario.loading import dump_scenario, load_scenario
+from emulator.scenario.scenario import Radio, Scenario
 from emulator.world.world import build_world
 from tests.support.motion import along, scenario_of_trips, write_trips
 from tests.support.radio import engine, line, nist_qpsk_half

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.radio import topology
-from emulator.radio.connectivity import Disc, Matrix
-from emulator.radio.topology import Topology
+from emulator.radio.topology import Disc, Matrix, Topology
 from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, fault
 from vnet.types import Array
 

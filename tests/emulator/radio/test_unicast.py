@@ -1,6 +1,6 @@
 """Frames to single vehicles: every one ends, is delivered once, and keeps to the rules of 802.11p."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from emulator.radio.dot11p import AIFSN_AND_CW, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.engine import Engine
-from emulator.radio.frames import BROADCAST, Frame
-from emulator.radio.unicast import ACK_BYTES, ACK_TIMEOUT_NS, EIFS_NS, MOST_ATTEMPTS, Result, ack_airtime_ns
+from emulator.radio.frames import Receptions, Result, Transmission
+from emulator.radio.unicast import ACK_BYTES, ACK_TIMEOUT_NS, EIFS_NS, MOST_ATTEMPTS, ack_airtime_ns
 from tests.support.radio import engine, line
 from vnet.radio import SendOptions
 
@@ -238,19 +238,19 @@ def test_a_vehicle_that_comes_back_between_attempts_receives_the_first_that_find
 
 def lose_acknowledgements(subject: Engine) -> Callable[[], None]:
     """Have nobody receive acknowledgements, until what this returns is called."""
-    csma = subject._csma
-    assert csma is not None
-    judge = csma.judge
+    mac = subject._mac
+    judge = mac.judge
 
-    def judge_frames_alone(frame: Frame) -> None:
-        judge(frame)
-        if frame.to == BROADCAST and frame.size_bytes == ACK_BYTES and frame.decoded is not None:
-            frame.decoded[:] = False
+    def judge_frames_alone(transmissions: Sequence[Transmission], receptions: Receptions) -> None:
+        judge(transmissions, receptions)
+        for sent in transmissions:
+            if not sent.attempt and sent.frame.size_bytes == ACK_BYTES and sent.decoded is not None:
+                sent.decoded[:] = False
 
     def hear_again() -> None:
-        csma.judge = judge
+        mac.judge = judge  # type: ignore[method-assign]
 
-    csma.judge = judge_frames_alone
+    mac.judge = judge_frames_alone  # type: ignore[method-assign]
     return hear_again
 
 

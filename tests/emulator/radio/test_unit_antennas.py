@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from emulator.radio.connectivity import distances_m
 from emulator.radio.propagation import MeanPower, loss_db
+from emulator.radio.topology import distances_m
+from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.radio import PathLoss
-from emulator.scenario.roadside import RoadsideUnit
 
 POSITION_M = np.array([[0.0, 0.0], [80.0, 60.0], [-300.0, 0.0]])
 MODELS = [

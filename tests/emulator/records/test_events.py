@@ -10,7 +10,7 @@ import pytest
 
 from emulator.drivers.session import Session
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, KINDS, Event, EventKind, Level, kinds_with
-from emulator.scenario.scenario import load_scenario
+from emulator.scenario.loading import load_scenario
 from tests.support.paths import ROOT
 
 

@@ -12,7 +12,8 @@ from emulator.checks.judge import check_run
 from emulator.records import run_folder
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import TABLES
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.stream.playback import messages
 from tests.emulator.checks.test_judge import run_scenario
 from tests.emulator.scenario.test_sumo import load as sumo_scenario
@@ -186,7 +187,7 @@ def test_a_folder_of_a_later_format_is_refused(inputs: Path, tmp_path: Path) -> 
 
 NAMES = {getattr(run_folder, name) for name in dir(run_folder) if name.endswith("_FILE")}
 NAMES |= {table.file for table in TABLES}
-ELSEWHERE = {"emulator/cells/cells.py", "emulator/world/trips/tables.py", "emulator/world/trips/files.py"}
+ELSEWHERE = {"emulator/cells/cells.py", "emulator/world/trips/files.py"}
 """Modules that read Parquet files, and none of a run's folder."""
 
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from emulator.records.events import KINDS, Event, EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 
 

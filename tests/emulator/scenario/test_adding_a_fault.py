@@ -10,10 +10,9 @@ from pydantic import Field
 
 from docs.generate import faults as fault_page
 from emulator.checks.judge import Verdict, judge
-from emulator.scenario.fault_draws import Drawn
-from emulator.scenario.fault_families import DelayFault, Fault, Probability
-from emulator.scenario.faults import KINDS, parse_fault
-from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
+from emulator.scenario.faults import KINDS, DelayFault, Drawn, Fault, Probability, parse_fault
+from emulator.scenario.loading import dump_scenario, load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import Plan
 from tests.emulator.checks.test_judge import run_scenario
 from vnet.errors import ScenarioError

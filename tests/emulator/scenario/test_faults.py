@@ -10,13 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from emulator.faults.plan import FaultPlan
-from emulator.faults.selectors import Nodes
+from emulator.faults.plan import FaultPlan, Nodes
 from emulator.scenario import faults
-from emulator.scenario.fault_families import Fault
-from emulator.scenario.faults import KINDS, parse_fault
-from emulator.scenario.recorded import parse_recorded_scenario
-from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
+from emulator.scenario.faults import KINDS, Fault, parse_fault
+from emulator.scenario.loading import dump_scenario, load_scenario, parse_recorded_scenario
+from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
 
 REQUIRED: dict[str, dict[str, Any]] = {

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from emulator.cli.commands import app
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
 from vnet.errors import ScenarioError
 from vnet.runtime.programs import search_programs_in

@@ -2,7 +2,7 @@
 
 from pathlib import PurePath
 
-from emulator.scenario.overrides import wrong_value
+from emulator.scenario.loading import wrong_value
 from vnet.errors import OverrideError
 
 

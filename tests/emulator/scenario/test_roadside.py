@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from emulator.scenario.scenario import dump_scenario, load_scenario
+from emulator.scenario.loading import dump_scenario, load_scenario
 
 
 def loaded(tmp_path: Path, text: str) -> str:

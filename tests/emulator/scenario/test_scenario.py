@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from emulator.scenario.scenario import Scenario, dump_scenario, input_digests, load_scenario
+from emulator.scenario.loading import dump_scenario, input_digests, load_scenario
+from emulator.scenario.scenario import Scenario
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError, did_you_mean
 

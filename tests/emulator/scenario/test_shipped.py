@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scenario.recorded import recorded_code
-from emulator.scenario.scenario import load_scenario
-from emulator.scenario.shipped import find_scenario, shipped_names
+from emulator.scenario.loading import find_scenario, load_scenario, recorded_code, shipped_names
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.scenario.overrides import as_overrides, parse_values
-from emulator.scenario.source import scenario_of
+from emulator.scenario.loading import as_overrides, parse_values, scenario_of
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 

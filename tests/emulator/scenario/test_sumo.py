@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scenario.scenario import Scenario, load_scenario
-from emulator.scenario.sumo import input_files, read_begin_s
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.network import input_files, read_begin_s
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from tests.emulator.world.trips.test_files import FCD
 from vnet.errors import ScenarioError

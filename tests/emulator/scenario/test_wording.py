@@ -10,7 +10,8 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from emulator.scenario.faults import KINDS
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError

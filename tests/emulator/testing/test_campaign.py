@@ -16,12 +16,11 @@ from rich.console import Console
 from emulator.cells.worker import WorkerDiedError, WorkerTimeoutError
 from emulator.checks.judge import Verdict
 from emulator.scenario.faults import Pause
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.testing import campaign
-from emulator.testing.campaign import run_campaign
+from emulator.testing.campaign import TEST_FILE, column_of, count_verdicts, failures, page, run_campaign
 from emulator.testing.campaign_plan import Plan
-from emulator.testing.matrix import column_of, count_verdicts, page
-from emulator.testing.regression_test import TEST_FILE, failures
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.trial import TrialPool
 from tests.support import forked_commands

@@ -7,13 +7,11 @@ import pytest
 
 from emulator.checks.judge import Verdict
 from emulator.report.index import write_index
-from emulator.scenario.fault_draws import Drawn
-from emulator.scenario.faults import KINDS, Delay, GnssJump
-from emulator.scenario.scenario import Scenario, load_scenario
-from emulator.testing.campaign_plan import Plan
-from emulator.testing.failure_kinds import FailureKind, failure_kinds
-from emulator.testing.matrix import count_verdicts, page
-from emulator.testing.schedules import parse_ranges, simulated_kinds
+from emulator.scenario.faults import KINDS, Delay, Drawn, GnssJump
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
+from emulator.testing.campaign import FailureKind, count_verdicts, failure_kinds, page
+from emulator.testing.campaign_plan import Plan, parse_ranges, simulated_kinds
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 
@@ -55,7 +53,7 @@ def test_without_faults_the_runs_differ_by_their_seeds() -> None:
 
 def test_a_plan_leaves_the_networks_of_its_runs_to_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = Plan.of(scenario(2.0, 0.5), "random", 2, seed=7)
-    monkeypatch.setattr("emulator.testing.schedules.build_world", None)
+    monkeypatch.setattr("emulator.testing.campaign_plan.build_world", None)
     assert [len(plan.draw(number).fault) > 1 for number in range(2)] == [True, True]
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from emulator.testing.credibility import after_a_fix, compared_with_before, green_runs_needed
+from emulator.testing.campaign import after_a_fix, compared_with_before, green_runs_needed
 
 
 def rows(runs: int, failed: int, check: str = "own:safe") -> list[dict[str, object]]:

@@ -7,14 +7,11 @@ import pytest
 from hypothesis import HealthCheck, Phase, find, given, settings
 from hypothesis.errors import NoSuchExample
 
-from emulator.faults.plan import FaultPlan
-from emulator.faults.selectors import Nodes
-from emulator.scenario.fault_families import Selector
-from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause
+from emulator.faults.plan import FaultPlan, Nodes
+from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause, Selector
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import schedule_toml
-from emulator.testing.campaign_plan import Plan
-from emulator.testing.schedules import ScheduleConstraints, known_kinds, simulated_kinds
+from emulator.testing.campaign_plan import Plan, ScheduleConstraints, known_kinds, simulated_kinds
 from emulator.testing.shrinking import Schedule, shrink
 from emulator.testing.strategies import faults
 from emulator.world.world import build_world

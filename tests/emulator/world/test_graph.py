@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from emulator.world.graph import weak_components
+from emulator.world.neighbours import weak_components
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -11,13 +11,11 @@ from hypothesis import strategies as st
 
 from emulator.checks.judge import judge
 from emulator.export.measured_links import measured_links
-from emulator.radio.connectivity import Measured, connectivity_of
 from emulator.radio.engine import Engine
+from emulator.radio.topology import Measured, connectivity_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Radio, Scenario
-from emulator.world.link_table import LinkTable
-from emulator.world.links import load_links
-from emulator.world.radio_inputs import RadioInputs
+from emulator.world.radio_inputs import LinkTable, RadioInputs, load_links
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 from vnet import Node

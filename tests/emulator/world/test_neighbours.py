@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from emulator.radio.connectivity import distances_m
+from emulator.radio.topology import distances_m
 from emulator.world.neighbours import Links, _candidates, links_within
 from vnet.types import Array
 

@@ -10,8 +10,8 @@ import pytest
 
 from emulator import SensedTruth
 from emulator.drivers.emulation import Emulation
+from emulator.scenario.loading import load_scenario
 from emulator.scenario.program import Program
-from emulator.scenario.scenario import load_scenario
 from emulator.scenario.world import OwnSensor
 from emulator.world.own_sensors import OwnSensors
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of

@@ -11,7 +11,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from emulator.records.recorded_world import RecordedWorld
-from emulator.scenario.scenario import Scenario, input_digests, load_scenario
+from emulator.scenario.loading import input_digests, load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError
 from vnet.types import Array

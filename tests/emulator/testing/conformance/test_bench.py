@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from emulator.testing.conformance.bench import Bench, Said
+from emulator.testing.conformance.scene import Bench, Said
 from vnet.transport.access import Access
 
 

@@ -12,13 +12,11 @@ import pytest
 from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import run_app
-from emulator.testing.conformance import joining, lockstep, realtime
+from emulator.testing.conformance import lockstep, realtime
 from emulator.testing.conformance import scene as scene_module
-from emulator.testing.conformance.bench import Said
 from emulator.testing.conformance.findings import CHECKS, Findings, decoding_problem, described
-from emulator.testing.conformance.inspection import Inspection
 from emulator.testing.conformance.play import SCENES, Conformance
-from emulator.testing.conformance.scene import Scene, SceneOverError
+from emulator.testing.conformance.scene import Inspection, Said, Scene, SceneOverError
 from tests.support.paths import ROOT
 from vnet.errors import VnetError
 from vnet.transport import wire
@@ -152,18 +150,18 @@ def arrange(mistake: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Give what comes a long time, however slow the machine, and what does not come a short one."""
     match mistake:
         case "TakesAnyWelcome":
-            wait_for(monkeypatch, joining, QUIET_S=LONG_S)
+            wait_for(monkeypatch, scene_module, QUIET_S=LONG_S)
         case "YieldsBeforeTheGrant":
             wait_for(monkeypatch, scene_module, QUIET_S=LONG_S)
         case "GivesUpAtOnce":
             wait_for(monkeypatch, scene_module, ORPHAN_TIMEOUT_S=LONG_S)
-            wait_for(monkeypatch, joining, ORPHAN_TIMEOUT_S=LONG_S, AWAY_S=LONG_S)
+            wait_for(monkeypatch, scene_module, ORPHAN_TIMEOUT_S=LONG_S, AWAY_S=LONG_S)
         case "SaysHelloOnce":
-            wait_for(monkeypatch, joining, HELLO_WAIT_S=SHORT_S)
+            wait_for(monkeypatch, scene_module, HELLO_WAIT_S=SHORT_S)
         case "NeverAcknowledges" | "NoLastWords":
             wait_for(monkeypatch, realtime, ACKNOWLEDGE_S=SHORT_S, FINAL_S=SHORT_S)
         case "IgnoresStackRequests":
-            ask = joining.ask_stack
+            ask = scene_module.ask_stack
             monkeypatch.setattr(lockstep, "ask_stack", lambda scene, timeout_s: ask(scene, SHORT_S))
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
-from emulator.world.driven.dynamics import Limits, Longitudinal, advance_limited
+from emulator.world.driven.vehicles import Limits, Longitudinal, advance_limited
 
 LIMITS = Limits(lag_s=0.3, acceleration=3.0, braking=8.0, speed=40.0)
 LAGS = st.sampled_from([0.0, 0.05, 0.3, 2.0])

@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from emulator.scenario.scenario import Scenario
-from emulator.world.driven.map_roads import MapRoads
+from emulator.world.driven.map_driving import MapRoads
+from emulator.world.driven.stepped import DrivenWorld
 from emulator.world.driven.vehicles import COLLISION, LANE_ENDED, LIMITED, DrivenVehicles, Happening
-from emulator.world.driven.world import DrivenWorld
 from emulator.world.world import build_world
 from tests.support.map_files import CROSS, Point, write_map
 from vnet.driving import Action

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emulator.world.driven.rectangles import rectangles_overlap
+from emulator.world.driven.vehicles import rectangles_overlap
 
 
 def test_rectangles_overlap_as_their_points_do() -> None:

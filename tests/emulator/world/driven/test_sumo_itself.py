@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import emulator
 from emulator.records.recorded_run import RecordedRun
-from emulator.scenario.scenario import load_scenario
-from emulator.world.driven.sumo_world import SumoWorld
+from emulator.scenario.loading import load_scenario
+from emulator.world.driven.sumo import SumoWorld
 from emulator.world.world import build_world
 from tests.support.paths import ROOT
 from vnet import Node

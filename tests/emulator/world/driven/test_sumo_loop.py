@@ -27,12 +27,13 @@ from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import map_charts
 from emulator.report.source import Source
-from emulator.scenario.scenario import Scenario, load_scenario, scenario_from
+from emulator.scenario.loading import load_scenario, scenario_from
+from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import unpack
 from emulator.stream.playback import messages
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
-from emulator.world.driven.sumo_world import SumoWorld
+from emulator.world.driven.sumo import SumoWorld
 from emulator.world.world import build_world
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together
 from tests.support.recordings import read_back

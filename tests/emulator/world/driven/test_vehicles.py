@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from emulator.scenario.driven import Driven
+from emulator.scenario.network import Driven
 from emulator.world.driven.vehicles import COLLISION, LIMITED, DrivenVehicles, Happening
 from vnet.driving import Action
 from vnet.errors import ScenarioError

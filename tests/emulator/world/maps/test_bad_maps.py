@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from emulator.world.maps import roads as roads_module
-from emulator.world.maps.files import READERS, read_roads, write_roads
-from emulator.world.maps.osm import CLIPPED
+from emulator.world.maps.files import CLIPPED, READERS, read_roads, write_roads
 from tests.support import maps
 from vnet.errors import ScenarioError
 

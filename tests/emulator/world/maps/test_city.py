@@ -15,13 +15,13 @@ from emulator.cli.commands import app
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.loading import load_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
 from emulator.world.maps.roads import Roads
-from emulator.world.trips.generate import LATERAL_MPS2, LEFT, Side, generate_motion
+from emulator.world.trips.generate import LATERAL_MPS2, LEFT, Network, Side, generate_motion
 from emulator.world.trips.motion import Motion
-from emulator.world.trips.routes import Network
 from emulator.world.world import build_world
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError

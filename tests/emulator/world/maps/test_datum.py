@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from emulator.world.maps.city import city_roads
-from emulator.world.maps.datum import calibrate, moved, residuals
+from emulator.world.maps.problems import calibrate, moved, residuals
 from emulator.world.trips.generate import RIGHT, generate_motion
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError

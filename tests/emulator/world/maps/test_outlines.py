@@ -8,8 +8,8 @@ import pytest
 
 from emulator.scenario.scenario import Scenario
 from emulator.world.buildings import Buildings
-from emulator.world.maps import outlines
-from emulator.world.maps.outlines import read_buildings
+from emulator.world.maps import files
+from emulator.world.maps.files import read_buildings
 from emulator.world.world import build_world
 from tests.support.maps import FRAME, ORIGIN, WAYS, collection, osm_xml, sumo_net
 from tests.support.motion import along, still, write_trips
@@ -183,7 +183,7 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, name: str, text: str, message:
 
 
 def test_the_corners_of_all_parts_of_a_multipolygon_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outlines, "MAX_POINTS", 10)
+    monkeypatch.setattr(files, "MAX_POINTS", 10)
     house = degrees([*HOUSE, HOUSE[0]])
     geometry = {"type": "MultiPolygon", "coordinates": [[house]] * 3}
     path = tmp_path / "town.geojson"

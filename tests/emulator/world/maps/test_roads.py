@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.world.maps.classes import CLASSES, NAMES, NUMBER
-from emulator.world.maps.roads import Roads, RoadsBuilder
+from emulator.world.maps.roads import CLASSES, NAMES, NUMBER, Roads, RoadsBuilder
 
 EAST = [(0.0, 0.0), (100.0, 0.0)]
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from emulator.world.trips.clean import Rules, clean
-from emulator.world.trips.motion import Motion, Selection, motion_of
+from emulator.world.trips.motion import Motion, Rules, Selection, clean, motion_of
 from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
 

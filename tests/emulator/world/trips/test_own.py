@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 import emulator
-from emulator.cli.check import check
+from emulator.cli.folders import check
+from emulator.scenario.loading import load_scenario
 from emulator.scenario.program import Program
-from emulator.scenario.scenario import load_scenario
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
 from tests.support.cli import command_app

@@ -1,28 +1,43 @@
-"""Effects of the acting faults on receptions: losses, delays, duplicates and altered bytes.
+"""Effects of the acting faults of links and senders on frames and receptions.
 
 `LinkFaults.update` takes the faults that act from now on and derives their `effects`, which are kept with every
-frame that is enqueued while they act.
+frame that is enqueued while they act. Senders repeat their own frames, whose payloads the emulator does not read,
+or send what a rule of the user's own says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault, swizzle_times_ns
-from emulator.radio.byte_flips import random_flips
-from emulator.radio.frames import Copied, Frame, Receptions
+from emulator.radio.frames import Copied, CopyNumbers, Frame, Receptions, Transmission, random_flips
 from emulator.radio.mac import Mac
 from emulator.radio.outcomes import PENDING
 from emulator.radio.own_rules import OwnRules, RuledLinks
-from emulator.scenario.fault_families import DelayFault, LossFault
-from emulator.scenario.faults import Corrupt, Custom, Duplicate, Range, Swizzle, Throttle
+from emulator.scenario.faults import (
+    Corrupt,
+    Custom,
+    CustomSender,
+    DataReplay,
+    DelayFault,
+    DoS,
+    Duplicate,
+    LossFault,
+    Range,
+    SenderFault,
+    StaleMessages,
+    Swizzle,
+    Sybil,
+    Throttle,
+)
 from emulator.scenario.random_streams import Draws
 from vnet.types import Array, Mask
-from vnet.units import NS_PER_MS
+from vnet.units import NS_PER_MS, NS_PER_S
 
 _Columns = slice | NDArray[np.intp]
 """Index that takes the columns of a frame's receptions from an array over all nodes (N,)."""
@@ -68,8 +83,9 @@ class ActiveLinkFaults:
         """True if a reception may arrive more than once."""
         return bool(self.copying or self.ruled)
 
-    def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
+    def losses(self, sent: Transmission) -> Iterator[tuple[int, Mask]]:
         """Yield, in the order in which faults act, a fault's number and the columns (M,) that lose the frame."""
+        frame = sent.frame
         at = frame.topology.receivers(frame.sender)
         for number, cut in self.cut:
             yield number, cut[frame.sender][at]
@@ -79,10 +95,11 @@ class ActiveLinkFaults:
         for one in self.losing:
             yield one.planned.number, (_lost(one, frame) & _links(one)[frame.sender])[at]
         for ruled in self.ruled:
-            yield ruled.planned.number, ruled.lost(frame)
+            yield ruled.planned.number, ruled.lost(sent)
 
-    def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
-        """Delay, duplicate or alter the pending receptions of frame number `index`."""
+    def changes(self, sent: Transmission, index: int, receptions: Receptions) -> None:
+        """Delay, duplicate or alter the pending receptions of transmission number `index`."""
+        frame = sent.frame
         pending = receptions.outcome[index] == PENDING
         at: _Columns = slice(None) if receptions.receiver is None else receptions.receiver[index]
         for one in self.delaying:
@@ -102,7 +119,7 @@ class ActiveLinkFaults:
             draws, links = _drawn(one, frame, at)
             _corrupt(one, frame, index, receptions, draws, pending & links)
         for ruled in self.ruled:
-            ruled.change(frame, index, receptions)
+            ruled.change(sent, index, receptions)
 
 
 class LinkFaults:
@@ -204,3 +221,96 @@ def _of_kind(random: Mapping[int, _RandomFault], *kinds: type) -> list[_RandomFa
 def _extra_delay_ns(planned: PlannedFault, draws: Array) -> NDArray[np.int64]:
     assert isinstance(planned.fault, DelayFault), planned.fault
     return np.asarray(np.round(planned.fault.added_ms(draws) * NS_PER_MS), dtype=np.int64)
+
+
+REMEMBERED_FRAMES = 4096
+"""Frames kept of each affected sender, to be sent again."""
+
+
+class SenderFaults:
+    """The acting sender faults, and the frames that affected senders have sent.
+
+    They number copies of frames among `copies`. `ask` returns the payloads that a rule of the user's own sends in
+    place of a frame, none if it drops it.
+    """
+
+    def __init__(
+        self, node_ids: Sequence[str], copies: CopyNumbers, ask: Callable[[PlannedFault, Frame], list[bytes]]
+    ) -> None:
+        self._ask = ask
+        self._node_ids = node_ids
+        self._copies = copies
+        self._acting: dict[int, list[PlannedFault]] = {}
+        self._sent: dict[int, deque[Frame]] = {}
+
+    @property
+    def misbehave(self) -> bool:
+        """True if any sender fault acts."""
+        return bool(self._acting)
+
+    def update(self, active: Sequence[PlannedFault]) -> None:
+        """Let exactly these faults act from now on."""
+        self._acting = {}
+        for planned in active:
+            if isinstance(planned.fault, SenderFault):
+                for node in np.flatnonzero(planned.nodes).tolist():
+                    self._acting.setdefault(node, []).append(planned)
+        self._sent = {node: self._sent.get(node, deque(maxlen=REMEMBERED_FRAMES)) for node in self._acting}
+
+    def frames(self, frame: Frame) -> Iterator[Frame]:
+        """Yield all frames that are sent when a node enqueues one."""
+        acting = self._acting.get(frame.sender, ())
+        if acting:
+            self._sent[frame.sender].append(frame)
+        original = frame
+        for planned in acting:
+            if isinstance(planned.fault, StaleMessages) and (old := self._older(original, planned.fault.age_s)):
+                frame = replace(_again(original, old), cause=planned.number)
+        further: dict[int, list[bytes]] = {}
+        for planned in acting:
+            if isinstance(planned.fault, CustomSender) and not frame.dropped:
+                sent = self._ask(planned, frame)
+                further[planned.number] = sent[1:]
+                if not sent:
+                    frame = replace(frame, cause=planned.number, dropped=True)
+                elif sent[0] != frame.payload:
+                    frame = replace(frame, payload=sent[0], cause=planned.number)
+        yield frame
+        for planned in acting:
+            for index, more in enumerate(further.get(planned.number, ()), start=1):
+                yield self._copy(planned, replace(frame, payload=more), index)
+            yield from self._repeated(planned, frame)
+
+    def _repeated(self, planned: PlannedFault, frame: Frame) -> Iterator[Frame]:
+        match planned.fault:
+            case DoS(factor=factor):
+                for index in range(1, factor):
+                    yield self._copy(planned, frame, index)
+            case Sybil(ghosts=ghosts):
+                for ghost in range(1, ghosts + 1):
+                    yield self._copy(planned, frame, ghost, f"~{ghost}")
+            case DataReplay(age_s=age_s):
+                if old := self._older(frame, age_s):
+                    yield self._copy(planned, replace(_again(frame, old), seq=old.seq), frame.seq - old.seq)
+
+    def _copy(self, planned: PlannedFault, frame: Frame, index: int, suffix: str = "") -> Frame:
+        """Return another copy of a frame; `index` distinguishes the copies that one fault makes of it."""
+        return replace(
+            frame,
+            copy=self._copies.next(frame.sender, frame.seq),
+            draw=(planned.number + 1 << 32) + index,
+            cause=planned.number,
+            name=self._node_ids[frame.sender] + suffix,
+            dropped=False,
+            ticket=0,
+        )
+
+    def _older(self, frame: Frame, age_s: float) -> Frame | None:
+        """Return the latest frame of a frame's sender that is at least `age_s` older, or None."""
+        before_ns = frame.sent_ns - round(age_s * NS_PER_S)
+        return next((sent for sent in reversed(self._sent[frame.sender]) if sent.sent_ns <= before_ns), None)
+
+
+def _again(frame: Frame, old: Frame) -> Frame:
+    """Return a frame that is an older one, sent again now: its payload, power, bit rate and addressee."""
+    return replace(frame, payload=old.payload, gain_db=old.gain_db, bitrate_mbps=old.bitrate_mbps, to=old.to)

@@ -1,15 +1,19 @@
-"""Untrusted CSV files, read within bounds: a file that is not a table is refused before it fills the memory."""
+"""Reading CSV and arrays of numpy that others wrote, with bounds and errors of one line."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
-from vnet.errors import ScenarioError, shown
+import numpy as np
+from numpy.typing import NDArray
+
+from vnet.errors import ScenarioError, printable, shown
 
 MAX_ROWS = 10_000
 """Most rows of a file: the most vehicles of a scenario."""
@@ -65,3 +69,37 @@ def number_within(path: Path, line: int, row: Mapping[str, str | None], column: 
             f"{path}: line {line}: {column} = {shown(row[column])}: a finite number is needed, within ±{most:g}"
         )
     return value
+
+
+def read_arrays(path: Path, names: Iterable[str], largest_bytes: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an NPZ file that are among `names`. Raise ScenarioError if one is larger than allowed.
+
+    No more memory is allocated than the file has content for.
+    """
+    arrays = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = set(archive.namelist())
+            for name in names:
+                if f"{name}.npy" in members:
+                    _check_size(archive, f"{name}.npy", largest_bytes)
+                    with archive.open(f"{name}.npy") as member:
+                        arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen types for a bad file
+        raise ScenarioError(f"{path}: not an NPZ file: {printable(str(error), 300)}") from None
+    return arrays
+
+
+def _check_size(archive: zipfile.ZipFile, name: str, largest_bytes: int) -> None:
+    """Raise ValueError if an array is larger than allowed, or its header claims more than its content."""
+    size = archive.getinfo(name).file_size
+    if size > largest_bytes:
+        raise ValueError(f"{name}: {size:,} bytes; at most {largest_bytes:,} are allowed")
+    with archive.open(name) as member:
+        version = np.lib.format.read_magic(member)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = read(member)
+    if math.prod(shape) * kind.itemsize > size:
+        raise ValueError(f"{name}: {shape} of {kind} in {size:,} bytes")
