@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from docs.generate.keys import key_table
+from docs.generate.keys import HEADER, key_rows, key_table
 from docs.generate.markdown import docstring, table
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.fault_draws import Drawn
@@ -15,8 +15,7 @@ from emulator.testing.schedules import simulated_kinds
 
 INTRODUCTION = """
 A fault is a table `[[fault]]` in a scenario, the arguments of `vnet fault inject`, or those of `emu.fault(…)` in a
-test. [faults.md](../faults.md) says how faults act, and [how to choose them](../how-to/faults.md) shows what one
-writes.
+test. [faults.md](../faults.md) shows how to choose faults, and defines how they act.
 
 ```toml
 [[fault]]
@@ -90,18 +89,11 @@ def _range(law: Drawn) -> str:
 
 
 def _chapter(kinds: Mapping[str, type[Fault]]) -> Iterator[str]:
-    """Yield the table of all kinds of a chapter, and the keys of those that have their own."""
-    own = {name: key_table(kind, without=_without(kind)) for name, kind in kinds.items()}
-    rows = ([_linked(name, own[name]), kind.acts_on, docstring(kind)] for name, kind in kinds.items())
+    """Yield the table of all kinds of a chapter, and one of the keys of those that have their own."""
+    rows = ([f"`{name}`", kind.acts_on, docstring(kind)] for name, kind in kinds.items())
     yield table(["kind", "acts on", "what happens"], rows)
-    for name, keys in own.items():
-        if keys:
-            yield f"### `{name}`"
-            yield keys
-
-
-def _linked(name: str, keys: str) -> str:
-    return f"[`{name}`](#{name.lower()})" if keys else f"`{name}`"
+    keys = [[f"`{name}`", *row] for name, kind in kinds.items() for row in key_rows(kind, without=_without(kind))]
+    yield table(["kind", *HEADER], keys)
 
 
 def _without(kind: type[Fault]) -> tuple[str, ...]:
