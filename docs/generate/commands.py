@@ -72,11 +72,11 @@ def _command(context: typer.Context, shared: Collection[tuple[str, str]]) -> Ite
             rows = ([f"`{_usage(each)}`", each.command.help or ""] for each in below.values())
         yield table(["command", "what it does"], rows)
         if path not in PROGRAMS:
-            takers: dict[tuple[str, str], list[str]] = {}
+            commands_of: dict[tuple[str, str], list[str]] = {}
             for name, each in below.items():
                 for record in _records(each):
-                    takers.setdefault(record, []).append(name)
-            rows = ([f"`{name}`", ", ".join(of), what] for (name, what), of in takers.items())
+                    commands_of.setdefault(record, []).append(name)
+            rows = ([f"`{name}`", ", ".join(of), what] for (name, what), of in commands_of.items())
             yield table(["argument or option", "of", "what"], rows)
     elif _has_chapter(context):
         yield f"## `{path}`"

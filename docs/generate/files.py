@@ -17,7 +17,7 @@ from vnet.units import unit_of
 INTRODUCTION = """
 A run leaves one folder: `runs/NAME-SEED` (with a number where that exists), or what `--out` says. `runs/latest`
 points to the newest. Times are emulated nanoseconds from the start of the run; positions are metres east and north.
-[How to read the tables](../how-to/read-tables.md) has examples.
+[How to read the tables](../how-to/results.md#read-the-tables) has examples.
 
 The folder of a finished run is complete: `vnet check`, `report`, `render`, `play`, `compare`, `export` and `radio`
 give the same results on another machine, without the run's input files, its program, or SUMO. Running it again
@@ -36,7 +36,7 @@ FOLDER = {
     "`calls/`: what each vehicle has sent and reported, and from which line, with `--check-determinism`",
     "files/": "what each vehicle has left on its disk, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` "
     "each. Only regular files of processes that the emulator has started; during a run they are in `disks/`",
-    "report.html": "[the run on one page](../report.md)",
+    "report.html": "[the run on one page](../viewing.md#reports)",
     "recording.rrd": "a Rerun recording, if one was asked for",
     "control.json, operator.json": "the control endpoint for `vnet fault` and `vnet status`, during a live run",
     "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",
@@ -107,7 +107,7 @@ VERDICT = {
     "roadside_units": "number of roadside units",
     "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",
     "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",
-    "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
+    "reported": "[figures of what programs report](../how-to/results.md#report-figures), by name: `reports`, `mean`, `p05`, "
     "`p95`, `last`, `is_share`; of a text `text` and its `share`",
     "cost": "[what the run cost](../how-to/fast.md#what-is-slow): `measured` (of each `program`, or of its "
     "`process`, which stands at its first vehicle), `cpu_s`, `wake_ups` (null in real time), `payload`, the "

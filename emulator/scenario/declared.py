@@ -1,7 +1,7 @@
 """Modules that programs declare: checks and a reference, which run in the emulator's process.
 
 A program's module names one in a constant, `DECLARES = "package.module"`. The constant is read from the source, so
-that no program is imported here. docs/how-to/own-figures.md describes such a module.
+that no program is imported here. docs/how-to/results.md describes such a module.
 """
 
 from __future__ import annotations
