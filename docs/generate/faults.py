@@ -38,7 +38,7 @@ or `--set nodes.count=3` at the command line. Without it, all vehicles are meant
 MISBEHAVIOUR = """
 Named as in VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not know what
 payloads mean: lies in them are a program, `agents.cooperative.attacker:main`, for some vehicles
-([`[[program.exceptions]]`](scenario.md#programexceptions)).
+([`[[program.exceptions]]`](scenario.md#program)).
 """
 INFRASTRUCTURE = """
 Live runs only; a simulation has neither. `router_restart` needs a router of its own, `vnet run --router separate`.

@@ -107,8 +107,8 @@ VERDICT = {
     "roadside_units": "number of roadside units",
     "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",
     "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",
-    "reported": "[figures of what programs report](../how-to/results.md#report-figures), by name: `reports`, `mean`, `p05`, "
-    "`p95`, `last`, `is_share`; of a text `text` and its `share`",
+    "reported": "[figures of what programs report](../how-to/results.md#report-figures), by name: `reports`, "
+    "`mean`, `p05`, `p95`, `last`, `is_share`; of a text `text` and its `share`",
     "cost": "[what the run cost](../how-to/fast.md#what-is-slow): `measured` (of each `program`, or of its "
     "`process`, which stands at its first vehicle), `cpu_s`, `wake_ups` (null in real time), `payload`, the "
     "same of up to 100 `vehicles`, the slowest first, and the number of `processes` of a simulation. The "
