@@ -72,13 +72,13 @@ def _part(title: str, thing: type) -> Iterator[str]:
     yield f"## `{title}`"
     said, _, attributes = docstring(thing).partition("\nAttributes:\n")
     yield said
-    yield table(["attribute", "what"], ([f"`{name}`", sentence(text)] for name, text in _listed(attributes)))
     if dataclasses.is_dataclass(thing) or issubclass(thing, msgspec.Struct | tuple):
         types = {name: getattr(kind, "__forward_arg__", kind) for name, kind in thing.__annotations__.items()}
         rows = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in types.items())
         yield table(["attribute", "type", "unit"], rows)
-    for name, member in _members(thing):
-        yield f"**`{name}`**: {docstring(member)}"
+    yield table(
+        ["property or method", "what"], ([f"`{name}`", docstring(member)] for name, member in _members(thing))
+    )
     if hasattr(thing, "__aiter__"):
         yield WAITING
 
