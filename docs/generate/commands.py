@@ -36,9 +36,8 @@ CHAPTERS = {
     "Look at runs": ("view", "play", "record", "render", "export"),
     "Many runs": ("campaign", "sweep", "conformance"),
     "Networks and maps": ("analyze", "map"),
-    "Studies": ("experiment",),
 }
-"""Commands of `vnet` by chapter."""
+"""Commands of `vnet` by chapter. `vnet experiment` is not vnet's own: `studies/` registers it."""
 PROGRAMS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 Command = Any
 """A command of typer's; typer brings a click of its own, whose classes it does not export."""
@@ -48,13 +47,12 @@ def page() -> str:
     """The whole page."""
     statuses = table(["exit status", "what"], ([str(status), what] for status, what in sorted(STATUSES.items())))
     parts = [INTRODUCTION, statuses, AGENT]
-    below = {
-        name: list(group) for name, group in groupby(_of(PROGRAMS["vnet"], "vnet"), lambda each: _path(each)[1])
-    }
-    for chapter, names in CHAPTERS.items():
-        parts += [f"## {chapter}", *_tables([context for name in names for context in below.pop(name)])]
-    if below:
-        raise KeyError(f"commands without a chapter: {', '.join(below)}")
+    of = {name: list(group) for name, group in groupby(_of(PROGRAMS["vnet"], "vnet"), lambda each: _path(each)[1])}
+    named = {name for names in CHAPTERS.values() for name in names}
+    others = {"Other commands": tuple(sorted(of.keys() - named - {"experiment"}))}
+    for chapter, names in (CHAPTERS | others).items():
+        if found := [context for name in names for context in of.get(name, [])]:
+            parts += [f"## {chapter}", *_tables(found)]
     return whole_page("Commands", *parts, "## `vnet-agent`", *_tables(_of(PROGRAMS["vnet-agent"], "vnet-agent")))
 
 
