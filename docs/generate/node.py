@@ -74,8 +74,8 @@ def _part(title: str, thing: type) -> Iterator[str]:
     yield said
     if dataclasses.is_dataclass(thing) or issubclass(thing, msgspec.Struct | tuple):
         types = {name: getattr(kind, "__forward_arg__", kind) for name, kind in thing.__annotations__.items()}
-        rows = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in types.items())
-        yield table(["attribute", "type", "unit"], rows)
+        fields = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in types.items())
+        yield table(["attribute", "type", "unit"], fields)
     rows = [[f"`{name}`", sentence(text)] for name, text in _listed(attributes)]
     rows += [[f"`{name}`", docstring(member)] for name, member in _members(thing)]
     yield table(["attribute or method", "what"], rows)
