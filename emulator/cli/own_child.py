@@ -14,6 +14,7 @@ from typing import NoReturn
 
 from vnet.runtime import interrupts, running_node
 from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.running_node import LOOK_S, Patience
 
 LONGEST_PATH = 4096
 """Bytes of the path of a run's folder."""
@@ -27,15 +28,18 @@ class OwnChild:
 
     def __init__(self) -> None:
         self._folder = mmap.mmap(-1, LONGEST_PATH)
+        self.ending = "ended"
+        """Word for its end by a vehicle: "ended" or "stalled"."""
 
     def told(self, folder: Path) -> None:
         """Take note of the folder that the run has made; of none, that all is done."""
         self._folder[:] = os.fsencode(folder.absolute() if folder.name else "").ljust(LONGEST_PATH, b"\0")
 
-    def fork(self) -> str | None:
+    def fork(self, stall_limit_s: float) -> str | None:
         """Return None in the child, and in the parent the vehicle that has ended it, "" if unknown.
 
-        The folder of its run is then removed. Where no vehicle has, the parent ends as the child did.
+        The folder of its run is then removed. Where no vehicle has, the parent ends as the child did. A vehicle
+        whose code runs for `stall_limit_s` without a pause ends it, too.
         """
         sys.stdout.flush()
         sys.stderr.flush()
@@ -52,9 +56,14 @@ class OwnChild:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return None
         forwarded: set[int] = set()
+        patience = Patience(running_node.running, stall_limit_s)
         while not (waited := os.waitpid(child, os.WNOHANG))[0]:
-            told = signal.sigwaitinfo(handled)
-            if told.si_signo in FORWARDED:
+            told = signal.sigtimedwait(handled, LOOK_S)
+            if told is None:
+                if patience.is_over(child):
+                    self.ending = "stalled"
+                    os.kill(child, signal.SIGKILL)
+            elif told.si_signo in FORWARDED:
                 if told.si_signo == signal.SIGTERM and signal.SIGTERM in forwarded:
                     os.kill(child, signal.SIGKILL)  # it does not end, as where its main thread has
                 forwarded.add(told.si_signo)
@@ -64,7 +73,7 @@ class OwnChild:
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
         ended = os.waitstatus_to_exitcode(waited[1])
         # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short.
-        if (vehicle or folder) and ended != -signal.SIGKILL and not forwarded:
+        if (vehicle or folder) and (self.ending == "stalled" or ended != -signal.SIGKILL) and not forwarded:
             running_node.running.show("")
             shutil.rmtree(folder, ignore_errors=True)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -150,9 +150,9 @@ def simulate(
         _announce(loaded, asked)
         child, apart = OwnChild(), None
         if processes == "1" and asked.debug is None and may_fork():
-            apart = child.fork()
+            apart = child.fork(loaded.run.stall_timeout_s)
         if apart is not None and not asked.only_the_result:
-            say_first(f"{apart or 'a program'} ended the process of all: again, with a process a vehicle")
+            say_first(f"{apart or 'a program'} {child.ending} the process of all: again, with a process a vehicle")
         with ended_at_once():
             from emulator.cli.execution import Request, run_simulated
 

@@ -30,7 +30,7 @@ from vnet.errors import VnetError
 from vnet.runtime import running_node
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.programs import Programs, error_line
-from vnet.runtime.running_node import RunningNode
+from vnet.runtime.running_node import LOOK_S, Patience, RunningNode
 from vnet.transport import wire
 from vnet.transport.backbone import MessageRef
 
@@ -46,6 +46,10 @@ class Ended(NamedTuple):
 
 class ProcessDiedError(VnetError):
     """A process has ended before its time. Its text says how, and which node's program ran."""
+
+
+class StalledError(VnetError):
+    """A process does not end its window. Its text is the node whose program runs."""
 
 
 class _Said(NamedTuple):
@@ -122,8 +126,15 @@ class ForkedPrograms:
         with suppress(OSError):  # it has ended, which `take` tells, or the error that it has raised before
             self._connection.send_bytes(pickle.dumps(None if turn is None else _Told.of(turn)))
 
-    def take(self) -> Any:
-        """Wait for its answer: a yield, or `Ended`. Raises ProcessDiedError, and what it has raised."""
+    def take(self, stall_limit_s: float) -> Any:
+        """Wait for its answer: a yield, or `Ended`. Raises ProcessDiedError, and what it has raised.
+
+        Raises StalledError if one of its nodes runs for `stall_limit_s` without a pause.
+        """
+        patience = Patience(self._running, stall_limit_s)
+        while not self._connection.poll(LOOK_S):
+            if patience.is_over(self.pid):
+                raise StalledError(self._running.read())
         try:
             said: _Said = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError):

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from emulator.drivers.collector import rare_collections
 from emulator.drivers.emulation import Emulation, PeriodView, ProcessActions
-from emulator.drivers.forked_programs import Ended, ForkedPrograms, ProcessDiedError
+from emulator.drivers.forked_programs import Ended, ForkedPrograms, ProcessDiedError, StalledError
 from emulator.drivers.hosted_programs import NONCE, Changes, HostedPrograms, RunOverError, Turn
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.memory import first_over
@@ -85,19 +85,19 @@ def simulate(
         ):
             simulation.run()
     except KeyboardInterrupt:
-        interrupted = not barrier.is_over_limit
+        interrupted = not barrier.is_cut_short
         if interrupted:
             emulation.folder.event(simulation.now_ns, EventKind.interrupted)
         emulation.finish(simulation.now_ns)
     if (
         apart is not None
-        and not interrupted
+        and not (interrupted or barrier.is_cut_short)
         and not any(each.kind == EventKind.died for each in emulation.folder.events)
     ):
         if not apart:
             raise VnetError("a process of programs ended, and none did when each vehicle had one of its own")
         how = "ended the process of all vehicles, and not one of its own"
-        emulation.folder.event(simulation.now_ns, EventKind.died, apart, how=how)
+        emulation.folder.event(emulation.duration_ns, EventKind.died, apart, how=how)
     return time.monotonic() - started, interrupted
 
 
@@ -149,22 +149,22 @@ class _Barrier:
         self._changes: dict[str, list[Changes]] = {process_id: [] for process_id in self._groups}
         """Changes of the programs of processes, until these are granted their next window."""
         self.stop = stop
-        self.is_over_limit = False
-        """True once a process holds more than `run.memory_limit_mb`."""
+        self.is_cut_short = False
+        """True once a process holds more than `run.memory_limit_mb`, or does not end its window."""
         self.pids = {nodes[0]: os.getpid() for nodes in groups}
         if emulation.scenario.run.memory_limit_mb is not None:
             emulation.watch(self._look_at_memory)
 
     def _look_at_memory(self, view: PeriodView) -> None:
         over = first_over(self._emulation.scenario.run.memory_limit_mb, self.pids)
-        if over is not None and not self.is_over_limit:
-            self.is_over_limit = True
+        if over is not None and not self.is_cut_short:
+            self.is_cut_short = True
             self._emulation.memory_exceeded(self.now_ns, *over, sorted(self._groups[over[0]]))
 
     @property
     def is_ending(self) -> bool:
         """True if the run is to end at the next barrier."""
-        return self.stop.is_set() or self.is_over_limit
+        return self.stop.is_set() or self.is_cut_short
 
     @property
     def now_ns(self) -> int:
@@ -200,9 +200,11 @@ class _Barrier:
         """Take note that a process has ended before its time, and its nodes with it."""
         self._lockstep.died(process_id, how=how)
 
-    def tell_deaths(self) -> None:
-        """Tell of the processes that have died since, where no turn follows."""
-        self._lockstep.tell_deaths()
+    def stalled(self, node: str, limit_s: float) -> None:
+        """Have the run end, since the code of a node runs on and on."""
+        self.is_cut_short = True
+        error = f"no yield within {limit_s:g} s of wall clock"
+        self._emulation.folder.event(self.now_ns, EventKind.stalled, node, error=error)
 
     def _turns(self, grants: Mapping[str, wire.Grant]) -> dict[str, Turn]:
         for actions in self._lockstep.take_actions():
@@ -280,6 +282,7 @@ class _Apart:
         self._welcomes = {nodes[0]: barrier.welcomes(nodes) for nodes in groups}
         self._programs = load_programs(each for welcomes in self._welcomes.values() for each in welcomes)
         self._processes: dict[str, ForkedPrograms] = {}
+        self._limit_s = emulation.scenario.run.stall_timeout_s
 
     @property
     def now_ns(self) -> int:
@@ -315,7 +318,11 @@ class _Apart:
         while turns:
             for process_id, turn in turns.items():
                 self._processes[process_id].give(turn)
-            yields = {process_id: self._take(process_id) for process_id in turns}
+            try:
+                yields = {process_id: self._take(process_id) for process_id in turns}
+            except StalledError as stalled:
+                self._barrier.stalled(str(stalled), self._limit_s)
+                raise KeyboardInterrupt from None
             turns = self._barrier.go_on(
                 {process_id: each for process_id, each in yields.items() if each is not None}
             )
@@ -323,7 +330,7 @@ class _Apart:
     def _take(self, process_id: str) -> Any:
         """Return the answer of a process; None if it has ended before its time, and its vehicles have died."""
         try:
-            return self._processes[process_id].take()
+            return self._processes[process_id].take(self._limit_s)
         except ProcessDiedError as death:
             self._barrier.died(process_id, str(death))
             return None
@@ -334,9 +341,17 @@ class _Apart:
         asked = [process_id for process_id, process in self._processes.items() if not process.owes]
         for process_id in asked:
             self._processes[process_id].give(None)
-        answers: list[Ended | None] = [self._take(process_id) for process_id in asked]
-        ended = [each for each in answers if each is not None]
-        self._barrier.tell_deaths()
+        ended: list[Ended] = []
+        after = ", after the run was over" if time_ns == emulation.duration_ns else ""
+        for process_id in asked:
+            try:
+                ended.append(self._processes[process_id].take(self._limit_s))
+            except (ProcessDiedError, StalledError) as error:
+                how = str(error)
+                if isinstance(error, StalledError):
+                    how = f"did not end within {self._limit_s:g} s, while {error} ran"
+                for welcome in self._welcomes[process_id]:
+                    emulation.died(time_ns, welcome.node, how=f"{how}{after}")
         emulation.take_final(time_ns, [each.final for each in ended])
         cpu_ns, wake_ups = Counter[str](), Counter[str]()
         for each in ended:

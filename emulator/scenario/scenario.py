@@ -71,7 +71,7 @@ class Run(Section):
     """Deviations from FIFO to follow, as far as they fit: the `tape.jsonl` of another run, relative to the scenario
     file, or a list of its lines. With `order = "fifo"`."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
-    """A process that makes no progress for so long (wall clock) ends the run as unknown; lockstep, live."""
+    """A process that makes no progress for so long (wall clock) ends the run as unknown; lockstep."""
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
     """An agent that has lost its emulator for so long (wall clock) ends."""
     spin_limit: int = Field(100_000, ge=100, le=MANY)

@@ -33,7 +33,7 @@ def watch(config: pytest.Config) -> None:
     capture = config.pluginmanager.getplugin("capturemanager")
     name, process = os.memfd_create("vnet-running-node"), os.pidfd_open(os.getpid())
     try:
-        os.ftruncate(name, LONGEST_ID)
+        os.ftruncate(name, LONGEST_ID + 1)
         running_node.running = RunningNode(name)
         with capture.global_and_fixture_disabled() if capture else nullcontext():
             _begun[os.getpid()] = subprocess.Popen(

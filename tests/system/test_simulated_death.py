@@ -56,6 +56,34 @@ def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end:
     assert "v02" in done.stdout
 
 
+@pytest.mark.parametrize("processes", ["1", "2"])
+@pytest.mark.parametrize(
+    ("endless", "kind", "status"),
+    [("while True: pass", "stalled", 3), ("ctypes.CDLL(None).pthread_exit(None)", "died", 1)],
+)
+def test_a_program_that_stalls_ends_the_run_with_its_name(
+    tmp_path: Path, endless: str, kind: str, status: int, processes: str
+) -> None:
+    words = [*command(tmp_path, endless), "--set", "run.stall_timeout_s=1", "--processes", processes]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == status, done.stderr
+    assert "v02" in {event["node"] for event in events(tmp_path / "run") if event["kind"] == kind}
+
+
+@pytest.mark.parametrize("end", ["while True: pass", FAULT])
+def test_what_ends_the_process_after_the_run_is_a_death_then_and_no_earlier(tmp_path: Path, end: str) -> None:
+    words = [*command(tmp_path, "pass"), "--set", "run.stall_timeout_s=1"]
+    program = PROGRAM.replace("END", "pass")
+    ending = f"    finally:\n        if node.id == 'v02':\n            {end}\n"
+    program = program.replace("    async for", "    try:\n     async for") + ending
+    (tmp_path / "deadly.py").write_text(program)
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == 1, done.stderr
+    assert died(tmp_path / "run") == {"v02"}
+    checks = json.loads((tmp_path / "run" / "verdict.json").read_text())["checks"]
+    assert [check["name"] for check in checks if check["verdict"] == "invalid"] == ["agents_alive"]
+
+
 LATER = """
 import atexit, ctypes, os, pathlib, threading
 def end():
@@ -88,9 +116,12 @@ def test_what_a_program_registers_with_atexit_does_not_run(tmp_path: Path, end: 
     assert json.loads((tmp_path / "run" / "verdict.json").read_text())["verdict"] == "valid"
 
 
-def died(folder: Path) -> set[str]:
-    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
-    return {event["node"] for event in events if event["kind"] == "died"}
+def events(folder: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+
+
+def died(folder: Path) -> set[object]:
+    return {event["node"] for event in events(folder) if event["kind"] == "died"}
 
 
 def test_vehicles_that_end_the_process_die_and_no_others(tmp_path: Path) -> None:

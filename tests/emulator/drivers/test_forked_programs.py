@@ -180,7 +180,7 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
     try:
         process.give(None)
         with pytest.raises(VnetError, match="no room for programs"):
-            process.take()
+            process.take(30.0)
     finally:
         process.close()
 
