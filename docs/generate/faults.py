@@ -28,32 +28,31 @@ loss_bad = 0.9
 ```
 """
 COMMON = """
-Faults of vehicles have `nodes` besides; those of links also have `senders` and `receivers`, and act on links with
-an end among `nodes`, from one of `senders`, to one of `receivers`. Each of the three is a selector.
+Faults of vehicles also have `nodes`; those of links also have `senders` and `receivers`, and act on links with an
+end among `nodes`, from one of `senders`, to one of `receivers`. Each of the three is a selector.
 """
 SELECTORS = """
 A selector is a table with one of these keys, or a list of ids: `nodes = { count = 3 }`, `nodes = ["v01", "v02"]`,
-or `--set nodes.count=3` at the command line. Without it, all vehicles are meant.
+or `--set nodes.count=3` at the command line. Without it the fault selects all vehicles.
 """
 MISBEHAVIOUR = """
-Named as in VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not know what
-payloads mean: lies in them are a program, `agents.cooperative.attacker:main`, for some vehicles
+Names are those of VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not
+interpret payloads: [lies in them](../faults.md#in-a-scenario) are a program for some vehicles
 ([`[[program.exceptions]]`](scenario.md#program)).
 """
 INFRASTRUCTURE = """
-Live runs only; a simulation has neither. `router_restart` needs a router of its own, `vnet run --router separate`.
+For live runs only. `router_restart` needs `vnet run --router separate`.
 """
 DRAWN = f"""
 `vnet campaign`, and the strategy `faults` of property tests, draw faults of these kinds. A run of a campaign has
-one to {MOST_FAULTS} of them. A kind is drawn as often as its weight says, relative to the others. A fault starts
-at any hundredth of a second, lasts any number of tenths that fits, and is over `run.settle_s` before the end.
-Parameters that are not listed keep their defaults. All numbers of a range are equally likely; a pair of numbers is
-two draws.
+one to {MOST_FAULTS} of them. Weights are relative. A fault starts at any hundredth of a second, lasts any number of
+tenths that fits, and ends `run.settle_s` before the end. Parameters that are not listed keep their defaults. All
+numbers of a range are equally likely; a pair of numbers is two draws.
 
 `vnet campaign --draw delay.delay_ms=1..2000` draws from another range, in the same steps; it may be repeated.
 """
 RULES = """
-[faults.md](../faults.md#rules-of-your-own) shows how rules are written. They stand in a scenario, or in a test as
+[faults.md](../faults.md#rules-of-your-own) defines rules. They are part of a scenario, or of a test as
 `emu.rule(…)`; a running emulator accepts none.
 """
 NOTES = {"Misbehaviour": MISBEHAVIOUR, "Infrastructure": INFRASTRUCTURE, "Rules of your own": RULES}
