@@ -24,8 +24,8 @@ give the same results on another machine, without input files, program, or SUMO.
 (`vnet run FOLDER/scenario.toml`) needs these.
 """
 FOLDER = {
-    "scenario.toml": "[the scenario](#scenariotoml) with every default, and digests of inputs and code; it reproduces "
-    "the run",
+    "scenario.toml": "[the scenario](#scenariotoml) with every default, and digests of inputs and code; it "
+    "reproduces the run",
     "tape.jsonl": "deviations from FIFO in [the order of events](../orders.md), with `run.order` or `run.tape`",
     "world.npz": "[the rest of the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[events](#eventsjsonl), one a line, written during the run",
