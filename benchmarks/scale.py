@@ -1,7 +1,7 @@
 """Figures of large runs, as a table: `python -m benchmarks scale [--only ROW …] [--runs N] [--write]`.
 
 Each row measures by itself, in runs that are interleaved where it compares two things, and shows the median. A row
-that fails says why in its place. With `--write` the table of `docs/scale.md` gets what was measured.
+that fails says why in its place. With `--write` the table of `docs/benchmarks.md` gets what was measured.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from benchmarks import hosts
 from benchmarks.__main__ import ROOT, event, vnet
 from vnet import Node
 
-PAGE = ROOT / "docs" / "scale.md"
+PAGE = ROOT / "docs" / "benchmarks.md"
 BEGIN, END = "<!-- measured: python -m benchmarks scale --write -->", "<!-- end -->"
 BEACON, COOPERATIVE = "scenarios/beacon.toml", "scenarios/quickstart.toml"
 COOPERATE = ("--program", "agents.cooperative:main")

@@ -1,4 +1,4 @@
-"""The declarations of the cooperative positioning programs; docs/how-to/own-figures.md describes such a module."""
+"""The declarations of the cooperative positioning programs; docs/how-to/results.md describes such a module."""
 
 CHECKS = (
     "agents.cooperative.checks:check_consensus_mean",

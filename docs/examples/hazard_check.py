@@ -1,4 +1,4 @@
-"""A check of hazard.py: everybody in range of the source is warned within 500 ms. docs/how-to/own-checks.md."""
+"""A check of hazard.py: everybody in range of the source is warned within 500 ms. docs/checks.md."""
 
 from __future__ import annotations
 

@@ -10,9 +10,8 @@ from emulator.checks.folder import FOLDER_CHECKS, VERDICT_FILE_CHECK
 from emulator.checks.registry import CHECKS, Check, Subject
 
 INTRODUCTION = """
-Every check of a run, from the table by which `vnet check` judges it. [checks.md](../checks.md) says how the
-verdicts add up. LABEL is the name of a fault, such as `kill-0`. A check
-*of the run* may be invalid; one *of the machine* is a note, or unknown, and never invalid.
+Every check of a run. [checks.md](../checks.md) explains verdicts and classes, and has checks of your own. LABEL is
+the name of a fault, such as `kill-0`.
 """
 FROM_THE_FOLDER = (
     *(

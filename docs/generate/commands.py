@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 from typing import Any
 
 import typer
@@ -15,19 +16,28 @@ from docs.generate.markdown import table
 from emulator.checks.judge import Verdict
 
 INTRODUCTION = """
-`vnet` runs and judges; `vnet-agent` is one process with vehicles in it, which `vnet run` starts by itself. Each
-command tells the same with `--help`.
+`vnet` runs scenarios and judges runs. `vnet-agent` is one process with vehicles; `vnet run` starts these processes
+itself. Each chapter has a table of commands and one of their options; `--help` prints those of one command.
 """
 STATUSES = {
     **{verdict.exit_status: f"the run is {verdict}" for verdict in Verdict},
-    2: "wrong usage, or what cannot be used: a scenario, a folder, a credentials file, a program, an output",
-    70: "a bug in vnet; the line of error says which file has its traceback",
+    2: "wrong usage, or an unusable scenario, folder, credentials file, program or output",
+    70: "a bug in vnet; the error names the file with the traceback",
     130: "interrupted by Ctrl-C",
 }
 AGENT = """
-`vnet-agent` ends with 0 when the run is over, 2 if the program cannot be loaded, 3 if the emulator was not found,
-has refused, or is gone.
+`vnet-agent` ends with 0 when the run is over, 2 if it cannot load the program, and 3 if it does not find the
+emulator, is refused, or loses it.
 """
+CHAPTERS = {
+    "Run a scenario": ("run", "simulate", "demo", "new", "emulator", "host", "access"),
+    "A running emulator": ("status", "fault"),
+    "Judge and compare runs": ("check", "report", "compare", "diff", "radio", "trace"),
+    "Look at runs": ("view", "play", "record", "render", "export"),
+    "Many runs": ("campaign", "sweep", "conformance"),
+    "Networks and maps": ("analyze", "map"),
+}
+"""Commands of `vnet` by chapter. `vnet experiment` is not vnet's own: `studies/` registers it."""
 PROGRAMS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 Command = Any
 """A command of typer's; typer brings a click of its own, whose classes it does not export."""
@@ -37,10 +47,13 @@ def page() -> str:
     """The whole page."""
     statuses = table(["exit status", "what"], ([str(status), what] for status, what in sorted(STATUSES.items())))
     parts = [INTRODUCTION, statuses, AGENT]
-    for name, app in PROGRAMS.items():
-        for context in contexts(name, typer.main.get_command(app)):
-            parts += _command(context)
-    return whole_page("Commands", *parts)
+    of = {name: list(group) for name, group in groupby(_of(PROGRAMS["vnet"], "vnet"), lambda each: _path(each)[1])}
+    named = {name for names in CHAPTERS.values() for name in names}
+    others = {"Other commands": tuple(sorted(of.keys() - named - {"experiment"}))}
+    for chapter, names in (CHAPTERS | others).items():
+        if found := [context for name in names for context in of.get(name, [])]:
+            parts += [f"## {chapter}", *_tables(found)]
+    return whole_page("Commands", *parts, "## `vnet-agent`", *_tables(_of(PROGRAMS["vnet-agent"], "vnet-agent")))
 
 
 def contexts(name: str, command: Command, parent: typer.Context | None = None) -> Iterator[typer.Context]:
@@ -51,21 +64,33 @@ def contexts(name: str, command: Command, parent: typer.Context | None = None) -
         yield from contexts(below, sub, context)
 
 
-def _command(context: typer.Context) -> Iterator[str]:
-    command = context.command
-    yield f"## `{context.command_path}`"
-    yield str(command.help)
-    if commands := getattr(command, "commands", {}):
-        yield table(
-            ["command", "what it does"],
-            ([_link(f"{context.command_path} {name}"), sub.help or ""] for name, sub in commands.items()),
-        )
-        return
-    pieces = " ".join(command.collect_usage_pieces(context)).replace("{", "").replace("}", "")
-    yield f"```text\n{context.command_path} {pieces}\n```"
-    records = [param.get_help_record(context) for param in command.get_params(context) if param.name != "help"]
-    yield table(["argument or option", "what"], ([f"`{name}`", what] for name, what in filter(None, records)))
+def _of(app: typer.Typer, name: str) -> list[typer.Context]:
+    """The commands of a program that are no groups."""
+    found = contexts(name, typer.main.get_command(app))
+    return [each for each in found if not getattr(each.command, "commands", {})]
 
 
-def _link(command: str) -> str:
-    return f"[`{command}`](#{command.replace(' ', '-')})"
+def _path(context: typer.Context) -> list[str]:
+    return context.command_path.split()
+
+
+def _tables(found: Sequence[typer.Context]) -> Iterator[str]:
+    """The commands of a chapter, and their arguments and options: each once, with the commands that take it."""
+    rows = ([f"`{context.command_path} {_pieces(context)}`", str(context.command.help)] for context in found)
+    yield table(["command", "what it does"], rows)
+    commands_of: dict[tuple[str, str], list[str]] = {}
+    for context in found:
+        for record in _records(context):
+            commands_of.setdefault(record, []).append(" ".join(_path(context)[1:]))
+    options = ([f"`{name}`", ", ".join(of), what] for (name, what), of in commands_of.items())
+    yield table(["argument or option", "of", "what"], options)
+
+
+def _pieces(context: typer.Context) -> str:
+    return " ".join(context.command.collect_usage_pieces(context)).replace("{", "").replace("}", "")
+
+
+def _records(context: typer.Context) -> list[tuple[str, str]]:
+    """The arguments and options of a command, as its help shows them."""
+    parameters = [param for param in context.command.get_params(context) if param.name != "help"]
+    return [record for param in parameters if (record := param.get_help_record(context))]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from docs.generate.keys import key_table
+from docs.generate.keys import HEADER, key_rows, key_table
 from docs.generate.markdown import docstring, table
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.faults import KINDS, Drawn, Fault, Selector
@@ -12,8 +12,7 @@ from emulator.testing.campaign_plan import MOST_FAULTS, simulated_kinds
 
 INTRODUCTION = """
 A fault is a table `[[fault]]` in a scenario, the arguments of `vnet fault inject`, or those of `emu.fault(…)` in a
-test. [faults.md](../faults.md) says how faults act, and [how to choose them](../how-to/faults.md) shows what one
-writes.
+test. [faults.md](../faults.md) shows how to choose faults, and defines how they act.
 
 ```toml
 [[fault]]
@@ -26,32 +25,31 @@ loss_bad = 0.9
 ```
 """
 COMMON = """
-Faults of vehicles have `nodes` besides; those of links also have `senders` and `receivers`, and act on links with
-an end among `nodes`, from one of `senders`, to one of `receivers`. Each of the three is a selector.
+Faults of vehicles also have `nodes`; those of links also have `senders` and `receivers`, and act on links with an
+end among `nodes`, from one of `senders`, to one of `receivers`. Each of the three is a selector.
 """
 SELECTORS = """
 A selector is a table with one of these keys, or a list of ids: `nodes = { count = 3 }`, `nodes = ["v01", "v02"]`,
-or `--set nodes.count=3` at the command line. Without it, all vehicles are meant.
+or `--set nodes.count=3` at the command line. Without it the fault selects all vehicles.
 """
 MISBEHAVIOUR = """
-Named as in VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not know what
-payloads mean: lies in them are a program, `agents.cooperative.attacker:main`, for some vehicles
-([`[[program.exceptions]]`](scenario.md#programexceptions)).
+Names are those of VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not
+interpret payloads: [lies in them](../faults.md#in-a-scenario) are a program for some vehicles
+([`[[program.exceptions]]`](scenario.md#program)).
 """
 INFRASTRUCTURE = """
-Live runs only; a simulation has neither. `router_restart` needs a router of its own, `vnet run --router separate`.
+For live runs only. `router_restart` needs `vnet run --router separate`.
 """
 DRAWN = f"""
 `vnet campaign`, and the strategy `faults` of property tests, draw faults of these kinds. A run of a campaign has
-one to {MOST_FAULTS} of them. A kind is drawn as often as its weight says, relative to the others. A fault starts
-at any hundredth of a second, lasts any number of tenths that fits, and is over `run.settle_s` before the end.
-Parameters that are not listed keep their defaults. All numbers of a range are equally likely; a pair of numbers is
-two draws.
+one to {MOST_FAULTS} of them. Weights are relative. A fault starts at any hundredth of a second, lasts any number of
+tenths that fits, and ends `run.settle_s` before the end. Parameters that are not listed keep their defaults. All
+numbers of a range are equally likely; a pair of numbers is two draws.
 
 `vnet campaign --draw delay.delay_ms=1..2000` draws from another range, in the same steps; it may be repeated.
 """
 RULES = """
-[faults.md](../faults.md#rules-of-your-own) shows how rules are written. They stand in a scenario, or in a test as
+[faults.md](../faults.md#rules-of-your-own) defines rules. They are part of a scenario, or of a test as
 `emu.rule(…)`; a running emulator accepts none.
 """
 NOTES = {"Misbehaviour": MISBEHAVIOUR, "Infrastructure": INFRASTRUCTURE, "Rules of your own": RULES}
@@ -87,18 +85,11 @@ def _range(law: Drawn) -> str:
 
 
 def _chapter(kinds: Mapping[str, type[Fault]]) -> Iterator[str]:
-    """Yield the table of all kinds of a chapter, and the keys of those that have their own."""
-    own = {name: key_table(kind, without=_without(kind)) for name, kind in kinds.items()}
-    rows = ([_linked(name, own[name]), kind.acts_on, docstring(kind)] for name, kind in kinds.items())
+    """Yield the table of all kinds of a chapter, and one of the keys of those that have their own."""
+    rows = ([f"`{name}`", kind.acts_on, docstring(kind)] for name, kind in kinds.items())
     yield table(["kind", "acts on", "what happens"], rows)
-    for name, keys in own.items():
-        if keys:
-            yield f"### `{name}`"
-            yield keys
-
-
-def _linked(name: str, keys: str) -> str:
-    return f"[`{name}`](#{name.lower()})" if keys else f"`{name}`"
+    keys = [[f"`{name}`", *row] for name, kind in kinds.items() for row in key_rows(kind, without=_without(kind))]
+    yield table(["kind", *HEADER], keys)
 
 
 def _without(kind: type[Fault]) -> tuple[str, ...]:

@@ -15,42 +15,44 @@ from emulator.records.tables import TABLES, Table
 from vnet.units import unit_of
 
 INTRODUCTION = """
-A run leaves one folder: `runs/NAME-SEED` (with a number where that exists), or what `--out` says. `runs/latest`
-points to the newest. Times are emulated nanoseconds from the start of the run; positions are metres east and north.
-[How to read the tables](../how-to/read-tables.md) has examples.
+A run writes one folder: `runs/NAME-SEED` (with a number if that exists), or that of `--out`. `runs/latest` points
+to the newest. Times are emulated nanoseconds from the start of the run; positions are metres east and north.
+[How to read the tables](../how-to/results.md#read-the-tables) has examples.
 
 The folder of a finished run is complete: `vnet check`, `report`, `render`, `play`, `compare`, `export` and `radio`
-give the same results on another machine, without the run's input files, its program, or SUMO. Running it again
-(`vnet run FOLDER/scenario.toml`) needs them.
+give the same results on another machine, without input files, program, or SUMO. Repeating the run
+(`vnet run FOLDER/scenario.toml`) needs these.
 """
 FOLDER = {
-    "scenario.toml": "[the scenario](#scenariotoml) with every default and digests of what it read; it runs again",
-    "tape.jsonl": "where [the order of events](../orders.md) was not FIFO, with `run.order` or `run.tape`",
-    "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
-    "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
-    "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
+    "scenario.toml": "[the scenario](#scenariotoml) with every default, and digests of inputs and code; it "
+    "reproduces the run",
+    "tape.jsonl": "deviations from FIFO in [the order of events](../orders.md), with `run.order` or `run.tape`",
+    "world.npz": "[the rest of the world](#worldnpz): vehicles, lanes, links",
+    "events.jsonl": "[events](#eventsjsonl), one a line, written during the run",
+    "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and the command that "
+    "reproduces the run",
     "manifest.json": "SHA-256 of each file above, of `logs/` but for `programs.log`, and of `files/`, by its path; "
     "[`vnet check`](../checks.md#the-files-of-a-run) compares them",
-    "logs/": "what each vehicle printed and logged: `v01.log`, …; further incarnations append. `programs.log`: "
-    "what programs of a simulation print on standard output with `--quiet`, `--log-format json` or in a campaign; "
-    "`calls/`: what each vehicle has sent and reported, and from which line, with `--check-determinism`",
-    "files/": "what each vehicle has left on its disk, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` "
-    "each. Only regular files of processes that the emulator has started; during a run they are in `disks/`",
-    "report.html": "[the run on one page](../report.md)",
-    "recording.rrd": "a Rerun recording, if one was asked for",
+    "logs/": "output and log of each vehicle: `v01.log`, …; further incarnations append. `programs.log`: standard "
+    "output of programs of a simulation with `--quiet`, `--log-format json` or in a campaign; `calls/`: frames and "
+    "reports of each vehicle with their lines of code, with `--check-determinism`",
+    "files/": "the disk of each vehicle, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` each. Only "
+    "regular files of processes that the emulator has started; during a run they are in `disks/`",
+    "report.html": "[the run on one page](../viewing.md#reports)",
+    "recording.rrd": "a Rerun recording, with `--rerun`",
     "control.json, operator.json": "the control endpoint for `vnet fault` and `vnet status`, during a live run",
-    "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",
+    "access/": "users and credentials, if `vnet emulator` made them; do not share them with a run",
     "again/": "the repetition that differs, or the last one, with `--check-determinism`",
 }
 SCENARIO = """
-Two sections are not the scenario's own: they hold SHA-256 of what the run has read at its start.
+Two sections are added by the run: SHA-256 of its inputs and its code.
 
 - `[inputs]`: each input file by its path. `vnet run FOLDER/scenario.toml` refuses a file that has changed, by name.
-  Where SUMO is stepped with the run, `libsumo` is its version and build, and another one is refused.
+  With SUMO in the loop, `libsumo` is its version and build, and another one is refused.
 - `[code]`: `program` is one digest of the programs named in `entries` and of every module that they import,
   directly or not, from outside the standard library and site-packages; `vnet` is one digest of vnet's own sources.
-  If either has changed, `vnet run FOLDER/scenario.toml` says so in one line, records it (the event `code_changed`,
-  and the new digests), and goes on. The hash of the trace does not depend on them.
+  If either has changed, `vnet run FOLDER/scenario.toml` reports it in one line, records it (event `code_changed`,
+  and the new digests), and continues. The hash of the trace does not depend on them.
 """
 WORLD_ABOUT = """
 An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.
@@ -60,12 +62,11 @@ KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
 `format` in `verdict.json` is the version of the whole folder.
 
-- 3: there is a `manifest.json`. Without one, checks that compare files with each other make a folder *unknown*
-  where they find something, and not *invalid*.
-- 2: there is a `world.npz`, and `scenario.toml` has a section `[code]`.
-- 1 (vnet 0.1.0): there is neither. Such folders are read. What needs the world, needs the run's input files:
-  `render` and `play`, and, with `radio.links` in a file, checks and radio figures. Names of checks that began with
-  `bit:` are read as `effect:`.
+- 3: the folder has a `manifest.json`. Without one, checks that compare files with each other are *unknown*
+  instead of *invalid*.
+- 2: the folder has a `world.npz`, and `scenario.toml` a section `[code]`.
+- 1 (vnet 0.1.0): it has neither. `render`, `play` and, with `radio.links` in a file, checks and radio figures need
+  the run's input files. Names of checks that began with `bit:` are read as `effect:`.
 
 A folder of a later format is refused, with the version of vnet that wrote it.
 """
@@ -91,29 +92,29 @@ VERDICT = {
     "verdict": "`valid`, `invalid` or `unknown`",
     "checks": "list of {`name`, `verdict`, `text`, `figures`}; `figures.rows` are the first offending rows",
     "not_exercised": "list of {`name`, `reason`}",
-    "trace_sha256": "of the trace's content, however it is stored",
-    "metrics_sha256": "of the metrics' content",
-    "emulated_s": "how far the run came",
-    "start_up_s": "how long the processes took to start and join; 0 if simulated",
+    "trace_sha256": "SHA-256 of the trace's content, independent of its storage",
+    "metrics_sha256": "SHA-256 of the metrics' content",
+    "emulated_s": "emulated length reached",
+    "start_up_s": "time until all processes had joined; 0 if simulated",
     "wall_s": "wall-clock time from time 0 to the end",
     "real_time_factor": "emulated by wall-clock time",
     "seed": "`run.seed`",
     "order": "[the order of events](../orders.md): null in FIFO order, else its kind, its seed, the number of "
     "deviations, and where a given tape was left",
-    "vehicles": "how many",
-    "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
-    "packet_delivery_ratio": "[of broadcasts](../export.md#radio-figures), copies left out; null without any",
+    "vehicles": "number of vehicles",
+    "frames_by_outcome": "receptions by [outcome](#outcomes), copies included",
+    "packet_delivery_ratio": "[of broadcasts](../export.md#radio-figures), without copies; null without any",
     "figures": "means of some metrics, after the first fifth of the run",
     "roadside_units": "number of roadside units",
     "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",
     "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",
-    "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
-    "`p95`, `last`, `is_share`; of a text `text` and its `share`",
+    "reported": "[figures of what programs report](../how-to/results.md#report-figures), by name: `reports`, "
+    "`mean`, `p05`, `p95`, `last`, `is_share`; of a text `text` and its `share`",
     "cost": "[what the run cost](../how-to/fast.md#what-is-slow): `measured` (of each `program`, or of its "
     "`process`, which stands at its first vehicle), `cpu_s`, `wake_ups` (null in real time), `payload`, the "
     "same of up to 100 `vehicles`, the slowest first, and the number of `processes` of a simulation. The "
     "machine decides `cpu_s`: no hash and no comparison has it",
-    "reproduce": "the command that runs it again, from any folder of the machine",
+    "reproduce": "the command that reproduces the run, from any folder of the machine",
     "versions": "of vnet, Python and numpy, and `arithmetic`: which processors compute the same bits",
 }
 
@@ -126,17 +127,17 @@ def page() -> str:
     for each in TABLES:
         about = docstring(each.fields_of) if each.fields_of else each.about
         parts += [f"## `{each.file}`", about, columns(each), each.further]
-    parts += ["## Outcomes", "Each pair of a frame and a receiver has exactly one."]
+    parts += ["## Outcomes", "Each reception has exactly one."]
     public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
     parts += ["## `scenario.toml`", SCENARIO, "## `world.npz`", WORLD_ABOUT, table(WORLD_COLUMNS, world_rows())]
     parts += [
         "## `events.jsonl`",
-        "Each line is an object with `time_ns`, `kind`, `node` (or null) and what is named here.",
+        "Each line is an object with `time_ns`, `kind`, `node` (or null) and these details.",
     ]
     rows = ([f"`{k}`", k.node_is, ", ".join(f"`{name}`" for name in k.details), k.meaning] for k in EventKind)
-    parts.append(table(["kind", "node", "besides", "what happened"], rows))
-    parts += ["## `verdict.json`", "[checks.md](../checks.md) says what each check claims."]
+    parts.append(table(["kind", "node", "details", "what happened"], rows))
+    parts += ["## `verdict.json`", "[checks.md](checks.md) has the claim of each check."]
     parts.append(table(["key", "what"], ([f"`{key}`", what] for key, what in VERDICT.items())))
     parts += ["## Formats", FORMATS]
     return whole_page("What a run leaves", *parts)

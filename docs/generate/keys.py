@@ -33,6 +33,11 @@ _BOUNDS = {
 
 def key_table(model: type[BaseModel], without: Collection[str] = ()) -> str:
     """The keys of `model`, but for those that are sections themselves or that are named; "" if none is left."""
+    return table(HEADER, key_rows(model, without))
+
+
+def key_rows(model: type[BaseModel], without: Collection[str] = ()) -> list[list[str]]:
+    """The rows of `key_table`."""
     schema = model.model_json_schema()
     required = schema.get("required", ())
     said = key_docstrings(model)
@@ -42,7 +47,7 @@ def key_table(model: type[BaseModel], without: Collection[str] = ()) -> str:
             if name not in said:
                 raise LookupError(f"{model.__name__}.{name} has no docstring")
             rows.append(_row(name, {**key, "description": said[name]}, name in required))
-    return table(HEADER, rows)
+    return rows
 
 
 def key_docstrings(model: type[BaseModel]) -> dict[str, str]:

@@ -7,7 +7,7 @@ import inspect
 import textwrap
 from collections.abc import Iterable, Sequence
 
-NOTICE = "<!-- Made by `make docs` from the code that it speaks of; what is written here is overwritten. -->"
+NOTICE = "<!-- Generated from the code by `make docs`; edits here are overwritten. -->"
 
 
 def page(title: str, *parts: str) -> str:

@@ -22,8 +22,8 @@ from vnet.roads.road_map import RoadMap
 from vnet.units import unit_of
 
 INTRODUCTION = """
-A program is one async function of one argument. It needs `from vnet import Node`, and nothing else of vnet; `Fix`
-and `Packet` are there for annotations.
+A program is one async function of one argument. It needs only `from vnet import Node`; `Fix` and `Packet` are for
+annotations.
 
 ```python
 from vnet import Node
@@ -50,16 +50,14 @@ PARTS = {
     "node.map": LaneMap,
     "node.map of a city": RoadMap,
 }
-HOSTS_ONLY = {"sever", "to_wire", "from_wire", "is_sending", "forget_results", "settle"}
+HOSTS_ONLY = {"disconnect", "to_wire", "from_wire", "is_sending", "forget_results", "settle"}
 """Public, but none of a program's business."""
 WAITING = f"""
-`async for` waits for the next one, and goes on until the run ends. The newest {INBOX_LIMIT} that the program has
-not read are kept.
+`async for` waits for the next one until the run ends. The newest {INBOX_LIMIT} unread ones are kept.
 """
 ERRORS = f"""
-`{PayloadTooLargeError.__name__}` is in `vnet.errors`; it has `size_bytes` and `max_payload_bytes`. A program that
-lets an error through has crashed: its vehicle is down from then on, and the run is invalid. An error in a task, a
-callback or a job that is never handled makes it invalid too, and the program goes on:
+`{PayloadTooLargeError.__name__}` is in `vnet.errors`; it has `size_bytes` and `max_payload_bytes`. An error that
+leaves the program, or that a task, callback or job never handles, makes the run invalid:
 [checks.md](../checks.md#exceptions).
 """
 
@@ -74,13 +72,13 @@ def _part(title: str, thing: type) -> Iterator[str]:
     yield f"## `{title}`"
     said, _, attributes = docstring(thing).partition("\nAttributes:\n")
     yield said
-    yield table(["attribute", "what"], ([f"`{name}`", sentence(text)] for name, text in _listed(attributes)))
     if dataclasses.is_dataclass(thing) or issubclass(thing, msgspec.Struct | tuple):
         types = {name: getattr(kind, "__forward_arg__", kind) for name, kind in thing.__annotations__.items()}
-        rows = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in types.items())
-        yield table(["attribute", "type", "unit"], rows)
-    for name, member in _members(thing):
-        yield f"**`{name}`**: {docstring(member)}"
+        fields = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in types.items())
+        yield table(["attribute", "type", "unit"], fields)
+    rows = [[f"`{name}`", sentence(text)] for name, text in _listed(attributes)]
+    rows += [[f"`{name}`", docstring(member)] for name, member in _members(thing)]
+    yield table(["attribute or method", "what"], rows)
     if hasattr(thing, "__aiter__"):
         yield WAITING
 

@@ -8,66 +8,76 @@ from typing import get_args
 from pydantic import BaseModel
 
 from agents.cooperative.options import Options
-from docs.generate.keys import key_docstrings, key_table, option_table, subsections
-from docs.generate.markdown import docstring, sentence
+from docs.generate.keys import HEADER, key_docstrings, key_rows, option_table, subsections
+from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.program import ProgramException, RoadsideUnit
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import OwnSensor
 
 INTRODUCTION = """
-A scenario is a TOML file. Every key has a default, so that an empty file is a run; a key that does not exist is
-refused. `--set SECTION.KEY=VALUE` changes one key at the command line, and each run writes all of them, defaults
-included, into its own `scenario.toml`, with [`[inputs]` and `[code]`](files.md#scenariotoml) besides: digests of
-the files that it read and of its code, so that a change is noticed. [scenarios/](../../scenarios/twelve.toml) has
-examples.
+A scenario is a TOML file. Every key has a default, so an empty file is a run; an unknown key is refused.
+`--set SECTION.KEY=VALUE` changes one key on the command line. Each run writes all keys into its own
+`scenario.toml`, with digests of its inputs and code ([`[inputs]` and `[code]`](files.md#scenariotoml)).
+[scenarios/](../../scenarios/twelve.toml) has examples. A row in bold begins a section below the chapter's own;
+the rows after it are its keys.
 """
+NOT_KEYS = ("exceptions", "sensor")
+"""Keys that are arrays or tables of sections."""
 OPTIONS = """
-What `agents.cooperative:main` and `agents.centralized:main` take; [estimator.md](../estimator.md) explains what
-they do. Other programs have options of their own, in `node.options`.
+Options of `agents.cooperative:main` and `agents.centralized:main`; [estimator.md](../estimator.md) explains them.
+Other programs have options of their own, in `node.options`.
 """
 
 
 def page() -> str:
-    """The whole page."""
-    return whole_page("The scenario file", INTRODUCTION, *_sections("", Scenario), *_options())
+    """The whole page: a chapter for each top section, in whose table the sections below it follow its keys."""
+    parts = [part for name, kinds in subsections(Scenario).items() for part in _chapter(name, kinds[0])]
+    return whole_page("The scenario file", INTRODUCTION, *parts, *_arrays(), *_options())
 
 
-def _sections(path: str, model: type[BaseModel]) -> Iterator[str]:
-    """The section at `path` and all below it."""
-    if path:
-        yield from _section(f"[{path}]", model, without=("exceptions", "sensor"))
+def _chapter(name: str, model: type[BaseModel]) -> Iterator[str]:
+    yield f"## `[{name}]`"
+    yield _about(model)
+    yield table(HEADER, [*key_rows(model, without=NOT_KEYS), *_below(name, model)])
+
+
+def _about(model: type[BaseModel]) -> str:
+    return sentence(docstring(model).partition("`: ")[2])
+
+
+def _below(path: str, model: type[BaseModel]) -> Iterator[list[str]]:
+    """Rows of all sections below `path`: one that names the section or its kind, then its keys."""
     for name, kinds in subsections(model).items():
-        below = f"{path}.{name}" if path else name
+        below = f"{path}.{name}"
         if len(kinds) == 1:
-            yield from _sections(below, kinds[0])
+            yield from _rows(f"[{below}]", _about(kinds[0]), kinds[0], NOT_KEYS)
+            yield from _below(below, kinds[0])
         else:
-            yield from _choice(below, key_docstrings(model).get(name, ""), kinds)
+            yield _title(f"[{below}]", key_docstrings(model).get(name, ""))
+            for kind in kinds:
+                (value,) = get_args(kind.model_fields["kind"].annotation)
+                yield from _rows(f'kind = "{value}"', docstring(kind), kind, ("kind",))
     if path == "world":
-        yield from _section("[world.sensor.NAME]", OwnSensor)
+        yield from _rows("[world.sensor.NAME]", _about(OwnSensor), OwnSensor, ())
     if path == "program":
-        yield from _section("[[program.exceptions]]", ProgramException)
-    if not path:
-        yield from _section("[[roadside]]", RoadsideUnit)
-        yield "## `[[fault]]`"
-        yield "What breaks, where, from when and for how long: [faults.md](faults.md)."
+        yield from _rows("[[program.exceptions]]", _about(ProgramException), ProgramException, NOT_KEYS)
 
 
-def _section(heading: str, model: type[BaseModel], without: tuple[str, ...] = ()) -> Iterator[str]:
-    yield f"## `{heading}`"
-    yield sentence(docstring(model).partition("`: ")[2])
-    yield key_table(model, without)
+def _rows(title: str, about: str, model: type[BaseModel], without: tuple[str, ...]) -> list[list[str]]:
+    return [_title(title, about), *key_rows(model, without)]
 
 
-def _choice(path: str, said: str, kinds: list[type[BaseModel]]) -> Iterator[str]:
-    """A section that is of one of several kinds."""
-    yield f"## `[{path}]`"
-    yield said
-    for kind in kinds:
-        (name,) = get_args(kind.model_fields["kind"].annotation)
-        yield f'### `kind = "{name}"`'
-        yield docstring(kind)
-        yield key_table(kind, without=("kind",))
+def _title(title: str, about: str) -> list[str]:
+    return [f"**`{title}`**", "", "", "", "", about]
+
+
+def _arrays() -> Iterator[str]:
+    yield "## `[[roadside]]`"
+    yield _about(RoadsideUnit)
+    yield table(HEADER, key_rows(RoadsideUnit))
+    yield "## `[[fault]]`"
+    yield "Kind, place, start and duration of a fault: [faults.md](faults.md)."
 
 
 def _options() -> Iterator[str]:

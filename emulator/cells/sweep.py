@@ -98,7 +98,7 @@ def sweep(
     Runs are spread over `executor`, any concurrent.futures.Executor, or over `jobs` processes of this machine
     (default: as many as it has cores). Results are kept in the folder `out`, by default runs/sweep-NAME, with the
     table as sweep.parquet and its page as sweep.html; what is there already is not run again. The columns are the
-    varied keys, `seed`, `verdict`, and every figure: docs/how-to/sweeps.md. Raises VnetError, in one line, for
+    varied keys, `seed`, `verdict`, and every figure: docs/how-to/results.md. Raises VnetError, in one line, for
     input that cannot be used, and KeyboardInterrupt after Ctrl-C: finished runs stay.
     """
     require_importable(program, "sweep")

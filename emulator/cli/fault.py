@@ -87,7 +87,7 @@ def list_faults(run: RunOption = LATEST) -> None:
 def status(
     run: RunOption = LATEST,
     as_json: Annotated[
-        bool, typer.Option("--json", metavar="", help="As one JSON object; docs/terminal.md says what is in it.")
+        bool, typer.Option("--json", metavar="", help="As one JSON object; docs/viewing.md says what is in it.")
     ] = False,
     watch: Annotated[
         bool, typer.Option("--watch", metavar="", help="Go on showing it until the run is over.")

@@ -114,7 +114,8 @@ STATES = Table(
     which=": truth and beliefs",
     further="Then a column for each number (`double`), boolean (`bool`) or text (`string`) that programs report "
             "by a "
-    "name of their own, called as they call it: [own figures](../how-to/own-figures.md). Those after the first 64 "
+    "name of their own, called as they call it: [own figures](../how-to/results.md#report-figures). "
+    "Those after the first 64 "
     "names stay in `values`.",
 )
 BUSY = Table(

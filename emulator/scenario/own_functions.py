@@ -1,7 +1,7 @@
 """Code of the user's own in the emulator's process: importing checks and rules, and what programs declare.
 
 A program's module names one in a constant, `DECLARES = "package.module"`. The constant is read from the source, so
-that no program is imported here. docs/how-to/own-figures.md describes such a module.
+that no program is imported here. docs/how-to/results.md describes such a module.
 """
 
 from __future__ import annotations

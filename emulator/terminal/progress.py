@@ -223,7 +223,7 @@ class PlainLines(_Lines):
 
 
 class JsonLines(_Lines):
-    """One JSON object a line; docs/terminal.md says what is in them."""
+    """One JSON object a line; docs/viewing.md says what is in them."""
 
     every_s = JSON_LINE_EVERY_S
     _phase_told = ""

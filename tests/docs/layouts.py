@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.support.paths import ROOT
 
 PAGE = ROOT / "docs" / "messages.md"
-_SECTION = re.compile(r"^#{2,3} (\w[^\n]*)\n(.*?)(?=^#{2,3} |\Z)", re.MULTILINE | re.DOTALL)
+_SECTION = re.compile(r"^\| \*\*(\w+)\*\* [^\n]*\n(.*?)(?=^\| \*\*|^[^|]|\Z)", re.MULTILINE | re.DOTALL)
 _ROW = re.compile(r"^\| `(\w+)` \| `([^|]+)` \|(.*)\|$", re.MULTILINE)
 _RANGE = re.compile(r"(-?[\d^]+) … (-?[\d^]+)")
 _LIMIT = re.compile(r"([<>]) (-?[\d^]+)")
@@ -53,13 +53,11 @@ class Field:
 
 
 def read_page() -> dict[str, list[Field]]:
-    """The layouts of the page by heading."""
-    layouts = {}
-    for heading, text in _SECTION.findall(PAGE.read_text(encoding="utf-8")):
-        fields = [Field(name, type_, rest.rpartition("|")[0].strip()) for name, type_, rest in _ROW.findall(text)]
-        if fields or "No fields." in text:
-            layouts[heading] = fields
-    return layouts
+    """The layouts of the page by name: a row in bold, and the rows of its fields."""
+    return {
+        name: [Field(field, type_, rest.rpartition("|")[0].strip()) for field, type_, rest in _ROW.findall(rows)]
+        for name, rows in _SECTION.findall(PAGE.read_text(encoding="utf-8"))
+    }
 
 
 def _number(text: str) -> int:

@@ -30,7 +30,7 @@ from vnet.errors import TransportError
 from vnet.transport import session
 from vnet.transport.access import Access
 
-DOCS = (ROOT / "docs" / "terminal.md").read_text()
+DOCS = (ROOT / "docs" / "viewing.md").read_text()
 SHORT = ["scenarios/beacon.toml", "--duration", "3", "--set", "network.vehicles=4"]
 WIDTH, HEIGHT = 90, 24
 CONTROL = re.compile(r"\x1b\[(\??)[\d;]*([A-Za-z])")
@@ -131,7 +131,7 @@ def test_json_for_machines(vnet: Vnet) -> None:
 
 
 def fields_in_the_docs(heading: str) -> set[str]:
-    """The names in the first column of the table under a heading of docs/terminal.md."""
+    """The names in the first column of the table under a heading of docs/viewing.md."""
     _, _, after = DOCS.partition(heading)
     rows = re.findall(r"^\| (`.*?) \|", after.partition("\n\n##")[0].partition("\n\nOn stdout")[0], re.MULTILINE)
     return {name for row in rows for name in re.findall(r"`(\w+)`", row)}
