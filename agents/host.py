@@ -22,7 +22,7 @@ from vnet.runtime.arrivals import Mail
 from vnet.runtime.host import Disks, Host
 from vnet.runtime.process_end import count_as_death, end_within
 from vnet.runtime.programs import Programs, load_programs
-from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
+from vnet.runtime.virtual_time import SkewedLoop, VirtualTimeLoop
 from vnet.transport import wire
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, never_preempt, set_time_slice
@@ -119,13 +119,7 @@ def _run_lockstep(
         host.order_events(loop)
         loop.start_at(next_grant())
         host.start(loop, programs)
-        while True:
-            try:
-                loop.run_forever()
-            except SpinError as spin:
-                host.end_spinning(loop, spin)
-            except SystemExit as leave:
-                host.end_exited(leave)
+        host.run(loop)
     except RunOverError:
         ahead.close()
         attachment.say_so_far(host.unhandled_so_far())

@@ -34,7 +34,7 @@ from vnet.runtime.outside_loop import present_node
 from vnet.runtime.process_end import caught
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.ready_queue import CpuMeter
-from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
+from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
 
 if TYPE_CHECKING:
@@ -256,17 +256,7 @@ class HostedPrograms:
             self._host.order_events(self.loop)
             self._host.start(self.loop, self._programs)
             self.loop.start_at(self._take(self._swap(None)))
-            while True:
-                try:
-                    self.loop.run_forever()
-                except SpinError as spin:
-                    self._host.end_spinning(self.loop, spin)
-                except SystemExit as leave:
-                    self._host.end_exited(leave)
-                except KeyboardInterrupt as leave:
-                    if not self.only_programs_raise():
-                        raise
-                    self._host.end_exited(leave)
+            self._host.run(self.loop, self.only_programs_raise)
         except RunOverError:
             self._close()
         except KeyboardInterrupt:

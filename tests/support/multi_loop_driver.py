@@ -30,7 +30,7 @@ from vnet.runtime.ahead import RunAhead
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.host import Disks, Host
 from vnet.runtime.programs import load_programs
-from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
+from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import backbone_keys, wire
 from vnet.transport.backbone_keys import Contents
 from vnet.transport.wire import SentMessage, WireMessage
@@ -208,13 +208,7 @@ class _Process:
             self._host.order_events(loop)
             loop.start_at(self._next_grant())
             self._host.start(loop, load_programs(self._welcomes))
-            while True:
-                try:
-                    loop.run_forever()
-                except SpinError as spin:
-                    self._host.end_spinning(loop, spin)
-                except SystemExit as leave:
-                    self._host.end_exited(leave)
+            self._host.run(loop)
         except Over:
             self._ahead.close()
             self._host.close(loop)

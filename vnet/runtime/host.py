@@ -22,7 +22,7 @@ from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 from threading import get_ident
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from msgspec.structs import replace
 
@@ -412,7 +412,22 @@ class Host:
     def _tasks_of(self, node: Node) -> list[asyncio.Task[Any]]:
         return [task for task, owner in list(self._tasks.items()) if owner is node and not task.done()]
 
-    def end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
+    def run(self, loop: VirtualTimeLoop, only_programs_raise: Callable[[], bool] = lambda: False) -> NoReturn:
+        """Run the programs until an exchange raises; a busy loop, or an exit, ends its node and no other.
+
+        `only_programs_raise` tells whether a KeyboardInterrupt can only be the programs' own.
+        """
+        while True:
+            try:
+                loop.run_forever()
+            except SpinError as spin:
+                self._end_spinning(loop, spin)
+            except (SystemExit, KeyboardInterrupt) as leave:
+                if isinstance(leave, KeyboardInterrupt) and not only_programs_raise():
+                    raise
+                self._end_exited(leave)
+
+    def _end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
         """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand.
 
         What spins on although it was cancelled loses its callbacks.
@@ -428,7 +443,7 @@ class Host:
             if self._runs(node):
                 self.end(node.id, "spun", str(spin), self.stacks(node.id))
 
-    def end_exited(self, leave: SystemExit | KeyboardInterrupt) -> None:
+    def _end_exited(self, leave: SystemExit | KeyboardInterrupt) -> None:
         """After an exception that left the loop: the task or callback that raised it has ended its node's program.
 
         Raises `leave` if no program has raised it.
@@ -487,7 +502,7 @@ class Host:
                     loop.finish(asyncio_internals.all_done(tasks))
                     break
                 except SystemExit as leave:
-                    self.end_exited(leave)
+                    self._end_exited(leave)
         self._left = asyncio_internals.abandon_pending(tasks)
         del tasks  # it would keep their exceptions from being discarded
         self._settle()

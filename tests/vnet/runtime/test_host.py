@@ -13,7 +13,7 @@ from vnet.roads.lanes import LaneMap
 from vnet.runtime.arrivals import Window
 from vnet.runtime.host import Host
 from vnet.runtime.programs import Program, load_program
-from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
+from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
 
 LANES = LaneMap(np.array([[0.0, 0.0]]), np.array([0.0]), 0.85)
@@ -63,11 +63,7 @@ class World:
     def run(self, program: Program) -> None:
         self.host.start(self.loop, dict.fromkeys(self.host.nodes, program))
         try:
-            while True:
-                try:
-                    self.loop.run_forever()
-                except SpinError as spin:
-                    self.host.end_spinning(self.loop, spin)
+            self.host.run(self.loop)
         except Over:
             self.host.close(self.loop)
         finally:
