@@ -15,6 +15,8 @@ from vnet.errors import VnetError
 
 DEFAULTS = {"--check-determinism": "--check-determinism=layouts"}
 """Values of options that may be given without one."""
+ANY_ARGUMENTS = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+"""Settings of a command that refuses whatever it is asked, its help too."""
 
 
 class _Group(TyperGroup):
@@ -47,10 +49,6 @@ def group(about: str) -> typer.Typer:
         rich_markup_mode=None,
         no_args_is_help=True,
     )
-
-
-ANY_ARGUMENTS = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-"""Settings of a command that refuses whatever it is asked, its help too."""
 
 
 def build_app(wanted: Collection[Command] = COMMANDS) -> typer.Typer:

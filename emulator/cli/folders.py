@@ -24,6 +24,16 @@ from vnet.errors import VnetError, did_you_mean, printable, shown
 from vnet.runtime.programs import error_line, search_programs_in
 from vnet.units import NS_PER_S
 
+LONGEST = 300
+"""Characters of what a run has at a parting."""
+COLUMNS = ("s", "sender", "frame", "bytes", "content", "receivers")
+LONGEST_CONTENT = 200
+"""Characters of a content that are shown."""
+LONGEST_CELL = 100_000
+"""Characters of a cell that are printed where no table is."""
+MOST_BYTES = 32
+"""Bytes of a payload that are shown where nothing decodes it."""
+
 
 def check(
     folder: Annotated[Path, typer.Argument(parser=path_of, metavar="RUN", help="A run's folder.")],
@@ -43,10 +53,6 @@ def check(
         judgement = check_run(folder, own_checks, [from_here(each) for each in check or ()])
         print_checks(judgement, SafeConsole(), RecordedRun.open(folder).record.reproduce)
         raise typer.Exit(judgement.exit_status)
-
-
-LONGEST = 300
-"""Characters of what a run has at a parting."""
 
 
 def diff(
@@ -80,15 +86,6 @@ def _table(found: list[Parting], ours: str, theirs: str) -> Table:
         shown = [Text(printable(text, LONGEST) or "–") for text in (each.first, each.second)]
         table.add_row(f"{each.time_ns / NS_PER_S:.6f}", each.kind, each.node, *shown)
     return table
-
-
-COLUMNS = ("s", "sender", "frame", "bytes", "content", "receivers")
-LONGEST_CONTENT = 200
-"""Characters of a content that are shown."""
-LONGEST_CELL = 100_000
-"""Characters of a cell that are printed where no table is."""
-MOST_BYTES = 32
-"""Bytes of a payload that are shown where nothing decodes it."""
 
 
 def trace(

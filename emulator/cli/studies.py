@@ -30,6 +30,8 @@ from emulator.terminal.standard_output import result_only
 from vnet.errors import VnetError, printable
 
 INTERRUPTED = 130
+RUNS_ON_DASK = 64
+"""Runs of a campaign that wait for Dask's workers at once: more than most clusters have."""
 
 
 def sweep(
@@ -115,10 +117,6 @@ def _varied(text: str) -> tuple[str, list[object]]:
     if not equals:
         raise VnetError(f"--vary {printable(text)}: write it as KEY=VALUES, for example radio.loss=0,0.1,0.3")
     return key.strip(), parse_values(key.strip(), values)
-
-
-RUNS_ON_DASK = 64
-"""Runs of a campaign that wait for Dask's workers at once: more than most clusters have."""
 
 
 def analyze(

@@ -20,6 +20,11 @@ from vnet.errors import ScenarioError, first_names
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
+MIN_DURATION_NS = 0.1
+"""Duration in ns of a fault that was healed before it began: less than an instant, so that it does not act."""
+Selection = tuple[Mask, Mask | None]
+"""The nodes (N,) and the links (N, N) on which a fault acts."""
+
 
 @dataclass(frozen=True)
 class Nodes:
@@ -110,12 +115,6 @@ def _outside_majority(order: NDArray[np.int64]) -> Mask:
     ahead = (index[:, None] - index[None, :]) % count
     others = count // 2  # of a majority, without the node itself: half of them on either side, or one more ahead
     return np.asarray((ahead > (others + 1) // 2) & (count - ahead > others // 2))
-
-
-MIN_DURATION_NS = 0.1
-"""Duration in ns of a fault that was healed before it began: less than an instant, so that it does not act."""
-Selection = tuple[Mask, Mask | None]
-"""The nodes (N,) and the links (N, N) on which a fault acts."""
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ from vnet.units import NS_PER_MS, NS_PER_S
 
 _Columns = slice | NDArray[np.intp]
 """Index that takes the columns of a frame's receptions from an array over all nodes (N,)."""
+REMEMBERED_FRAMES = 4096
+"""Frames kept of each affected sender, to be sent again."""
 
 
 @dataclass
@@ -221,10 +223,6 @@ def _of_kind(random: Mapping[int, _RandomFault], *kinds: type) -> list[_RandomFa
 def _extra_delay_ns(planned: PlannedFault, draws: Array) -> NDArray[np.int64]:
     assert isinstance(planned.fault, DelayFault), planned.fault
     return np.asarray(np.round(planned.fault.added_ms(draws) * NS_PER_MS), dtype=np.int64)
-
-
-REMEMBERED_FRAMES = 4096
-"""Frames kept of each affected sender, to be sent again."""
 
 
 class SenderFaults:

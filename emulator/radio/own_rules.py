@@ -50,6 +50,9 @@ MOST_COPIES = 20
 MOST_FLIPS = 65_000
 MOST_FRAMES = 200
 """Frames that a sender may send in place of one."""
+__all__ = ["Answer", "OwnRules", "RadioFrame", "RuleFailure", "RuledLinks"]
+T = TypeVar("T")
+Rule = Callable[["RadioFrame", dict[str, Any]], Any]
 
 
 class Answer(NamedTuple):
@@ -142,12 +145,6 @@ def _copy_delay_ns(given: Any) -> int:
             f"copy_delay_s = {shown(given)}: a number over 0 and up to {LONGEST_DELAY_S:g} is needed"
         )
     return max(1, round(float(given) * NS_PER_S))
-
-
-__all__ = ["Answer", "OwnRules", "RadioFrame", "RuleFailure", "RuledLinks"]
-
-T = TypeVar("T")
-Rule = Callable[["RadioFrame", dict[str, Any]], Any]
 
 
 @dataclass(frozen=True)

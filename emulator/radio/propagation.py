@@ -42,6 +42,17 @@ the number of vehicles, then decides nothing."""
 
 PathLossModel = FreeSpace | LogDistance | DualSlope | TwoRay
 """A model of the path loss."""
+CELL_M = 20.0
+"""Least side of the cells in which edges are looked up: about the length of a building's edge."""
+MOST_CELLS = 10_000_000
+"""Entries of the table of cells; with enormous buildings cells are larger."""
+MARGIN = 1e-3
+"""Share of a cell by which rays are widened, against rounding, where cells are chosen."""
+FIRST_REACH_M = 50.0
+"""Length over which rays are followed in the first round; then twice as far, and so on."""
+MOST_RAYS = 20_000
+"""Rays that are followed at once, which bounds the memory."""
+Index = NDArray[np.intp]
 
 
 def vehicle_antenna_m(model: PathLossModel) -> float:
@@ -194,20 +205,6 @@ class Nakagami:
             return np.ones(step.shape)
         factor: Array = self._factor[step + shape]
         return factor
-
-
-CELL_M = 20.0
-"""Least side of the cells in which edges are looked up: about the length of a building's edge."""
-MOST_CELLS = 10_000_000
-"""Entries of the table of cells; with enormous buildings cells are larger."""
-MARGIN = 1e-3
-"""Share of a cell by which rays are widened, against rounding, where cells are chosen."""
-FIRST_REACH_M = 50.0
-"""Length over which rays are followed in the first round; then twice as far, and so on."""
-MOST_RAYS = 20_000
-"""Rays that are followed at once, which bounds the memory."""
-
-Index = NDArray[np.intp]
 
 
 class _Cells:

@@ -14,6 +14,9 @@ from emulator.world.neighbours import Links, links_within
 from emulator.world.radio_inputs import LinkTable, RadioInputs
 from vnet.types import Array, IntArray, Mask
 
+MOST_IN_MATRICES = 64
+"""Largest number of vehicles whose links are kept as matrices of all pairs, the fastest way for few vehicles."""
+
 
 class Connectivity(Protocol):
     """A model of the nodes in range of each other; rows are senders, and no node is in range of itself.
@@ -208,10 +211,6 @@ class AboveFloor(_Timeless):
 def _without_itself(in_range: Mask) -> Mask:
     np.fill_diagonal(in_range, False)
     return in_range
-
-
-MOST_IN_MATRICES = 64
-"""Largest number of vehicles whose links are kept as matrices of all pairs, the fastest way for few vehicles."""
 
 
 @dataclass(frozen=True, slots=True)

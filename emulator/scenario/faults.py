@@ -45,6 +45,14 @@ from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
 T = TypeVar("T")
+RENAMED_SELECTORS = {"random": "count"}
+"""Keys of selectors: the old name, and today's."""
+Probability = Annotated[float, Field(ge=0, le=1)]
+Point = tuple[float, float]
+LONGEST_S = 86_400.0
+"""No fault starts later or lasts longer: a day."""
+DEFAULT_RULE = "rule"
+"""Function of a file that is named as a rule without one."""
 
 
 class Chooser(Protocol):
@@ -99,16 +107,6 @@ class Drawn:
     def draw(self, choose: Chooser) -> float:
         """Draw one number."""
         return choose.integer(self.low, self.high) * self.times / self.per
-
-
-RENAMED_SELECTORS = {"random": "count"}
-"""Keys of selectors: the old name, and today's."""
-Probability = Annotated[float, Field(ge=0, le=1)]
-Point = tuple[float, float]
-LONGEST_S = 86_400.0
-"""No fault starts later or lasts longer: a day."""
-DEFAULT_RULE = "rule"
-"""Function of a file that is named as a rule without one."""
 
 
 class Selector(Section):

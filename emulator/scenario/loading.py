@@ -44,6 +44,21 @@ _INTEGERS = range(-(2**63), 2**64)  # what msgpack can carry
 
 _KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{DEEPEST}}}")
+FOLDER = Path(__file__).parent.parent / "scenarios"
+"""In a clone a link to its folder `scenarios/`; in an installation that folder's files."""
+DEFAULT_FUNCTIONS = {
+    "program.entry": "main",
+    "program.checks": "check",
+    "fault.rule": DEFAULT_RULE,
+    "network.function": "network",
+    "world.sensor.model": "sensor",
+}
+"""Functions of a file that is named without one, by key."""
+P = ParamSpec("P")
+T = TypeVar("T")
+Source = str | Path | Mapping[str, Any] | Scenario
+DATA = Path("scenario")
+"""The name of plain data in messages. Relative paths in it are taken from the current folder."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -91,10 +106,6 @@ def _problem(value: Any) -> str:
     except UnicodeEncodeError:
         return "text in UTF-8 is needed"
     return ""
-
-
-FOLDER = Path(__file__).parent.parent / "scenarios"
-"""In a clone a link to its folder `scenarios/`; in an installation that folder's files."""
 
 
 def shipped_names() -> list[str]:
@@ -185,16 +196,6 @@ def _value(text: str) -> Any:
         return parse_toml(f"value = {text}")["value"]
     except ValueError:
         return text.strip()
-
-
-DEFAULT_FUNCTIONS = {
-    "program.entry": "main",
-    "program.checks": "check",
-    "fault.rule": DEFAULT_RULE,
-    "network.function": "network",
-    "world.sensor.model": "sensor",
-}
-"""Functions of a file that is named without one, by key."""
 
 
 def with_modules(program: Program, base: Path | None, checks: Sequence[str] = (), source: str = "") -> Program:
@@ -523,13 +524,6 @@ def _with_new_selectors(fault: Any) -> Any:
         else value
         for name, value in fault.items()
     }
-
-
-P = ParamSpec("P")
-T = TypeVar("T")
-Source = str | Path | Mapping[str, Any] | Scenario
-DATA = Path("scenario")
-"""The name of plain data in messages. Relative paths in it are taken from the current folder."""
 
 
 def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str] = ()) -> Scenario:

@@ -21,6 +21,18 @@ from vnet.units import NS_PER_S
 LIBSUMO = "libsumo"
 """The package that has SUMO as a library, and its name among the inputs of a run."""
 VehicleId = Annotated[str, Field(min_length=1, max_length=200)]
+LARGEST_BYTES = 1 << 20
+LATEST_S = 1e9
+_UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.]|^[_.]")
+"""Characters of an id that are escaped where one of them cannot be part of a key."""
+Speed = Annotated[float, Field(ge=0, le=100)]
+Place = Annotated[float, Field(ge=0, le=100_000)]
+OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
+"""Keys of `[network]` for vehicles that move."""
+NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
+Shift = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
+OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]
 
 
 class Sumo(Section):
@@ -44,11 +56,6 @@ def libsumo_build() -> str | None:
         return None
     tags = [line for line in (found.read_text("WHEEL") or "").splitlines() if line.startswith("Tag: ")]
     return " ".join([found.version, *sorted({tag.rpartition("-")[2] for tag in tags})])
-
-
-LARGEST_BYTES = 1 << 20
-LATEST_S = 1e9
-_UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 
 
 def input_files(path: Path) -> list[Path]:
@@ -106,10 +113,6 @@ def _values(path: Path) -> dict[str, str]:
     return values
 
 
-_UNSAFE = re.compile(r"[^A-Za-z0-9_.]|^[_.]")
-"""Characters of an id that are escaped where one of them cannot be part of a key."""
-
-
 def node_id(given: str) -> str:
     """Return the id of a node for an id in a file: itself if keys can hold it, else with characters escaped.
 
@@ -121,10 +124,6 @@ def node_id(given: str) -> str:
         return given
     escaped = _UNSAFE.sub(lambda found: f"-{ord(found[0]):x}-", given)
     return f"x{escaped}" if escaped.startswith("-") else escaped
-
-
-Speed = Annotated[float, Field(ge=0, le=100)]
-Place = Annotated[float, Field(ge=0, le=100_000)]
 
 
 class Driven(Section):
@@ -215,13 +214,6 @@ class Ranging(Section):
 def control_step_ns(control_hz: float) -> int:
     """Return the time between two control instants in nanoseconds."""
     return round(NS_PER_S / control_hz)
-
-
-OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
-"""Keys of `[network]` for vehicles that move."""
-NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
-Shift = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
-OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]
 
 
 class Network(Section):

@@ -22,6 +22,7 @@ from emulator.scenario.program import Program
 from vnet.errors import ScenarioError, VnetError, printable
 
 LONGEST_ERROR = 300
+CONSTANT = "DECLARES"
 
 
 class NonsenseError(VnetError):
@@ -70,9 +71,6 @@ def line_of(frames: TracebackType | None) -> str:
         return ""
     last = [frame for frame in extracted if frame.filename == extracted[0].filename][-1]
     return f"{Path(last.filename).name}:{last.lineno}"
-
-
-CONSTANT = "DECLARES"
 
 
 def declared(program: Program, name: str) -> list[Any]:

@@ -15,6 +15,8 @@ from vnet.errors import ScenarioError, shown
 
 _MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
+Coordinate = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
+NodeId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 
 
 def split_file(entry: str) -> tuple[str, str] | None:
@@ -87,10 +89,6 @@ class Program(OneProgram):
     def of(self, node: str) -> OneProgram:
         """Return the program of `node`."""
         return next((exception for exception in self.exceptions if node in exception.nodes), self)
-
-
-Coordinate = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
-NodeId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 
 
 class RoadsideUnit(Section):

@@ -63,6 +63,26 @@ WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 NO_FAULTS = "no faults"
 """Row of the runs without any fault."""
 Matrix = Mapping[str, Mapping[str, Counter[Verdict]]]
+_NUMBERS = re.compile(r"(\.py:\d+)|\b0x[0-9a-f]+\b|\d+(?:[.,]\d+)*|'[^']*'")
+"""Parts of a text that differ from run to run: numbers, names of vehicles, and what is quoted; lines do not."""
+ALPHA = 0.05
+"""Probability of error, both of the bound of the rate and of as many green runs by chance."""
+TEST_FILE = "test_failure.py"
+TEXT = '''"""Failure {number} of a campaign: {checks}. Written by vnet; `pytest {file}` runs it."""
+
+from pathlib import Path
+
+from emulator.testing.campaign import failures
+
+
+def test_failure_{name}(tmp_path: Path) -> None:
+    scenario = Path(__file__).with_name("scenario.toml")
+    assert failures(scenario, tmp_path / "run", limit_s={limit_s:g}{twice}) == {{}}
+'''
+FAILURE_PAGE = "failure.html"
+NS_PER_US = 1000
+FORMAT = 1
+WRITE_EVERY = 20
 
 
 def column_of(check: str) -> tuple[str, str | None]:
@@ -115,10 +135,6 @@ def _cell(counts: Counter[Verdict]) -> tuple[Counter[Verdict], Verdict | None]:
     return counts, next((verdict for verdict in WORST_FIRST if counts[verdict]), None)
 
 
-_NUMBERS = re.compile(r"(\.py:\d+)|\b0x[0-9a-f]+\b|\d+(?:[.,]\d+)*|'[^']*'")
-"""Parts of a text that differ from run to run: numbers, names of vehicles, and what is quoted; lines do not."""
-
-
 @dataclass(frozen=True)
 class FailureKind:
     """Runs in which a check failed in one way: their count, and number and text of the first."""
@@ -143,10 +159,6 @@ def failure_kinds(failures: Iterable[tuple[str, Mapping[str, str]]]) -> list[Fai
             before = kinds.get(key)
             kinds[key] = kind if before is None else replace(before, runs=before.runs + 1)
     return sorted(kinds.values(), key=lambda kind: -kind.runs)
-
-
-ALPHA = 0.05
-"""Probability of error, both of the bound of the rate and of as many green runs by chance."""
 
 
 def green_runs_needed(failed: int, runs: int, alpha: float = ALPHA) -> int:
@@ -199,20 +211,6 @@ def compared_with_before(before: Sequence[Mapping[str, Any]], now: Sequence[Mapp
             yield f"{was}, and in none of {len(now)} now: a fix is credible from {needed} runs on ({1 - ALPHA:.0%})"
 
 
-TEST_FILE = "test_failure.py"
-TEXT = '''"""Failure {number} of a campaign: {checks}. Written by vnet; `pytest {file}` runs it."""
-
-from pathlib import Path
-
-from emulator.testing.campaign import failures
-
-
-def test_failure_{name}(tmp_path: Path) -> None:
-    scenario = Path(__file__).with_name("scenario.toml")
-    assert failures(scenario, tmp_path / "run", limit_s={limit_s:g}{twice}) == {{}}
-'''
-
-
 def regression_test(number: str, checks: Sequence[str], limit_s: float) -> str:
     """Return the test of the failure of this number, of these checks, whose run may take `limit_s` seconds."""
     name = "".join(character if character.isalnum() else "_" for character in number)
@@ -235,10 +233,6 @@ def failures(scenario: Path, folder: Path, limit_s: float, twice: bool = False) 
     finally:
         pool.close()
     return {name: trial.texts[name] for name in trial.failed}
-
-
-FAILURE_PAGE = "failure.html"
-NS_PER_US = 1000
 
 
 def write_failure_page(folder: Path, title: str, checks: Mapping[str, str], explanation: Explanation) -> Path:
@@ -264,10 +258,6 @@ def shown_parting(explanation: Explanation) -> dict[str, Any]:
     rows = table(explanation.rows()) if explanation.partings else None
     node = explanation.partings[0].node if explanation.partings else ""
     return {"line": explanation.line(), "rows": rows, "node": node, "until": explanation.until}
-
-
-FORMAT = 1
-WRITE_EVERY = 20
 
 
 @dataclass(frozen=True)

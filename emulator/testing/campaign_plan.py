@@ -32,6 +32,15 @@ AT_STEPS, DURATION_STEPS = 100, 10
 """Faults start on hundredths of a second and last tenths."""
 LEAST_TIME_S = 1 / DURATION_STEPS
 """Least time that a run must leave for faults."""
+Ranges = Mapping[str, Mapping[str, Drawn]]
+"""Ranges of parameters by kind and key, in place of those of the kinds."""
+LONGEST_S = 20.0
+MOST_FAULTS = 4
+SEEDS = 2**63
+RANDOM, NONE = "random", "none"
+"""Faults of all kinds, and none drawn: then the runs differ by their seeds."""
+SHRINK_STEPS = 250
+"""Runs that shrink a failure: of its order, then of its faults, then of its vehicles and seconds."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +75,6 @@ def known_kinds(kinds: Sequence[str] | None) -> tuple[str, ...]:
         if kind not in known:
             raise ScenarioError(f"fault {kind!r}{did_you_mean(kind, known)}: must be one of {', '.join(known)}")
     return tuple(kinds) if kinds else known
-
-
-Ranges = Mapping[str, Mapping[str, Drawn]]
-"""Ranges of parameters by kind and key, in place of those of the kinds."""
 
 
 def parse_ranges(texts: Sequence[str]) -> Ranges:
@@ -122,15 +127,6 @@ def draw_fault(
     times = {"kind": kind, "at_s": at_s, "duration_s": choose.integer(1, longest) / DURATION_STEPS}
     target = KINDS[kind].draw_target(choose, constraints.processes)
     return parse_fault(times | target | KINDS[kind].draw_parameters(choose, (ranges or {}).get(kind)))
-
-
-LONGEST_S = 20.0
-MOST_FAULTS = 4
-SEEDS = 2**63
-RANDOM, NONE = "random", "none"
-"""Faults of all kinds, and none drawn: then the runs differ by their seeds."""
-SHRINK_STEPS = 250
-"""Runs that shrink a failure: of its order, then of its faults, then of its vehicles and seconds."""
 
 
 @dataclass(frozen=True)

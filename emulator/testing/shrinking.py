@@ -15,6 +15,13 @@ from vnet.errors import VnetError
 Schedule = tuple[Fault, ...]
 SHORTEST_S = 0.1
 MOST_STEPS = 50
+MOST_ORDER_STEPS = 150
+"""Runs that shrink an order."""
+SHORTEST_RUN_S = 0.2
+MOST_SHOWN = 5
+"""Deviations that a phrase tells."""
+T = TypeVar("T")
+Fails = Callable[[Scenario], bool]
 
 
 def shrink(
@@ -70,15 +77,6 @@ def _shorter(fault: Fault) -> Iterator[Fault]:
     half_s = max(SHORTEST_S, round(fault.duration_s / 2, 1))
     if half_s < fault.duration_s:
         yield fault.model_copy(update={"duration_s": half_s})
-
-
-MOST_ORDER_STEPS = 150
-"""Runs that shrink an order."""
-SHORTEST_RUN_S = 0.2
-MOST_SHOWN = 5
-"""Deviations that a phrase tells."""
-T = TypeVar("T")
-Fails = Callable[[Scenario], bool]
 
 
 def with_faults(scenario: Scenario, schedule: Schedule) -> Scenario:

@@ -25,6 +25,11 @@ LONGEST_LINE = 10_000
 FARTHEST_M = 100 * WILD_M
 """Largest recorded error."""
 _COMPONENT = re.compile(r"(.+_|)(?:east|north)_m")
+M_PER_KM = 1000.0
+SLOWEST_MPS = 1e-9
+"""Speed of a vehicle that stands, as a divisor."""
+EVERY = slice(None)
+"""All periods."""
 
 
 @dataclass(frozen=True)
@@ -125,13 +130,6 @@ def _number(path: Path, line: int, name: str, text: str | None) -> float:
     if not math.isfinite(number):
         raise ScenarioError(f"{path}: line {line}: {name} = {shown(text)}: a finite number is needed")
     return number
-
-
-M_PER_KM = 1000.0
-SLOWEST_MPS = 1e-9
-"""Speed of a vehicle that stands, as a divisor."""
-EVERY = slice(None)
-"""All periods."""
 
 
 def noise_m(scenario: Scenario, periods: int, count: int) -> Array:

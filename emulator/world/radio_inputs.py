@@ -27,6 +27,8 @@ MOST_ROWS = 5_000_000
 """Rows of a file; they are checked one by one."""
 _LONGEST_LINE = 1000
 """Characters of a line."""
+_LONGEST_MATRIX_LINE = 10 * MAX_ROWS
+"""Characters of a line: an entry may be written as `1.000000,`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +149,6 @@ def _probability(path: Path, line: int, text: str) -> float:
         needed = "0 to 1, or nothing out of range, is needed"
         raise ScenarioError(f"{path}: line {line}: loss = {shown(text)}: {needed}")
     return loss
-
-
-_LONGEST_MATRIX_LINE = 10 * MAX_ROWS
-"""Characters of a line: an entry may be written as `1.000000,`."""
 
 
 def load_links(radio: Radio, node_ids: Sequence[str]) -> NDArray[np.bool_] | LinkTable | None:

@@ -20,6 +20,35 @@ from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 
 Ints = NDArray[np.intp]
+INDEX_STEP_M = 40.0
+"""Distance (m) between two points of the index on a segment: a square or two."""
+MAX_INDEXED = 1_000_000
+"""Number of points in the index besides one a segment: 64 MB. It is coarser for a map that would need more."""
+SQUARE_M = 25.0
+"""Side (m) of the index's squares: about the distance within which lanes are sought."""
+HEADING_TOLERANCE_RAD = 0.35
+"""Difference (rad) of the headings of a vehicle and its lane: 20°, more than in a lane change."""
+FARTHEST_M = 1e8
+"""Largest coordinate and length (m) in a map that comes in a message: twice the circumference of the Earth."""
+TAG = "roads"
+"""Tag of a map's plain form."""
+MAX_CLASSES = 255
+"""Number of road classes in a map: their index is one byte."""
+MAX_CLASS_LENGTH = 64
+"""Characters of a class's name."""
+_COLUMNS = {
+    "point_m": "<f8",
+    "heading_rad": "<f8",
+    "length_m": "<f8",
+    "half_width_m": "<f8",
+    "kind": "|u1",
+    "one_way": "|b1",
+    "road": "<i4",
+    "lane": "<i4",
+}
+"""Number format of each column in a message."""
+_DEVIATIONS = ("sigma_m", "datum_sigma_m")
+"""Numbers of a whole map."""
 
 
 class Grid:
@@ -66,37 +95,6 @@ def ranges(label: Ints, start: Ints, end: Ints) -> tuple[Ints, Ints]:
     until = np.cumsum(count)
     total = int(until[-1]) if len(until) else 0
     return np.repeat(label, count), np.arange(total) + np.repeat(start - until + count, count)
-
-
-INDEX_STEP_M = 40.0
-"""Distance (m) between two points of the index on a segment: a square or two."""
-MAX_INDEXED = 1_000_000
-"""Number of points in the index besides one a segment: 64 MB. It is coarser for a map that would need more."""
-SQUARE_M = 25.0
-"""Side (m) of the index's squares: about the distance within which lanes are sought."""
-HEADING_TOLERANCE_RAD = 0.35
-"""Difference (rad) of the headings of a vehicle and its lane: 20°, more than in a lane change."""
-FARTHEST_M = 1e8
-"""Largest coordinate and length (m) in a map that comes in a message: twice the circumference of the Earth."""
-TAG = "roads"
-"""Tag of a map's plain form."""
-MAX_CLASSES = 255
-"""Number of road classes in a map: their index is one byte."""
-MAX_CLASS_LENGTH = 64
-"""Characters of a class's name."""
-_COLUMNS = {
-    "point_m": "<f8",
-    "heading_rad": "<f8",
-    "length_m": "<f8",
-    "half_width_m": "<f8",
-    "kind": "|u1",
-    "one_way": "|b1",
-    "road": "<i4",
-    "lane": "<i4",
-}
-"""Number format of each column in a message."""
-_DEVIATIONS = ("sigma_m", "datum_sigma_m")
-"""Numbers of a whole map."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,29 @@ LEASE_MS = 60_000
 POLL_S = 0.02
 KILL_WAIT_S = 5.0
 PLACEHOLDERS = ("{endpoint}", "{run}", "{node}", "{credentials}")
+OF_TRAFFIC = ("own_node", "payload", "sends", "numbers", "report_time")
+OF_YIELDS = ("timers", "steps", "wakes", *OF_TRAFFIC)
+SLACK_NS = 50_000_000
+"""Real time: how much the two clocks of one machine may seem to differ."""
+OLDEST_NS = 1_000_000_000
+"""Real time: a report is on its way for less than this."""
+ORPHAN_TIMEOUT_S = 1.0
+"""Time that an agent waits for an emulator that is gone, as the welcome says."""
+QUIET_S = 0.3
+"""Time that a scene listens for messages that must not come."""
+SHORTEST_NONCE = 8
+OTHERS_NONCE = b"of another session"
+PAYLOADS = (b"a packet", b"", b"\xc1 no msgpack", b"\x81\xa1x")
+"""Payloads of the packets that the agent receives, in turn: the radio may bring anything."""
+M = TypeVar("M", bound=wire.AgentMessage)
+START_UP_S = 20.0
+"""Time that a process may take to start and to load its program."""
+WAIT_S = 0.05
+HELLO_WAIT_S = 2.0
+AWAY_S = 1.5 * ORPHAN_TIMEOUT_S
+RETURN_WITHIN_S = 15.0
+WARNING_S = 0.2
+ASK_EVERY_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -169,14 +192,6 @@ class Bench:
             self.present = item
 
 
-OF_TRAFFIC = ("own_node", "payload", "sends", "numbers", "report_time")
-OF_YIELDS = ("timers", "steps", "wakes", *OF_TRAFFIC)
-SLACK_NS = 50_000_000
-"""Real time: how much the two clocks of one machine may seem to differ."""
-OLDEST_NS = 1_000_000_000
-"""Real time: a report is on its way for less than this."""
-
-
 class Inspection:
     """Checks messages of `node` and notes what is wrong in `findings`."""
 
@@ -262,18 +277,6 @@ def _numbers(report: Report) -> Iterator[float]:
     for value in report.values.values():
         if not isinstance(value, str):
             yield from value if isinstance(value, list) else [value]
-
-
-ORPHAN_TIMEOUT_S = 1.0
-"""Time that an agent waits for an emulator that is gone, as the welcome says."""
-QUIET_S = 0.3
-"""Time that a scene listens for messages that must not come."""
-SHORTEST_NONCE = 8
-OTHERS_NONCE = b"of another session"
-PAYLOADS = (b"a packet", b"", b"\xc1 no msgpack", b"\x81\xa1x")
-"""Payloads of the packets that the agent receives, in turn: the radio may bring anything."""
-
-M = TypeVar("M", bound=wire.AgentMessage)
 
 
 class SceneOverError(Exception):
@@ -462,21 +465,9 @@ class Scene:
         return wire.WirePacket(self.bench.node, "another", sent_ns, received_ns, payload)
 
 
-START_UP_S = 20.0
-"""Time that a process may take to start and to load its program."""
-WAIT_S = 0.05
-
-
 def _is_an_answer(hello: wire.Hello) -> bool:
     """True if a hello answers the welcome."""
     return hello.ready or hello.failure is not None
-
-
-HELLO_WAIT_S = 2.0
-AWAY_S = 1.5 * ORPHAN_TIMEOUT_S
-RETURN_WITHIN_S = 15.0
-WARNING_S = 0.2
-ASK_EVERY_S = 0.2
 
 
 def joining(scene: Scene) -> None:

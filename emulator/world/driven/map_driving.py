@@ -35,6 +35,31 @@ _STRAIGHT_RAD = 1e-6
 """Turns below this are none."""
 _SHORTEST_M = 0.01
 """Links that are not longer than this are not driven on."""
+SHARE = 0.45
+"""Greatest share of a link, or of a straight part of it, that a turn at one of its ends takes."""
+TURN_POINTS = 13
+"""Points of the path of a turn."""
+ARC_POINTS = 7
+"""Points of the arc that rounds a corner: of a right angle one every 15°."""
+_SAME_M = 1e-6
+"""Points closer than this are the same."""
+_MIN_ONE_PLUS_COSINE = 0.5
+"""Lower bound of 1 + cos(turn): at a turn sharper than 120° the corner of a lane is cut off."""
+APART_M = 100.0
+"""Distance between two paths on the common scale: more than a vehicle's length, and what it drives in a period."""
+_NEAR = 3
+"""Most paths between two vehicles that overlap."""
+AGAINST = "-"
+"""Sign before the name of a road on which a route goes against the road's direction."""
+KEY = "network.driven.routes"
+_INSIDE = 3
+"""Most links inside an intersection between two roads that a route names."""
+TRIES = 200
+"""Places that are drawn for a vehicle before there is no room for it."""
+STREAM = "driven routes"
+"""Random stream of a vehicle's place at the start, and of its route."""
+Route = tuple[int, ...]
+Names = tuple[str, ...]
 
 
 class Links:
@@ -156,18 +181,6 @@ def _is_stop(roads: Roads) -> Mask:
     is_stop[roads.node[roads.first[:-1]]] = True
     is_stop[roads.node[roads.first[1:] - 1]] = True
     return np.asarray(is_stop)
-
-
-SHARE = 0.45
-"""Greatest share of a link, or of a straight part of it, that a turn at one of its ends takes."""
-TURN_POINTS = 13
-"""Points of the path of a turn."""
-ARC_POINTS = 7
-"""Points of the arc that rounds a corner: of a right angle one every 15°."""
-_SAME_M = 1e-6
-"""Points closer than this are the same."""
-_MIN_ONE_PLUS_COSINE = 0.5
-"""Lower bound of 1 + cos(turn): at a turn sharper than 120° the corner of a lane is cut off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,13 +335,6 @@ _WEIGHT, _SLOPE = _cubic(np.linspace(0, 1, TURN_POINTS))
 def _wrapped(angle: Array) -> Array:
     """Return angles in [-π, π)."""
     return np.asarray(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
-
-
-APART_M = 100.0
-"""Distance between two paths on the common scale: more than a vehicle's length, and what it drives in a period."""
-
-_NEAR = 3
-"""Most paths between two vehicles that overlap."""
 
 
 class _Place(NamedTuple):
@@ -514,13 +520,6 @@ class MapRoads:
         return np.concatenate(vehicles), np.concatenate(paths), np.concatenate(places)
 
 
-AGAINST = "-"
-"""Sign before the name of a road on which a route goes against the road's direction."""
-KEY = "network.driven.routes"
-_INSIDE = 3
-"""Most links inside an intersection between two roads that a route names."""
-
-
 def elements_of(paths: Paths, links: Iterator[int], least_m: float) -> tuple[int, ...]:
     """Return the paths of a route along `links`, with the turns between, until they are at least `least_m` long."""
     found, length_m, before = list[int](), 0.0, -1
@@ -614,15 +613,6 @@ class NamedRoutes:
             inside = (way for way in ways if self._links.is_crossing[way[-1]])
             ways = [[*way, after] for way in inside for after in self._links.exits(way[-1]).tolist()]
         return []
-
-
-TRIES = 200
-"""Places that are drawn for a vehicle before there is no room for it."""
-STREAM = "driven routes"
-"""Random stream of a vehicle's place at the start, and of its route."""
-
-Route = tuple[int, ...]
-Names = tuple[str, ...]
 
 
 class _StartPlace(NamedTuple):

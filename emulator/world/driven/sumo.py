@@ -61,6 +61,10 @@ EXPLAIN_LINES = 3
 LARGEST_ERRORS = 1 << 16
 """Bytes at the end of SUMO's output that are searched for them."""
 A = TypeVar("A", bound=msgspec.Struct)
+STEPS = 100
+"""Steps that SUMO makes for one answer before the run, so that this comes well within the time for it."""
+TRAFFIC_LIGHTS = "traffic_lights"
+"""Name of the reading of a node that is told the traffic lights."""
 
 
 def require_libsumo(path: Path) -> None:
@@ -180,10 +184,6 @@ def _kill(process: subprocess.Popen[bytes], errors: IO[bytes], owner: int) -> No
         if file is not None:
             with contextlib.suppress(OSError):
                 file.close()
-
-
-STEPS = 100
-"""Steps that SUMO makes for one answer before the run, so that this comes well within the time for it."""
 
 
 def start_sumo(scenario: Scenario, path: Path, step_ns: int) -> tuple[SumoProcess, Begun, list[str]]:
@@ -413,10 +413,6 @@ class SumoVehicles:
         speed, acceleration, along_m, left_m = self._values[3:7]
         self._log.time_ns.append(self.now_ns)
         self._log.rows.append(np.array([along_m, left_m, speed, acceleration, self._command]))
-
-
-TRAFFIC_LIGHTS = "traffic_lights"
-"""Name of the reading of a node that is told the traffic lights."""
 
 
 class SumoWorld(SteppedWorld):

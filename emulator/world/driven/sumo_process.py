@@ -22,6 +22,17 @@ COLUMNS = ("x", "y", "angle", "speed", "acceleration", "distance", "lateral", "g
 LENGTH_BYTES = 4
 TIED = "--tied"
 """Option of the process: it is ended at once when the one that has started it ends."""
+ALL_CHECKS = 31
+"""SUMO's speed mode in which it keeps its own rules: safe gaps, limits, right of way, red lights."""
+NO_CHECKS = 32
+"""Speed mode in which the vehicle drives as it is told, whatever is in its way."""
+ALL_LANE_CHANGES = 1621
+"""SUMO's lane change mode in which it changes lanes whenever its driver would."""
+ROUTE_LANE_CHANGES = 1537
+"""Mode in which it changes lanes only where the route needs it, and when it is told to, without a collision."""
+LANE_S = 5.0
+"""Time for which SUMO tries to change to a lane, and stays there."""
+ABSENT = [math.nan] * len(COLUMNS)
 
 
 class Begin(msgspec.Struct, tag=True):
@@ -146,19 +157,6 @@ def decode_answer(data: bytes) -> Answer:
     """Return an answer. Raise msgspec.DecodeError, or ValidationError, for what is none."""
     decoded: Answer = msgspec.msgpack.decode(data, type=Answer)
     return decoded
-
-
-ALL_CHECKS = 31
-"""SUMO's speed mode in which it keeps its own rules: safe gaps, limits, right of way, red lights."""
-NO_CHECKS = 32
-"""Speed mode in which the vehicle drives as it is told, whatever is in its way."""
-ALL_LANE_CHANGES = 1621
-"""SUMO's lane change mode in which it changes lanes whenever its driver would."""
-ROUTE_LANE_CHANGES = 1537
-"""Mode in which it changes lanes only where the route needs it, and when it is told to, without a collision."""
-LANE_S = 5.0
-"""Time for which SUMO tries to change to a lane, and stays there."""
-ABSENT = [math.nan] * len(COLUMNS)
 
 
 class Simulation:

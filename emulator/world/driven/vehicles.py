@@ -21,6 +21,13 @@ from vnet.errors import ScenarioError
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
+_BISECTIONS = 80
+"""Most halvings of the search for an instant; doubles are exhausted before."""
+COLLISION = "collision"
+LANE_ENDED = "lane_ended"
+LIMITED = "drive_limited"
+"""Events of driven vehicles."""
+
 
 def rectangles_overlap(
     offset_m: Array, heading_rad: Array, other_rad: Array, length_m: float, width_m: float
@@ -41,10 +48,6 @@ def rectangles_overlap(
         overlap &= np.abs(offset_m[:, 0] * east + offset_m[:, 1] * north) < long_m
         overlap &= np.abs(offset_m[:, 1] * east - offset_m[:, 0] * north) < wide_m
     return overlap
-
-
-_BISECTIONS = 80
-"""Most halvings of the search for an instant; doubles are exhausted before."""
 
 
 @dataclass(frozen=True)
@@ -167,12 +170,6 @@ def _bisected(
 
 def _decay(time_s: float, lag_s: float) -> float:
     return math.exp(-time_s / lag_s) if lag_s else 0.0
-
-
-COLLISION = "collision"
-LANE_ENDED = "lane_ended"
-LIMITED = "drive_limited"
-"""Events of driven vehicles."""
 
 
 class Happening(NamedTuple):

@@ -37,6 +37,30 @@ _MIN_SINE = 0.1
 """Sine of the least angle at which streets cross; streets at a smaller angle are parallel."""
 _ABOVE_M = 1e6
 """Height that separates elevated streets from those on the ground in the search for crossings."""
+SIZE_M = 3000.0
+"""Default size of the city."""
+SMALLEST_M, LARGEST_M = 1000.0, 10_000.0
+"""Least and greatest size of the city."""
+ORIGIN_DEG = (42.0, -40.0)
+"""Latitude and longitude of the centre: in the Atlantic, so that no real town is meant."""
+_MARGIN = 1.1
+"""Size of the warped plan relative to the plan."""
+_ARTERIAL_M = (420.0, 640.0)
+"""Range of the distance between neighbouring arterials."""
+_CORE = 0.22
+"""Radius of the dense core, relative to the city's size."""
+_BLOCK_M, _CORE_BLOCK_M = 125.0, 95.0
+"""Mean length of a block outside the core and in it."""
+_MOTORWAY_OFFSET_M = 11.0
+"""Distance of a motorway carriageway from the motorway's centre line."""
+_NEAR_MOTORWAY_M = 115.0
+"""Distance from the motorway within which no other streets are built."""
+_RAMP_M = 290.0
+"""Length of a ramp along the motorway."""
+_RAMP_OFFSET_M = 62.0
+"""Distance of a ramp's end from the motorway's centre line."""
+_RIVER_STEP_M = 11.0
+"""Distance between the points of the road along the river."""
 
 
 @dataclass
@@ -198,33 +222,6 @@ def _largest(pieces: list[_Piece], crossings: int) -> list[_Piece]:
     label = label[ends[:, 0]]
     best = int(np.argmax(np.bincount(label, [piece.length_m for piece in pieces])))
     return [piece for piece, its in zip(pieces, label.tolist(), strict=True) if its == best]
-
-
-SIZE_M = 3000.0
-"""Default size of the city."""
-SMALLEST_M, LARGEST_M = 1000.0, 10_000.0
-"""Least and greatest size of the city."""
-ORIGIN_DEG = (42.0, -40.0)
-"""Latitude and longitude of the centre: in the Atlantic, so that no real town is meant."""
-
-_MARGIN = 1.1
-"""Size of the warped plan relative to the plan."""
-_ARTERIAL_M = (420.0, 640.0)
-"""Range of the distance between neighbouring arterials."""
-_CORE = 0.22
-"""Radius of the dense core, relative to the city's size."""
-_BLOCK_M, _CORE_BLOCK_M = 125.0, 95.0
-"""Mean length of a block outside the core and in it."""
-_MOTORWAY_OFFSET_M = 11.0
-"""Distance of a motorway carriageway from the motorway's centre line."""
-_NEAR_MOTORWAY_M = 115.0
-"""Distance from the motorway within which no other streets are built."""
-_RAMP_M = 290.0
-"""Length of a ramp along the motorway."""
-_RAMP_OFFSET_M = 62.0
-"""Distance of a ramp's end from the motorway's centre line."""
-_RIVER_STEP_M = 11.0
-"""Distance between the points of the road along the river."""
 
 
 def city_roads(seed: int, size_m: float = SIZE_M) -> Roads:

@@ -40,6 +40,23 @@ _UNDEFINED_DEG = 200.0
 """Nodes that a file lacks have a longitude beyond it."""
 _LONGEST_LINE = 1 << 16
 """Bytes of a line that are searched at once."""
+FAR_M = 100.0
+"""Distance to the nearest lane beyond which a position is off the map."""
+SAMPLES = 5000
+"""Positions that are tested for it."""
+COLUMNS = ("building", "x_m", "y_m")
+"""Columns of a CSV file: rows with one name in `building`, one after the other, are its corners."""
+_LONGEST_ROW = 1000
+"""Characters of a line of CSV."""
+Rings = list[Array]
+_T = TypeVar("_T")
+WRITERS: dict[str, Callable[[Roads, Path], None]] = {
+    ".geojson": write_geojson,
+    ".json": write_geojson,
+    ".npz": write_graph,
+}
+LARGEST_BYTES = 2**31
+"""Largest file that is read."""
 
 
 def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
@@ -117,12 +134,6 @@ def _pieces(path: Path, way: Way) -> list[list[tuple[int, tuple[float, float]]]]
     return [piece for piece in pieces if piece]
 
 
-FAR_M = 100.0
-"""Distance to the nearest lane beyond which a position is off the map."""
-SAMPLES = 5000
-"""Positions that are tested for it."""
-
-
 def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
     """Return the lanes of `[map]`, read as `roads`, around the positions `course_m` (K, N, 2) of all vehicles.
 
@@ -168,14 +179,6 @@ def _far_share(lanes: RoadMap, position_m: Array) -> float:
 
 def _extent(roads: Roads) -> tuple[Array, Array]:
     return roads.node_m.min(axis=0), roads.node_m.max(axis=0)
-
-
-COLUMNS = ("building", "x_m", "y_m")
-"""Columns of a CSV file: rows with one name in `building`, one after the other, are its corners."""
-_LONGEST_ROW = 1000
-"""Characters of a line of CSV."""
-
-Rings = list[Array]
 
 
 def read_buildings(path: Path, frame: Callable[[], Frame]) -> Buildings:
@@ -310,8 +313,6 @@ def _rings(where: str, polygon: Any) -> Rings:
     return [_open_ring(where, ring) for ring in rings]
 
 
-_T = TypeVar("_T")
-
 READERS: dict[str, Callable[[Path, tuple[float, float] | None], Roads]] = {
     ".osm": read_osm,
     ".pbf": read_osm,
@@ -320,13 +321,6 @@ READERS: dict[str, Callable[[Path, tuple[float, float] | None], Roads]] = {
     ".json": read_geojson,
     ".npz": read_graph,
 }
-WRITERS: dict[str, Callable[[Roads, Path], None]] = {
-    ".geojson": write_geojson,
-    ".json": write_geojson,
-    ".npz": write_graph,
-}
-LARGEST_BYTES = 2**31
-"""Largest file that is read."""
 
 
 def read_roads(path: Path, origin_deg: tuple[float, float] | None = None) -> Roads:

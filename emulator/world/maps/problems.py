@@ -41,6 +41,8 @@ BIWEIGHT = 4.685
 """Tukey's constant: 95 % as efficient as least squares where residuals are Gaussian."""
 NORMAL_MAD = 1.4826
 """Deviation of a Gaussian relative to the median of absolute deviations."""
+GAP_M = 1.0
+"""A road's end this close to another point, but not joined to it, is more likely an error than a dead end."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,6 @@ def _apart(position_m: Array, heading_rad: Array) -> NDArray[np.intp]:
     steps_m = np.hypot(*np.diff(position_m[present], axis=0).T)
     step = np.floor(np.append(0.0, np.cumsum(steps_m)) / SPACING_M)
     return present[np.flatnonzero(np.diff(step, prepend=-1))]
-
-
-GAP_M = 1.0
-"""A road's end this close to another point, but not joined to it, is more likely an error than a dead end."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,27 @@ from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap, touch_box
 from vnet.types import Array
 
+VEHICLE_WIDTH_M = 1.8
+"""Width of every vehicle: that of a passenger car."""
+MIN_LANE_WIDTH_M = 2.0
+"""Least width of a lane in a map."""
+MAX_LANE_WIDTH_M = 20.0
+"""Greatest width of a lane in a map: some maps have one strip for all lanes of a road."""
+MAX_LANES = 16
+"""Most lanes of a road in one direction."""
+_ONE_WAY_CLASSES = {"motorway", "motorway_link"}
+"""Classes whose ways are one-way unless tagged otherwise."""
+_ROUND = {"roundabout", "circular"}
+"""Values of `junction` whose ways are one-way unless tagged otherwise."""
+_WIDTH = re.compile(r"(\d{1,4}(?:\.\d{1,9})?)\s*m?")
+MAX_POINTS = 5_000_000
+"""Most points of a map: ten times those of a large city."""
+MIN_HALF_WIDTH_M = 0.3
+"""Least half-width left to a vehicle's centre, in a lane hardly wider than the vehicle."""
+_MIN_ONE_PLUS_COSINE = 0.5
+"""Lower bound of 1 + cos(turn): at a turn sharper than 120° the corner of a lane is cut off."""
+Ints = NDArray[np.intp]
+
 
 @dataclass(frozen=True)
 class RoadClass:
@@ -57,26 +78,11 @@ NUMBER = {name: number for number, name in enumerate(NAMES)}
 UNKNOWN = NUMBER["road"]
 """Number of the class of a road whose class is unknown."""
 
-VEHICLE_WIDTH_M = 1.8
-"""Width of every vehicle: that of a passenger car."""
-MIN_LANE_WIDTH_M = 2.0
-"""Least width of a lane in a map."""
-MAX_LANE_WIDTH_M = 20.0
-"""Greatest width of a lane in a map: some maps have one strip for all lanes of a road."""
-MAX_LANES = 16
-"""Most lanes of a road in one direction."""
 
 LANE_WIDTH_M: Array = np.array([each.lane_width_m for each in CLASSES.values()])
 """Default lane widths, indexed by class."""
 LANES = np.array([each.lanes for each in CLASSES.values()])
 """Default numbers of lanes in each direction, indexed by class."""
-
-
-_ONE_WAY_CLASSES = {"motorway", "motorway_link"}
-"""Classes whose ways are one-way unless tagged otherwise."""
-_ROUND = {"roundabout", "circular"}
-"""Values of `junction` whose ways are one-way unless tagged otherwise."""
-_WIDTH = re.compile(r"(\d{1,4}(?:\.\d{1,9})?)\s*m?")
 
 
 @dataclass(frozen=True)
@@ -130,16 +136,6 @@ def _lanes(tags: Mapping[str, str], name: str) -> tuple[tuple[int, int], bool]:
 def _count(text: str | None) -> int:
     """Return a number of lanes, or 0 if the tag is missing or invalid."""
     return int(text) if text and re.fullmatch("[0-9]{1,3}", text) and 1 <= int(text) <= MAX_LANES else 0
-
-
-MAX_POINTS = 5_000_000
-"""Most points of a map: ten times those of a large city."""
-MIN_HALF_WIDTH_M = 0.3
-"""Least half-width left to a vehicle's centre, in a lane hardly wider than the vehicle."""
-_MIN_ONE_PLUS_COSINE = 0.5
-"""Lower bound of 1 + cos(turn): at a turn sharper than 120° the corner of a lane is cut off."""
-
-Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

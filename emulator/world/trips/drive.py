@@ -29,6 +29,8 @@ from vnet.units import NS_PER_S
 USAGE = "def {}(seed, vehicles, duration_s)"
 COLUMNS = ("time_s", "x_m", "y_m", "heading_rad")
 """Numbers of a sample; the heading may be missing."""
+READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml": read_fcd}
+"""Readers of trips by the ending of the file's name."""
 
 
 def own_samples(network: Network, program: Program, duration_s: float) -> Samples:
@@ -71,10 +73,6 @@ def _table(problem: str, name: object, rows: Any) -> np.ndarray[Any, np.dtype[np
         needed = "rows of time_s, x_m, y_m and, if you like, heading_rad are needed"
         raise ScenarioError(f"{problem}: {shown(name)}: {shown(rows)}: {needed}")
     return table
-
-
-READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml": read_fcd}
-"""Readers of trips by the ending of the file's name."""
 
 
 def drive(network: Network, program: Program, periods: int, period_ns: int) -> Motion:

@@ -43,6 +43,14 @@ _LONGEST_LINE = 100_000
 """Characters of the header line."""
 BATCH_ROWS = 1 << 16
 """Rows that are read at once."""
+_CHUNK_BYTES = 1 << 20
+"""Bytes that are parsed at once."""
+_GEO = re.compile(r'<fcd-output\.geo\s+value="(?:true|1|t)"')
+_EXPLAIN_LINES = 3
+"""Lines of SUMO's errors that are shown."""
+_LARGEST_BYTES = 8 * MOST_SAMPLES + (1 << 20)
+"""Largest array that is read."""
+ENDINGS = (".csv", ".parquet")
 
 
 def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
@@ -104,13 +112,6 @@ def _collect(
         values = {name: np.asarray(column.to_numpy(zero_copy_only=False)) for name, column in numbers.items()}
         samples.add(batch["id"].cast(pa.string()), row, values)
     return samples
-
-
-_CHUNK_BYTES = 1 << 20
-"""Bytes that are parsed at once."""
-_GEO = re.compile(r'<fcd-output\.geo\s+value="(?:true|1|t)"')
-_EXPLAIN_LINES = 3
-"""Lines of SUMO's errors that are shown."""
 
 
 def read_fcd(path: Path, window_s: tuple[float, float] | None) -> Samples:
@@ -234,10 +235,6 @@ def _sumo(path: Path) -> str:
     return found
 
 
-_LARGEST_BYTES = 8 * MOST_SAMPLES + (1 << 20)
-"""Largest array that is read."""
-
-
 def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
     """Return the samples of an NPZ file. Raise ScenarioError, naming the array or the row, for a bad file."""
     arrays = _load(path)
@@ -294,9 +291,6 @@ def _ids(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> list[str]:
         twice = next(name for number, name in enumerate(ids) if name in ids[:number])
         raise ScenarioError(f"{path}: id = {printable(twice)} appears twice; ids must differ")
     return ids
-
-
-ENDINGS = (".csv", ".parquet")
 
 
 def check_trips_name(path: Path) -> None:

@@ -40,6 +40,32 @@ LINK_SHARE = 0.7
 """Speed on a ramp relative to the road that it belongs to."""
 TRIES = 8
 """Destinations that are tried to find one that can be reached without a U-turn."""
+LATERAL_MPS2 = 2.5
+"""Greatest lateral acceleration in a curve: that of a brisk driver."""
+STARTING_MPS2 = 2.0
+"""Acceleration."""
+BRAKING_MPS2 = 2.5
+"""Deceleration."""
+SLOWEST_MPS = 1.5
+"""Speed in the tightest turn."""
+STOPS_AT = 0.3
+"""Probability of a stop at a crossing."""
+STOPPED_S, LONGEST_STOP_S = 8.0, 40.0
+"""Mean time of a stop beyond its first second, and longest stop."""
+PARKED, LATE, EARLY = 0.15, 0.2, 0.2
+"""Shares of vehicles that start on a parking lot, that enter during the run, and that leave during it."""
+PARKED_OFFSET_M, PARKED_S = (7.0, 18.0), (5.0, 40.0)
+"""Ranges of a parking lot's distance from the lane, and of the time that a vehicle stays there."""
+LATERAL_SIGMA_M, LATERAL_TAU_S = 0.3, 20.0
+"""Standard deviation and time constant of the lateral offset in a lane."""
+MIN_HALF_WIDTH_M = 0.3
+"""Least bound of the lateral offset, in a lane hardly wider than the vehicle."""
+SLOWEST_SHARE, FASTEST_SHARE = 0.85, 1.05
+"""Range of a vehicle's speed relative to the streets' free-flow speeds."""
+STEP_M, SMOOTH_STEPS = 1.0, 5
+"""Distance between the points of a trajectory, and number of points over which it is smoothed."""
+CORNER_RAD, CORNER_M = 0.35, 8.0
+"""Least turn that is rounded by an arc, and distance of the arc's ends from the corner."""
 
 
 @dataclass(frozen=True)
@@ -162,34 +188,6 @@ def _leg(before: Ints, start: int, end: int) -> list[int]:
         found.append(end)
         end = int(before[end])
     return found[::-1]
-
-
-LATERAL_MPS2 = 2.5
-"""Greatest lateral acceleration in a curve: that of a brisk driver."""
-STARTING_MPS2 = 2.0
-"""Acceleration."""
-BRAKING_MPS2 = 2.5
-"""Deceleration."""
-SLOWEST_MPS = 1.5
-"""Speed in the tightest turn."""
-STOPS_AT = 0.3
-"""Probability of a stop at a crossing."""
-STOPPED_S, LONGEST_STOP_S = 8.0, 40.0
-"""Mean time of a stop beyond its first second, and longest stop."""
-PARKED, LATE, EARLY = 0.15, 0.2, 0.2
-"""Shares of vehicles that start on a parking lot, that enter during the run, and that leave during it."""
-PARKED_OFFSET_M, PARKED_S = (7.0, 18.0), (5.0, 40.0)
-"""Ranges of a parking lot's distance from the lane, and of the time that a vehicle stays there."""
-LATERAL_SIGMA_M, LATERAL_TAU_S = 0.3, 20.0
-"""Standard deviation and time constant of the lateral offset in a lane."""
-MIN_HALF_WIDTH_M = 0.3
-"""Least bound of the lateral offset, in a lane hardly wider than the vehicle."""
-SLOWEST_SHARE, FASTEST_SHARE = 0.85, 1.05
-"""Range of a vehicle's speed relative to the streets' free-flow speeds."""
-STEP_M, SMOOTH_STEPS = 1.0, 5
-"""Distance between the points of a trajectory, and number of points over which it is smoothed."""
-CORNER_RAD, CORNER_M = 0.35, 8.0
-"""Least turn that is rounded by an arc, and distance of the arc's ends from the corner."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,44 @@ from vnet.errors import ScenarioError, first_names
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
+MAX_ACCELERATION_MPS2 = 10.0
+"""Greatest acceleration of a vehicle from a standstill."""
+MAX_JUMP_SHARE = 0.05
+"""Greatest share of jumps in a trip: with more, its units, projection or ids are wrong."""
+ALWAYS_ALLOWED_JUMPS = 10
+"""Jumps that are allowed in every trip, however short."""
+MAX_SKIPPED_RUNS = 20
+"""Most runs of samples that a chain skips."""
+MAX_SKIPPED_SAMPLES = 5
+"""Most samples before a jump that a chain skips: a filter in the receiver spreads a jump over a few."""
+SPEED_WINDOW_S = 10.0
+"""Time around a step whose median speed is that of the vehicle: longer than what a jump is spread over."""
+FEWEST_IN_WINDOW = 11
+"""Fewest steps in this time; with fewer samples a second a single step may differ from all around it."""
+MOST_IN_WINDOW = 101
+"""Most steps in this time, for speed."""
+FASTER_THAN_AROUND = 1.5
+FASTER_THAN_AROUND_MPS = 5.0
+"""A vehicle is at most so many times, and so much, faster than it drives at the time. Hard braking and full
+acceleration stay far below."""
+SMALL_JUMP_M = 3.0
+"""Shorter steps are no jumps by the speed around them: rounding and noise of standing receivers."""
+_CHUNK = 10_000
+"""Steps whose windows are in memory at once."""
+Rows = NDArray[np.intp]
+STANDING_MPS = 0.5
+"""Speed below which a vehicle stands and keeps its heading."""
+ACCELERATION_S = 0.5
+"""Time before and after an instant over which speeds are taken for an acceleration: recordings have noise."""
+CHORD_S = 0.5
+"""Half of the time over which a heading is computed from positions."""
+SHORTEST_STAY_S = 1.0
+"""Shortest presence of a vehicle that takes part."""
+MOST_LEFT_OUT = 0.5
+"""Largest share of vehicles that are left out; if more are impossible, the file's units or ids are wrong."""
+MOST_STATES = 50_000_000
+"""Most vehicles times periods, so that the truth fits into memory."""
+
 
 def lateral_offsets_m(normal: Array, sigma_m: float, correlation: float, half_width_m: float) -> Array:
     """Return offsets (K, …) in metres from standard normal draws (K, …), a step at a time.
@@ -41,35 +79,6 @@ def _reflect(offset_m: Array, half_width_m: float) -> Array:
     """Reflect offsets into ± `half_width_m`."""
     folded = np.mod(offset_m + half_width_m, 4 * half_width_m)
     return np.asarray(np.where(folded > 2 * half_width_m, 4 * half_width_m - folded, folded) - half_width_m)
-
-
-MAX_ACCELERATION_MPS2 = 10.0
-"""Greatest acceleration of a vehicle from a standstill."""
-MAX_JUMP_SHARE = 0.05
-"""Greatest share of jumps in a trip: with more, its units, projection or ids are wrong."""
-ALWAYS_ALLOWED_JUMPS = 10
-"""Jumps that are allowed in every trip, however short."""
-MAX_SKIPPED_RUNS = 20
-"""Most runs of samples that a chain skips."""
-MAX_SKIPPED_SAMPLES = 5
-"""Most samples before a jump that a chain skips: a filter in the receiver spreads a jump over a few."""
-
-SPEED_WINDOW_S = 10.0
-"""Time around a step whose median speed is that of the vehicle: longer than what a jump is spread over."""
-FEWEST_IN_WINDOW = 11
-"""Fewest steps in this time; with fewer samples a second a single step may differ from all around it."""
-MOST_IN_WINDOW = 101
-"""Most steps in this time, for speed."""
-FASTER_THAN_AROUND = 1.5
-FASTER_THAN_AROUND_MPS = 5.0
-"""A vehicle is at most so many times, and so much, faster than it drives at the time. Hard braking and full
-acceleration stay far below."""
-SMALL_JUMP_M = 3.0
-"""Shorter steps are no jumps by the speed around them: rounding and noise of standing receivers."""
-_CHUNK = 10_000
-"""Steps whose windows are in memory at once."""
-
-Rows = NDArray[np.intp]
 
 
 class ImpossibleTripError(ScenarioError):
@@ -208,20 +217,6 @@ class _Run:
         if length > self.length:
             self.length, self.entry = length, self.start + int(reached[0])
             self.before, self.left = earlier, last
-
-
-STANDING_MPS = 0.5
-"""Speed below which a vehicle stands and keeps its heading."""
-ACCELERATION_S = 0.5
-"""Time before and after an instant over which speeds are taken for an acceleration: recordings have noise."""
-CHORD_S = 0.5
-"""Half of the time over which a heading is computed from positions."""
-SHORTEST_STAY_S = 1.0
-"""Shortest presence of a vehicle that takes part."""
-MOST_LEFT_OUT = 0.5
-"""Largest share of vehicles that are left out; if more are impossible, the file's units or ids are wrong."""
-MOST_STATES = 50_000_000
-"""Most vehicles times periods, so that the truth fits into memory."""
 
 
 @dataclass(frozen=True)
