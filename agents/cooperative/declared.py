@@ -7,3 +7,4 @@ CHECKS = (
 )
 REFERENCE = "agents.cooperative.hears_all:HearsAll"
 PUBLISHED = "agents.cooperative.paper_values:paper_rmse"
+FIGURES = "agents.cooperative.figures:Figures"

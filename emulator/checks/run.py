@@ -13,7 +13,6 @@ from emulator.checks.memory_growth import is_long_enough, steady_growth_kib_per_
 from emulator.records.distributions import lowest_share
 from emulator.records.events import Event, EventKind
 from emulator.records.failures import in_words, kinds_of
-from emulator.records.period_figures import VECTORS
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result, unknown
@@ -150,7 +149,7 @@ def check_finite(recorded: RecordedRun) -> Finding:
 def _not_finite_rows(recorded: RecordedRun) -> IntArray:
     """Number of rows of the states in each period of the metrics that hold NaN or infinity."""
     broken = np.zeros(len(recorded.states), dtype=bool)
-    for name in (*VECTORS, "cloud_m", *recorded.value_names):
+    for name in recorded.reported_names:
         column = recorded.states[name].combine_chunks()
         if is_text(column.type):
             continue

@@ -30,7 +30,6 @@ from emulator.records.costs import Costs
 from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
-from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.fault_families import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.lookahead import least_latency_ns
@@ -60,7 +59,7 @@ class PeriodView:
     counts: dict[str, int]
 
     @property
-    def figures(self) -> PeriodFigures:
+    def figures(self) -> Any:
         """Its figures."""
         return self.metrics.rows[self.instant.period]
 
@@ -117,7 +116,7 @@ class Emulation:
         self._acting: set[str] = set()
         self._acted_ns = -1
         self._next_change_ns = self._find_next_change_ns()
-        self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns)
+        self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns, scenario.program)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
         self.driving = Driving(world, folder, self.number)
         for node, up in self.up.items():

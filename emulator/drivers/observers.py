@@ -53,7 +53,7 @@ class Messages:
             emulation.world.node_ids,
             view.instant,
             end_ns,
-            beliefs_of(emulation.number, view.reports),
+            beliefs_of(emulation.number, view.reports, emulation.metrics.declared),
             view.figures,
             self._rows(end_ns),
             [emulation.up[node] for node in emulation.world.node_ids],

@@ -12,15 +12,13 @@ import pyarrow.compute as pc
 
 from emulator.records.events import SAMPLES, Event
 from emulator.records.recorded_run import OpenedRun
-from emulator.records.reported import value_columns
+from emulator.records.reported import reported_columns
 from emulator.records.tape import TAPE_FILE, TapeEntry, described, read_tape
 from vnet.transport.orders import Deviation
 from vnet.units import NS_PER_S
 
 FRAME = ("sent_ns", "sender", "seq", "size_bytes", "payload_digest")
 RECEPTION = ("sent_ns", "sender", "seq", "copy", "receiver", "outcome", "cause", "arrival_ns")
-REPORT = ("estimate_m", "covariance_m2", "common_error_estimate_m", "mean_m")
-"""Columns of states that programs report, beside those of their own names."""
 MOST_BEFORE = 8
 """Events and frames that are told of before a parting."""
 
@@ -155,7 +153,7 @@ def _first_vehicle(first: OpenedRun, second: OpenedRun) -> Parting | None:
 
 def _first_value(first: pa.Table, second: pa.Table) -> Parting | None:
     """Return the first value that programs of vehicles of both runs report otherwise, at its period's beginning."""
-    columns = list(dict.fromkeys([*REPORT, *value_columns(first.schema), *value_columns(second.schema)]))
+    columns = list(dict.fromkeys([*reported_columns(first.schema), *reported_columns(second.schema)]))
     both = pc.unique(first["node"].cast(pa.string()))
     both = both.filter(pc.is_in(both, pc.unique(second["node"].cast(pa.string()))))
     for ours, theirs in zip_longest(_values(first, both, columns), _values(second, both, columns)):

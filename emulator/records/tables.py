@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 
 import pyarrow as pa
 
-from emulator.records.period_figures import PeriodFigures
+from emulator.records.period_figures import NUMBER, NUMBERS, PeriodFigures, ProgramFigures
 from emulator.scenario.scenario import Scenario
 
 Condition = Callable[[Scenario], bool]
@@ -66,21 +66,42 @@ class Table:
     @property
     def schema(self) -> pa.Schema:
         """All columns with their types."""
-        return pa.schema([(name, column.type) for name, column in self.columns.items()])
+        return schema_of(self.columns)
+
+
+def schema_of(columns: Mapping[str, Column]) -> pa.Schema:
+    """Return the types of columns."""
+    return pa.schema([(name, column.type) for name, column in columns.items()])
+
+
+def columns_of(table: Table, declared: ProgramFigures) -> Mapping[str, Column]:
+    """Return the columns of a table in a run whose program declares these figures."""
+    if table is METRICS:
+        return _figures(declared.row)
+    own = declared.columns.values() if table is STATES else ()
+    return {
+        **table.columns,
+        **{each.name: Column(pa.list_(FLOAT, each.size or -1), each.text, True) for each in own},
+    }
+
+
+def _figures(row: type) -> dict[str, Column]:
+    return {each.name: Column(ARROW[str(each.type)], "", str(each.type) == NUMBER) for each in fields(row)}
 
 
 ID = "id of the vehicle"
 NAME, TEXT = pa.dictionary(pa.int32(), pa.string()), pa.string()
 INT, FLOAT = pa.int64(), pa.float64()
 POINT, MATRIX = pa.list_(FLOAT, 2), pa.list_(FLOAT, 4)
-_ARROW = {"int": INT, "float": FLOAT, "float | None": FLOAT, "list[float | None]": pa.list_(FLOAT)}
+ARROW = {"int": INT, NUMBER: FLOAT, NUMBERS: pa.list_(FLOAT)}
+"""Types of the columns of the metrics by those of the figures."""
+TRUTH = ("period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_m")
+"""Columns of the states that reports have no part in."""
 
 # fmt: off
 METRICS = Table(
-    "metrics", "a row for each period",
-    {field.name: Column(_ARROW[str(field.type)], "", "None" in str(field.type) and "list" not in str(field.type))
-     for field in fields(PeriodFigures)},
-    which=": errors and deviation", fields_of=PeriodFigures,
+    "metrics", "a row for each period", _figures(PeriodFigures), which=": errors", fields_of=PeriodFigures,
+    further="Then the figures that the program declares: [own figures](../how-to/own-figures.md).",
 )
 STATES = Table(
     "states", "a row for each vehicle and period",
@@ -98,22 +119,13 @@ STATES = Table(
                                     "reported "
                              "none", True),
         "covariance_m2": Column(MATRIX, "of `estimate_m`, as it reported: a 2 × 2 matrix by rows", True),
-        "common_error_estimate_m": Column(POINT, "`common_error_m` of its report", True),
-        "common_error_covariance_m2": Column(MATRIX, "of its report: a 2 × 2 matrix by rows", True),
-        "mean_m": Column(POINT, "of its report: what it takes for the mean of all estimates of the common "
-                                "error", True),
-        "stacked_common_error_m": Column(POINT, "of its report: the common error right after fusion, before the "
-                                                "map",
-                                         True),
-        "cloud_m": Column(pa.list_(FLOAT), "of its report: some hypotheses of the common error, x and y in "
-                                           "turns", True),
         "values": Column(pa.map_(TEXT, pa.list_(FLOAT)), "what it reported besides and has no column, by name: "
                                                          "lists, "
-                         "and weights of a fusion (`weight.v03`)", True),
+                         "and values of each pair of vehicles", True),
     },
     which=": truth and beliefs",
-    further="Then a column for each number (`double`), boolean (`bool`) or text (`string`) that programs report "
-            "by a "
+    further="Then the columns that the program declares for lists, and a column for each number (`double`), "
+            "boolean (`bool`) or text (`string`) that programs report by a "
     "name of their own, called as they call it: [own figures](../how-to/own-figures.md). Those after the first 64 "
     "names stay in `values`.",
 )

@@ -9,11 +9,13 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from emulator.records.costs import RunCost
+from emulator.records.period_figures import POSITION_FIGURES, KeyFigure, shown_figures
 from emulator.records.reported import ReportedFigure
 from emulator.records.verdicts import CheckResult, Judgement, NotExercised, Verdict
 from emulator.scenario.sections import first_problem
 from vnet.bounded import read_regular
 from vnet.errors import VnetError
+from vnet.units import title_of
 
 LARGEST_BYTES = 64 * 2**20
 RENAMED_CHECKS = {"bit:": "effect:"}
@@ -46,11 +48,18 @@ class Record:
     roadside_units: int = 0
     cost: RunCost | None = None
     versions: dict[str, str] = field(default_factory=dict)
+    key_figures: list[KeyFigure] = field(default_factory=list)
+    """Those of `figures` that sum the run up, as its program declares them."""
 
     @property
     def judgement(self) -> Judgement:
         """The checks as they were judged."""
         return Judgement(self.checks, self.not_exercised, self.trace_sha256)
+
+    @property
+    def shown_figures(self) -> dict[str, float]:
+        """The key figures that the run has, by title."""
+        return shown_figures(self.key_figures, self.figures)
 
     @property
     def in_range(self) -> int:
@@ -74,6 +83,12 @@ def read_record(path: Path) -> Record:
         raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
     except (ValueError, RecursionError) as error:
         raise VnetError(f"{path}: not JSON: {error}") from None
+    if "key_figures" not in data:  # of an earlier vnet, whose figures have no titles
+        own = [each.name for each in POSITION_FIGURES]
+        others = [
+            KeyFigure(name, title_of(name)) for name in record.figures if name[-2:] == "_m" and name not in own
+        ]
+        record = replace(record, key_figures=[*others, *POSITION_FIGURES])
     if "packet_delivery_ratio" not in data:  # of an earlier vnet, which counted all receptions
         record = replace(record, packet_delivery_ratio=record.share_of("delivered"))
     return replace(

@@ -11,7 +11,6 @@ import numpy as np
 
 from emulator.pages.canvas import BLUE, RED, Canvas, Span, canvas, legend
 from emulator.pages.page import SIGNS, put_page, render, table
-from emulator.records.key_figures import KEY_FIGURES
 from emulator.records.verdicts import Verdict
 from emulator.report.comparison import A, B, Comparison, turned
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
@@ -68,7 +67,7 @@ def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, list[str]]]:
     }
     drawers |= {
         key: (title, partial(_metric, comparison, each.name, axis))
-        for each in KEY_FIGURES
+        for each in {each.name: each for record in comparison.records for each in record.key_figures}.values()
         if each.chart
         for key, title, axis in [each.chart]
     }

@@ -14,7 +14,6 @@ from rich.text import Text
 
 from emulator.checks.replay import compare_folders
 from emulator.pages.text import cell
-from emulator.records.key_figures import KEY_FIGURES, shown_figures
 from emulator.records.reported import ReportedFigure, figure_text
 from emulator.records.run_folder import check_is_run
 from emulator.records.verdict_file import Record
@@ -81,8 +80,8 @@ class Comparison:
     @cached_property
     def figures(self) -> list[Row]:
         """Key figures with B − A; lengths in metres, ratios in percent."""
-        ours, theirs = (shown_figures(record.figures) for record in self.records)
-        titles = [each.title for each in KEY_FIGURES if each.title in ours or each.title in theirs]
+        ours, theirs = (record.shown_figures for record in self.records)
+        titles = dict.fromkeys([*ours, *theirs])
         rows = [_difference(f"{title} (m)", ours.get(title), theirs.get(title), ".3f") for title in titles]
         ratios = [record.packet_delivery_ratio for record in self.records]
         if any(ratio is not None for ratio in ratios):

@@ -1,6 +1,9 @@
-"""Figures of the estimates: their errors against time, their consensus and their consistency."""
+"""Figures of the estimates: their errors against time, what the program declares, and their consistency."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -9,6 +12,7 @@ from emulator.records.metrics import anees_band
 from emulator.report.drawing import DASHES, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source, maybe
 from vnet.errors import VnetError
+from vnet.units import title_of
 
 
 def _lines(source: Source, names: dict[str, str]) -> list[Line]:
@@ -17,7 +21,7 @@ def _lines(source: Source, names: dict[str, str]) -> list[Line]:
     Raises VnetError if none is left.
     """
     found: list[Line] = []
-    problem = VnetError("")
+    problem: VnetError = NothingToShow("")
     for (label, name), colour, dash in zip(names.items(), (BLUE, RED, GREEN), DASHES, strict=False):
         try:
             found.append(Line(label, source.time_s, source.metric(name), colour, dash))
@@ -28,12 +32,12 @@ def _lines(source: Source, names: dict[str, str]) -> list[Line]:
     return found
 
 
-def common_error(source: Source) -> Drawing:
-    """Draw the errors of the estimates of the common error."""
-    lines = _lines(source, {"RMSE": "common_error_rmse_m", "deviation": "deviation_m"})
-    text = "Distance of the vehicles' estimates from the true common error (RMSE) and from their mean (deviation)."
-    text += _add_reference(source, "common_error_rmse_m", lines)
-    made = time_figure(lines, "common error (m)", source.end_s, source.spans)
+def declared_chart(chart: Mapping[str, Any], source: Source) -> Drawing:
+    """Draw figures that the program declares to belong together."""
+    names = chart["lines"]
+    lines = _lines(source, names)
+    text = chart["text"] + _add_reference(source, next(iter(names.values())), lines)
+    made = time_figure(lines, chart["axis"], source.end_s, source.spans)
     return Drawing(made, text + faults_note(made, source))
 
 
@@ -64,18 +68,13 @@ def position(source: Source) -> Drawing:
     return Drawing(made, text + faults_note(made, source))
 
 
-def consensus(source: Source) -> Drawing:
-    """Draw the consensus error."""
-    lines = _lines(source, {"consensus error": "consensus_error_m"})
-    made = time_figure(lines, "consensus error (m)", source.end_s, source.spans)
-    text = "Distance of the means that vehicles hold from the mean of all estimates of their component."
-    return Drawing(made, text + faults_note(made, source))
-
-
 def consistency(source: Source) -> Drawing:
     """Draw the normalized squared errors of the filters."""
-    names = {"common error": "common_error_anees"}
-    lines = _lines(source, names | ({"position": "position_anees"} if source.estimates_positions else {}))
+    names = [name for name in source.metrics.column_names if name.endswith("_anees")]
+    if not source.estimates_positions:
+        names.remove("position_anees")
+    names.sort(key="position_anees".__eq__)
+    lines = _lines(source, {title_of(name.removesuffix("_anees")): name for name in names})
     made = time_figure(lines, "ANEES (1 = consistent)", source.end_s, source.spans)
     count = int(np.median(source.metrics["reporting"].to_numpy())) or 1
     low, high = anees_band(count)
@@ -85,7 +84,6 @@ def consistency(source: Source) -> Drawing:
     made.axes.set_ylim(min(bottom, low / 1.1), max(top, high * 1.1))
     text = (
         f"Normalized estimation error squared, averaged. Above 1 a filter is overconfident. Grey: 95 % band of "
-        f"{count} independent estimates, {low:.2f} to {high:.2f}; those of the common error are dependent and "
-        "spread further."
+        f"{count} independent estimates, {low:.2f} to {high:.2f}; dependent ones spread further."
     )
     return Drawing(made, text + faults_note(made, source))

@@ -8,15 +8,15 @@ from functools import partial
 
 from emulator.report.drawing import Chart, Drawing, draw_charts
 from emulator.report.driving_figures import speeds
-from emulator.report.error_figures import common_error, consensus, consistency, position
+from emulator.report.error_figures import consistency, declared_chart, position
 from emulator.report.map_figures import map_charts
-from emulator.report.network_figures import degrees, links, weights
+from emulator.report.network_figures import degrees, links, peers
 from emulator.report.program_figures import program_charts
 from emulator.report.radio_figures import ages, busy, latency, outcomes, totals
 from emulator.report.source import Source
+from vnet.units import title_of
 
 FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
-    "common-error": ("Common error", common_error),
     "position": ("Position", position),
     "speeds": ("Speed of driven vehicles", speeds),
     "outcomes": ("Outcomes over time", outcomes),
@@ -25,12 +25,21 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "links": ("Packet delivery ratio against distance", links),
     "latency": ("Latency", latency),
     "ages": ("Inter-packet gap and age of information", ages),
-    "consensus": ("Consensus error", consensus),
     "consistency": ("Consistency of the filters", consistency),
     "degrees": ("Node degrees", degrees),
-    "weights": ("Fusion weights", weights),
 }
 """Title and drawing by id, in the order of the page. A figure without data raises NothingToShow."""
+
+
+def _figures(source: Source) -> dict[str, tuple[str, Callable[[Source], Drawing]]]:
+    """Return the figures of a run: those that its program declares around vnet's."""
+    declared = source.declared
+    first = {each["id"]: (each["title"], partial(declared_chart, each)) for each in declared.charts}
+    last = {
+        f"peers-{name}": (f"{title_of(name).capitalize()} by vehicle", partial(peers, name))
+        for name in declared.peers
+    }
+    return {**first, **FIGURES, **last}
 
 
 @dataclass(frozen=True)
@@ -45,7 +54,7 @@ class Charts:
 
 def draw(source: Source) -> Charts:
     """Draw all figures of a run."""
-    drawers = {key: (title, partial(figure, source)) for key, (title, figure) in FIGURES.items()}
+    drawers = {key: (title, partial(figure, source)) for key, (title, figure) in _figures(source).items()}
     network, program, figures = (
         draw_charts(each) for each in (map_charts(source), program_charts(source), drawers)
     )

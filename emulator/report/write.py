@@ -17,7 +17,6 @@ from emulator.pages.page import Table, put_page, render, table
 from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS
 from emulator.records.events import SAID, SAMPLES, Event
-from emulator.records.key_figures import shown_figures
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Verdict
@@ -73,7 +72,7 @@ def report_page(source: Source) -> str:
         problems=[check for check in _checks(record) if check["verdict"] is not Verdict.VALID] if record else [],
         not_applicable=record.judgement.not_applicable if record else {},
         key_figures=key_figures(record) if record else {},
-        has_errors=bool(record and shown_figures(record.figures)),
+        has_errors=bool(record and record.shown_figures),
         reported=_reported(record) if record else None,
         charts=draw(source),
         timeline=maybe(lambda: timeline(source)),
@@ -183,7 +182,7 @@ def _one_line(value: Any) -> Any:
 
 def key_figures(record: Record) -> dict[str, str]:
     """Return the figures that sum up a run, by title."""
-    found = {title: f"{value:.3f} m" for title, value in shown_figures(record.figures).items()}
+    found = {title: f"{value:.3f} m" for title, value in record.shown_figures.items()}
     if (delivered := record.packet_delivery_ratio) is not None:
         found["packet delivery ratio"] = f"{delivered:.2%}"
     if record.in_range:

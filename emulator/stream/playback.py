@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from emulator.records.background_table import positions_by_time
 from emulator.records.busy import busy_windows, mean_busy
 from emulator.records.events import Event
-from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import check_is_run
 from emulator.records.run_tables import StatesReader, TraceReader
@@ -45,7 +44,7 @@ class _Playback:
     """A run's files."""
 
     run: OpenedRun
-    figures: Sequence[PeriodFigures]
+    figures: Sequence[Any]
     trace: TraceReader
     states: StatesReader
     busy: Array

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from emulator.viewer.drawing import TIMELINE
+from emulator.records.period_figures import Estimate
+from emulator.viewer.drawing import POSITION, TIMELINE
 from emulator.viewer.layout import EVERYTHING, Content
 from emulator.viewer.program_scene import entity, titled
 from emulator.viewer.radio_scene import WINDOW_S
-
-COMMON_VIEW_M, POSITION_VIEW_M = 1.15, 5.6
 
 
 def blueprint(vehicle: str, tab: int = 0, content: Content = EVERYTHING) -> rrb.Blueprint:
@@ -27,15 +26,16 @@ def blueprint(vehicle: str, tab: int = 0, content: Content = EVERYTHING) -> rrb.
 
 def overview(content: Content) -> rrb.Vertical:
     """The network: map, beliefs, figures, faults, events."""
-    beliefs = _beliefs(content)
+    beliefs = [
+        _around_truth(each.name, f"{each.title.capitalize()} − truth (m)", each) for each in content.estimates
+    ]
     main: list[rrb.Spatial2DView | rrb.Vertical] = [
         rrb.Spatial2DView(origin="map", name="Map (east →, north ↑): vehicles and links of this period")
     ]
     below = [rrb.StateTimelineView(origin="faults", name="Faults acting, vehicles down"), _events()]
     if beliefs:
         main.append(rrb.Vertical(*beliefs))
-    if content.weights:
-        below.insert(0, _matrix("weights", "Weights of the fusion (brighter: more)"))
+    below[:0] = [_matrix(f"peers/{name}", f"{titled(name)} by vehicle (brighter: more)") for name in content.peers]
     return rrb.Vertical(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="about", name="About", titlebar=False),
@@ -52,30 +52,20 @@ def overview(content: Content) -> rrb.Vertical:
             rrb.Vertical(*_curves(content)),
             column_shares=[4, 2.4, 3.6] if beliefs else [4, 4],
         ),
-        rrb.Horizontal(*below, column_shares=[2, 3, 4] if content.weights else [3, 4]),
+        rrb.Horizontal(*below, column_shares=[*[2] * len(content.peers), 3, 4]),
         row_shares=[1.6, 7, 2.8],
         name="Overview",
     )
 
 
-def _beliefs(content: Content) -> list[rrb.Spatial2DView]:
-    """Errors around the truth, of what programs estimate."""
-    views = []
-    if content.common:
-        views.append(_around_truth("common", "Common error − truth (m), with 95 % ellipses", COMMON_VIEW_M))
-    if content.position:
-        views.append(_around_truth("position", "Position − truth (m)", POSITION_VIEW_M))
-    return views
-
-
 def _curves(content: Content) -> list[rrb.TimeSeriesView | rrb.Tabs]:
     """Figures against time, frames last."""
     curves: list[rrb.TimeSeriesView | rrb.Tabs] = []
-    if content.common:
-        curves.append(_against_time("figures/common", "Common error (m)"))
-    more = [_against_time("figures/consensus", "Consensus (m)")] if content.consensus else []
-    more += [_against_time("figures/position", "RMSE of position (m)")] if content.position else []
-    if not content.common:
+    more = [_against_time(f"figures/{key}", title) for key, title in content.charts]
+    if more:
+        curves.append(more.pop(0))
+    more += [_against_time("figures/position", "RMSE of position (m)")] if POSITION in content.estimates else []
+    if not content.charts:
         more += [_against_time(entity("curve", name), titled(name)) for name in content.values]
     if more:
         curves.append(rrb.Tabs(*more))
@@ -140,20 +130,17 @@ def _loads(content: Content) -> list[rrb.TimeSeriesView]:
 def one_vehicle(vehicle: str, content: Content) -> rrb.Vertical:
     """One vehicle."""
     around = [rrb.Spatial2DView(origin="vehicle/hears", name=f"{vehicle} hears (around it, east →, north ↑)")]
-    if content.position:
-        name = f"{vehicle}: position − truth (m), 95 % ellipse"
-        around.append(_around_truth("vehicle/position", name, POSITION_VIEW_M))
-    if content.common:
-        name = f"{vehicle}: common error − truth (m), 95 % ellipse"
-        around.append(_around_truth("vehicle/common", name, COMMON_VIEW_M))
+    for each in content.estimates:
+        name = f"{vehicle}: {each.title} − truth (m), 95 % ellipse"
+        around.append(_around_truth(f"vehicle/{each.name}", name, each))
     curves = [_against_time("vehicle/frames", f"Frames to {vehicle} a period")]
-    if content.position or content.common:
+    if content.estimates:
         curves.insert(0, _against_time("vehicle/errors", f"{vehicle}: distance from the truth (m)"))
     return rrb.Vertical(
         rrb.Horizontal(*around),
         rrb.Horizontal(
             rrb.Vertical(*curves),
-            rrb.TextDocumentView(origin="vehicle/table", name=f"Whom {vehicle} hears and weighs"),
+            rrb.TextDocumentView(origin="vehicle/table", name=f"Whom {vehicle} hears"),
             column_shares=[2, 1],
         ),
         row_shares=[4, 4],
@@ -161,8 +148,8 @@ def one_vehicle(vehicle: str, content: Content) -> rrb.Vertical:
     )
 
 
-def _around_truth(origin: str, name: str, half_m: float) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=(-half_m, half_m), y_range=(-half_m, half_m))
+def _around_truth(origin: str, name: str, of: Estimate) -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=(-of.view_m, of.view_m), y_range=(-of.view_m, of.view_m))
     return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
 
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from emulator.records.period_figures import figures_if_here
 from emulator.records.reference import Setting, reference_of
-from emulator.records.tables import STATES
+from emulator.records.tables import STATES, columns_of
 from emulator.scenario.declared import declared, load_entry
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
@@ -28,11 +29,18 @@ class DrawnReference:
         point_m = unpack(scene["lane_point_m"], 2).astype(float)
         heading_rad = unpack(scene["lane_heading_rad"])[:, 0].astype(float)
         component = np.frombuffer(scene["component"], dtype="<i2")
+        self._sizes = {
+            name: each.type.list_size if pa.types.is_fixed_size_list(each.type) else 1
+            for name, each in columns_of(STATES, figures_if_here(scenario.program)).items()
+        }
+        if unknown := [name for name in self._columns if name not in self._sizes]:
+            raise VnetError(f"its column {unknown[0]!r} is neither vnet's nor declared")
         self._reference = kind(Setting(scenario, component, point_m, heading_rad))
 
     def step(self, period: Mapping[str, Any]) -> dict[str, float]:
         """Take a period; returns its figures of the whole network by name. Periods may be left out."""
-        states = {name: self._column(name, period[name]) for name in self._columns}
+        told = {**period["columns"], **period}
+        states = {name: self._column(name, told[name]) for name in self._columns}
         up = np.frombuffer(period["up"], dtype=np.uint8).astype(bool)
         states["fix_m"] = np.where(up[:, None], states["fix_m"], np.nan)
         figures = self._reference.step(int(period["time_ns"]), states)
@@ -40,11 +48,10 @@ class DrawnReference:
 
     def _column(self, name: str, data: bytes) -> Array:
         """Return a column of the states, with a row for each vehicle."""
-        kind = STATES.schema.field(name).type
-        if not pa.types.is_fixed_size_list(kind):
+        size = self._sizes[name]
+        if size == 1:
             return unpack(data)[:, 0].astype(float)
-        rows = unpack(data, kind.list_size).astype(float)
-        return np.broadcast_to(rows, (self._count, kind.list_size))
+        return np.broadcast_to(unpack(data, size).astype(float), (self._count, size))
 
 
 def published(scene: Mapping[str, Any]) -> dict[str, tuple[str, float]]:

@@ -12,7 +12,6 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.log_book import MOST_NOTES
 from emulator.records.node_logs import NodeLogs
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.states import COMMON_VALUES
 from emulator.records.tables import STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
@@ -147,7 +146,7 @@ def test_names_of_columns_and_names_with_a_dot_are_taken(node: Node) -> None:
 
 
 def test_vnets_own_columns_are_those_that_no_value_can_have() -> None:
-    assert frozenset(STATES.columns) - COMMON_VALUES.keys() - {"estimate_m", "covariance_m2"} == RESERVED_NAMES
+    assert frozenset(STATES.columns) - {"estimate_m", "covariance_m2", "common_error_m"} == RESERVED_NAMES
 
 
 def test_numbers_and_texts_by_one_name_are_refused(node: Node) -> None:

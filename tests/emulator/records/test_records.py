@@ -19,10 +19,13 @@ from emulator.records.events import Event, EventKind
 from emulator.records.metrics import Metrics, summarize
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
+from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, build_world
 from vnet.errors import VnetError
 from vnet.reports import Report
+
+COOPERATIVE = Program(entry="agents.cooperative:main")
 
 
 def beacons(folder: Path, **radio: float) -> RecordedRun:
@@ -206,7 +209,7 @@ def instant(position: np.ndarray, common: list[float]) -> Instant:
 
 def test_metrics_are_the_figures_by_hand() -> None:
     position = np.array([[0.0, 0.0], [10.0, 0.0], [500.0, 0.0]])
-    metrics = Metrics(["a", "b", "c"], np.array([0, 0, 1]), 100_000_000)
+    metrics = Metrics(["a", "b", "c"], np.array([0, 0, 1]), 100_000_000, COOPERATIVE)
     estimates = {"a": [1.0, 0.0], "b": [3.0, 0.0], "c": [2.0, 2.0]}
     unit = [1.0, 0.0, 0.0, 1.0]
     reports = [
@@ -234,7 +237,7 @@ def test_metrics_are_the_figures_by_hand() -> None:
 
 def test_who_reports_nothing_leaves_nulls_and_nan_is_counted() -> None:
     position = np.array([[0.0, 0.0], [10.0, 0.0]])
-    metrics = Metrics(["a", "b"], np.array([0, 0]), 100_000_000)
+    metrics = Metrics(["a", "b"], np.array([0, 0]), 100_000_000, COOPERATIVE)
     metrics.record(instant(position, [2.0, 0.0]), [])
     figures = metrics.rows[-1]
     assert figures.common_error_rmse_m is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import emulator
-from emulator.cells.measure import judged_figures
+from emulator.cells.cells import judged_figures
 from emulator.radio.outcomes import Outcome
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun

@@ -16,7 +16,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.records.events import Event
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import event_message, unpack
+from emulator.stream.messages import event_message
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
     Canvas,
@@ -147,16 +147,16 @@ def test_there_is_no_time_but_the_emulated(path: Path) -> None:
         ("/map/estimate", "estimate_m", None),
         ("/position/fix", "fix_m", "position_m"),
         ("/position/estimate", "estimate_m", "position_m"),
-        ("/common/estimates", "common_error_estimate_m", "common_error_m"),
+        ("/common/estimate", "common_error_estimate_m", "common_error_m"),
     ],
 )
 def test_points_are_where_the_messages_say_with_north_up(
     told: Told, entities: dict[str, Entity], entity: str, name: str, relative_to: str | None
 ) -> None:
     for period in periods(told):
-        wanted = unpack(period.message[name], 2)
+        wanted = period.points(name)
         if relative_to is not None:
-            wanted = wanted - unpack(period.message[relative_to], 2)
+            wanted = wanted - period.points(relative_to)
         drawn = entities[entity].array("Points2D:positions", period.time_s)
         np.testing.assert_allclose(drawn, wanted * [1, -1], rtol=1e-6, atol=1e-4)
 
@@ -164,7 +164,7 @@ def test_points_are_where_the_messages_say_with_north_up(
 @pytest.mark.parametrize(
     ("entity", "figures"),
     [
-        ("/figures/common", ["common_error_rmse_m", "deviation_m"]),
+        ("/figures/common-error", ["common_error_rmse_m", "deviation_m"]),
         ("/figures/consensus", ["consensus_error_m", "bias_m"]),
         ("/figures/position", ["position_rmse_m", "fix_rmse_m"]),
     ],
@@ -183,7 +183,7 @@ def test_lines_have_the_figures_of_the_messages(
 
 
 def test_the_limit_is_drawn_and_beats_raw_fixes_by_far(told: Told, entities: dict[str, Entity]) -> None:
-    common = entities["/figures/common"]
+    common = entities["/figures/common-error"]
     assert common.static["SeriesLines:names"][2] == "bound: a Kalman filter that hears every fix of its component"
     late = [common.array("Scalars:scalars", period.time_s)[2] for period in periods(told)][-5:]
     assert 0 < np.mean(late) < np.mean([period.figure("fix_rmse_m") for period in periods(told)])
@@ -276,15 +276,15 @@ def test_events_are_told_at_their_time_and_those_after_the_last_period_too(
 def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str, Entity]) -> None:
     number = {node: row for row, node in enumerate(told[0][1]["node_ids"])}
     matrix = np.full((6, 6), np.nan)
-    drawn = entities["/weights"].at["Tensor:data"]
+    drawn = entities["/peers/weight"].at["Tensor:data"]
     compared = 0
     for period in periods(told):
-        for node, row in period.weights().items():
+        for node, row in period.peers().get("weight", {}).items():
             matrix[number[node]] = row
         matrix[~period.up] = np.nan
         if period.time_s in drawn:
             tensor = drawn[period.time_s][0]
-            assert tensor["names"] == ["fuses", "is weighed"]
+            assert tensor["names"] == ["reports", "of"]
             np.testing.assert_allclose(_numbers(tensor).reshape(6, 6), matrix, rtol=1e-6)
             compared += 1
     assert compared >= 2
@@ -355,11 +355,11 @@ def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dic
 def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, Entity]) -> None:
     period = next(period for period in periods(told) if period.time_s == LATE_S)
     position, estimate = (period.points(f"{name}_m")[2] for name in ("position", "estimate"))
-    common = period.points("common_error_estimate_m")[2] - period.truth_m
+    common = (period.points("common_error_estimate_m") - period.points("common_error_m"))[2]
     drawn = entities["/vehicle/errors"].array("Scalars:scalars", LATE_S)
     wanted = [np.hypot(*(estimate - position)), np.hypot(*common)]
     np.testing.assert_allclose(drawn, wanted, rtol=1e-5)
-    assert all(clouds <= {"Points2D:positions"} for clouds in [set(entities["/vehicle/common/particles"].at)])
+    assert all(clouds <= {"Points2D:positions"} for clouds in [set(entities["/vehicle/common/cloud"].at)])
     table = list(entities["/vehicle/table"].at["TextDocument:text"].values())[-1][0]
     assert table.splitlines()[0] == "| hears | frames in 5 s | delivered | weight |"
     assert "| v03 (itself) |" in table
@@ -379,7 +379,7 @@ def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path)
     assert max(table) == pytest.approx(1.5)
     assert table[max(table)] == ["v03 is not in the network: it has not entered yet, or has left."]
     assert max(found["/vehicle/errors"].at["Scalars:scalars"]) < 1.5
-    for name in ("position/estimate", "common/particles", "hears/neighbours"):
+    for name in ("position/estimate", "common/cloud", "hears/neighbours"):
         last = found[f"/vehicle/{name}"].at["Points2D:positions"]
         assert max(last) == pytest.approx(1.5) and len(last[max(last)]) == 0, name
 
