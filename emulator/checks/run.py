@@ -76,7 +76,7 @@ def check_no_exceptions(recorded: RecordedRun) -> Finding:
     )
     rows = [
         {
-            "what": kind.why,
+            "what": kind.first.why,
             "vehicles": len(kind.nodes),
             "node": kind.first.node,
             "time_ns": kind.first.time_ns,

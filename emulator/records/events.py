@@ -14,7 +14,7 @@ from enum import Flag, IntEnum, StrEnum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vnet.errors import VnetError, printable
+from vnet.errors import VnetError, first_names, printable
 
 if TYPE_CHECKING:
     from typing import Self
@@ -55,6 +55,8 @@ class Part(Flag):
 
 NOTE, TOLD, CHANGE, WARNING, FAILURE = Level
 SAMPLES, MEASURED, SAID, GROUPED, ENDS_PROGRAM, CUTS_RUN = Part
+REASONS, PAGES = ("how", "error", "reason"), ("where", "log_tail", "key")
+"""Details that are told without their names, and those that are not told in a line."""
 QUIET_LEVELS = ("debug", "info")
 """Levels of log lines that are no warnings."""
 
@@ -215,11 +217,6 @@ class Event:
         return self.kind in KINDS and bool(KINDS[self.kind].part & part)
 
     @property
-    def words(self) -> str:
-        """Its kind in words."""
-        return self.kind.replace("_", " ")
-
-    @property
     def name(self) -> str:
         """Name that the program gave to an event of its own (`node.event`); else the kind."""
         return str(self.details.get("name", "")) if self.kind == EventKind.event else self.kind
@@ -230,9 +227,51 @@ class Event:
         values = self.details.get("details") if self.kind == EventKind.event else self.details
         return values if isinstance(values, dict) else {}
 
+    @property
+    def why(self) -> str:
+        """Error of a failure, or how its process ended, and where an exception came up."""
+        error = str(self.details.get("error") or self.details.get("how", ""))
+        place = str(self.details.get("place", ""))
+        return error + (", " if ":" in error else ": ") * bool(place) + place
+
+    @property
+    def said(self) -> str:
+        """Details in words: reasons first, without pages of text, which are in the run's folder."""
+        if self.kind == EventKind.log:
+            return str(self.details.get("text", ""))
+        if self.kind == EventKind.exception:
+            return self.why
+        if self.kind == EventKind.started:
+            start_up_s = self.details.get("start_up_s") or 0.0
+            return f"all have joined in {start_up_s:.1f} s" if start_up_s else ""
+        left_out = () if self.kind == EventKind.event else (*PAGES, *REASONS, "fault", "nodes")
+        told = {key: _listed(value) for key, value in self.values.items()}
+        said = [told[key] for key in (*REASONS, "nodes") if key in left_out and told.get(key)]
+        return ", ".join(said + [f"{key} {value}" for key, value in told.items() if key not in left_out])
+
+    @property
+    def what(self) -> str:
+        """Name and details in words, without whom it befell."""
+        if self.kind in (EventKind.log, EventKind.exception):
+            return self.said
+        name = self.name if self.kind == EventKind.event else self.kind.replace("_", " ")
+        name = name.removeprefix("fault ") if "fault" in self.details else name
+        return f"{name}: {self.said}" if self.said else name
+
+    @property
+    def text(self) -> str:
+        """One line: whom it befell, what, and why. `v04 died: SIGKILL`."""
+        who = str(self.node or self.details.get("fault") or "")
+        colon = ":" * (self.kind in (EventKind.log, EventKind.exception))
+        return f"{who}{colon} {self.what}".strip()
+
     def line(self) -> str:
         """Return the event as a line of `events.jsonl`."""
         return json.dumps({"time_ns": self.time_ns, "kind": self.kind, "node": self.node, **self.details}) + "\n"
+
+
+def _listed(value: object) -> str:
+    return first_names(value, with_total=True) if isinstance(value, list) else str(value)
 
 
 def parse_events(path: Path, content: bytes) -> list[Event]:

@@ -34,16 +34,6 @@ class Kind:
         return self.nodes[0] if len(self.nodes) == 1 else f"{len(self.nodes)} vehicles"
 
     @property
-    def why(self) -> str:
-        """The first one's error, or how its process ended, and where an exception came up."""
-        details = self.first.details
-        error = str(details.get("error") or details.get("how", ""))
-        place = str(details.get("place", ""))
-        if not place:
-            return error
-        return f"{error}, {place}" if ":" in error else f"{error}: {place}"
-
-    @property
     def when(self) -> str:
         """The instant, or that of the first one."""
         instant = f"at {shown_s(self.first.time_ns)}"
@@ -55,13 +45,13 @@ class Kind:
     def untimed(self) -> str:
         """The kind in one line without its instant."""
         ended = "" if self.first.kind == EventKind.exception else f" {self.first.kind}"
-        return f"{self.who}{ended}: {self.why}"
+        return f"{self.who}{ended}: {self.first.why}"
 
     def __str__(self) -> str:
         if self.first.kind == EventKind.exception:
             return f"{self.untimed}, {self.when}"
         comma = "," if self.when.startswith("first") else ""
-        return f"{self.who} {self.first.kind}{comma} {self.when}: {self.why}"
+        return f"{self.who} {self.first.kind}{comma} {self.when}: {self.first.why}"
 
 
 def shown_s(time_ns: int) -> str:

@@ -26,7 +26,7 @@ from emulator.report.radio import radio_section
 from emulator.report.source import Source, maybe, why_not
 from emulator.report.timeline import timeline
 from vnet.counted import counted
-from vnet.errors import VnetError, first_names
+from vnet.errors import VnetError
 
 MOST_EVENTS = 200
 MOST_SAID = 2000
@@ -240,29 +240,14 @@ def _log(source: Source) -> dict[str, Any] | None:
 
 def _said(event: Event) -> dict[str, Any]:
     """A row of the table of log lines and events of programs."""
-    text = str(event.details.get("text") or event.details.get("name", ""))
-    if isinstance(details := event.details.get("details"), dict) and details:
-        text += ": " + ", ".join(f"{name} {value}" for name, value in details.items())
     level = str(event.details.get("level", event.kind))
-    return {"time (s)": f"{event.time_ns / 1e9:.3f}", "node": event.node or "", "level": level, "text": text}
+    return {"time (s)": f"{event.time_ns / 1e9:.3f}", "node": event.node or "", "level": level, "text": event.what}
 
 
 def _event(event: Event) -> dict[str, Any]:
     """A row of the table of events."""
-    details = {name: value for name, value in event.details.items() if name != "where"}
-    text = ", ".join(f"{name} {_listed(value)}" for name, value in details.items())
-    return {
-        "time (s)": f"{event.time_ns / 1e9:.3f}",
-        "event": event.kind,
-        "node": event.node or "",
-        "details": text,
-    }
-
-
-def _listed(value: Any) -> str:
-    if not isinstance(value, list):
-        return str(value)
-    return first_names(value, with_total=True)
+    who = event.node or event.details.get("fault", "")
+    return {"time (s)": f"{event.time_ns / 1e9:.3f}", "event": event.kind, "of": who, "details": event.said}
 
 
 def _scenario(source: Source) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from emulator.records.reported import MOST_DOTTED, figures_among
 from emulator.records.run_tables import Beliefs
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
+from vnet.errors import printable
 from vnet.reports import Report
 from vnet.types import Array
 
@@ -243,11 +244,12 @@ def _one_each(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def event_message(event: Event) -> dict[str, Any]:
-    """Return an event as a map, with long details truncated."""
+    """Return an event as a map, with its words, and long details truncated."""
     return {
         "time_ns": event.time_ns,
         "kind": event.kind,
         "node": event.node,
+        "text": printable(event.text, LONGEST_DETAIL),
         "details": {key: _short(value) for key, value in event.details.items()},
     }
 

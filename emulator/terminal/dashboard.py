@@ -20,8 +20,6 @@ from rich.style import Style
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN
-from emulator.records.events import Event, EventKind
-from emulator.records.failures import Kind
 from vnet.errors import printable
 
 Line = list[Segment]
@@ -299,33 +297,12 @@ class _Rows:
         for event in self._shot.events[-rows:]:
             label = "" if lines else "events"
             when = f"{event.time_ns / 1e9:>6.1f} s  "
-            about = _cut(describe(event), max(1, self._width - self._label - len(when)))
+            about = _cut(printable(event.text, 300), max(1, self._width - self._label - len(when)))
             style = BAD if event.is_bad else PLAIN
             lines.append([Segment(label.ljust(self._label), DIM), Segment(when, DIM), Segment(about, style)])
         if not lines:
             lines.append([Segment("events".ljust(self._label), DIM), Segment("none yet", DIM)])
         return lines
-
-
-def describe(event: Event) -> str:
-    """An event in words, in one line: who, what, and the details that say why."""
-    if event.kind == EventKind.started:
-        start_up_s = event.details.get("start_up_s") or 0.0
-        return f"started: all have joined in {start_up_s:.1f} s" if start_up_s else "started"
-    if event.kind == EventKind.exception:
-        return printable(f"{event.node}: {Kind((event,)).why}", 300)
-    details = dict(event.details)
-    fault, nodes = details.pop("fault", None), details.pop("nodes", None)
-    who = event.node or fault or ""
-    what = event.words.removeprefix("fault ") if fault else event.words
-    for key in ("where", "log_tail", "key"):  # pages of text; they are in the run's folder
-        details.pop(key, None)
-    said = [str(details.pop(key)) for key in ("how", "error", "reason") if key in details]
-    if isinstance(nodes, list) and nodes:
-        said.append(_names(nodes, 40))
-    said += [f"{key} {value}" for key, value in details.items() if isinstance(value, (str, int, float))]
-    text = f"{who} {what}".strip()
-    return printable(f"{text}: {', '.join(said)}" if said else text, 300)
 
 
 def sparkline(values: Sequence[float | None], width: int) -> str:

@@ -19,7 +19,7 @@ from emulator.drivers.status import Course, Snapshot
 from emulator.records.events import GROUPED, Event
 from emulator.records.failures import key_of, kinds_of
 from emulator.terminal.console import LogFormat
-from emulator.terminal.dashboard import Dashboard, describe
+from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import EVERY_S, Painter
 from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import first_names, printable
@@ -218,7 +218,7 @@ class PlainLines(_Lines):
                 self._write(f"{kind.first.time_ns / 1e9:6.1f} s  {printable(kind.untimed, LONGEST_LINE)}")
         for event in news:
             if event.is_bad and not event.has(GROUPED):
-                self._write(f"{event.time_ns / 1e9:6.1f} s  {describe(event)}")
+                self._write(f"{event.time_ns / 1e9:6.1f} s  {printable(event.text, LONGEST_LINE)}")
 
 
 class JsonLines(_Lines):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -51,7 +50,6 @@ LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
 LOG_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "critical": "CRITICAL"}
 """Rerun's names of the levels of a program's log."""
-LONGEST_DETAIL = 60
 NAMED_DOWN = 6
 ACTING, NOBODY = "acting", "none"
 """States of faults, and of those who are down."""
@@ -227,34 +225,7 @@ class OverviewScene:
             level = "WARN" if level_of(event["kind"], event["details"]) >= WARNING or planned else "INFO"
             if event["kind"] == EventKind.log:
                 level = LOG_LEVELS.get(str(event["details"].get("level")), level)
-            self._canvas.log("events", rr.TextLog(in_words(event), level=level))
-
-
-def in_words(event: Mapping[str, Any]) -> str:
-    """An event in a line: `v03 died: how SIGKILL`, `v02 suspects: member v01`."""
-    if event["kind"] == EventKind.log:
-        return drawable(f"{event['node']}: {event['details'].get('text', '')}")
-    what, told = event["kind"].replace("_", " "), event["details"]
-    if event["kind"] == EventKind.event:  # of a program, which has named it
-        what, told = _short(told.get("name", what)), _as_map(told.get("details"))
-    details = [f"{key} {_short(value)}".rstrip() for key, value in told.items()]
-    who = f"{event['node']} " if event["node"] else ""
-    return drawable(f"{who}{what}: {', '.join(details)}" if details else f"{who}{what}")
-
-
-def _as_map(details: object) -> Mapping[str, Any]:
-    """Return what a program has told of its event; in one piece where the message was too long for all of it."""
-    try:
-        told = json.loads(str(details))
-    except ValueError:
-        told = {"": details}
-    known = told if isinstance(told, dict) else {}
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in known.items()}
-
-
-def _short(value: object) -> str:
-    text = str(value).translate(str.maketrans("", "", '"[]{}'))
-    return text if len(text) <= LONGEST_DETAIL else f"{text[: LONGEST_DETAIL - 1]}…"
+            self._canvas.log("events", rr.TextLog(drawable(event["text"]), level=level))
 
 
 def draw_scale(canvas: Canvas, point_m: Floats) -> None:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.records.events import Event
-from emulator.terminal.dashboard import Dashboard, describe, sparkline
+from emulator.terminal.dashboard import Dashboard, sparkline
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
 FAULTS = (
@@ -227,21 +227,3 @@ def test_a_sparkline_of_odd_values() -> None:
     assert sparkline((None,) * 60 + (1.0,) * 60, 4) == "  ▄▄"
     assert sparkline((1.0,) * 60 + (math.inf,) * 60, 4) == "▄▄▇▇"
     assert sparkline((0.0,) * 60 + (1.0,) * 60, 4) == "▁▁▇▇"
-
-
-@pytest.mark.parametrize(
-    ("event", "said"),
-    [
-        (Event(0, "started", None, {"start_up_s": 0.0}), "started"),
-        (Event(0, "restarted", "v01", {"incarnation": 2}), "v01 restarted: incarnation 2"),
-        (Event(0, "fault_ended", None, {"fault": "loss-3"}), "loss-3 ended"),
-        (Event(0, "fault_started", None, {"fault": "loss-3", "nodes": []}), "loss-3 started"),
-        (Event(0, "refused", "v01", {"key": "k", "reason": "not its own"}), "v01 refused: not its own"),
-        (Event(0, "transport_gap", None, {"count": 3}), "transport gap: count 3"),
-        (Event(0, "crashed", "v01", {"error": "a\nb", "where": "line 1"}), "v01 crashed: a\\nb"),
-        (Event(0, "observer_ended", "recorder", {"how": "SIGTERM"}), "recorder observer ended: SIGTERM"),
-        (Event(0, "interrupted", None, {}), "interrupted"),
-    ],
-)
-def test_events_in_words(event: Event, said: str) -> None:
-    assert describe(event) == said

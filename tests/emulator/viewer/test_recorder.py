@@ -13,10 +13,8 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
-from emulator.records.events import Event
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import event_message
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
     Canvas,
@@ -27,7 +25,6 @@ from emulator.viewer.drawing import (
     link_states,
     nice_length,
 )
-from emulator.viewer.overview_scene import in_words
 from emulator.viewer.radio_scene import STROKES, delivery_by_distance
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
@@ -428,27 +425,6 @@ def test_ellipses_hold_95_percent() -> None:
 def test_what_the_font_cannot_draw_is_not_drawn() -> None:
     assert drawable("müde – 3 ≤ 4\n\tja") == "müde – 3 ≤ 4 ja"
     assert drawable("a🟩b\x00c漢") == "a?b?c?"
-
-
-def test_events_in_words() -> None:
-    event = {"node": "v03", "kind": "fault_started", "details": {"nodes": '["v01", "v02"]', "log": "x" * 99}}
-    assert in_words(event) == f"v03 fault started: nodes v01, v02, log {'x' * 59}…"
-    assert in_words({"node": None, "kind": "interrupted", "details": {}}) == "interrupted"
-
-
-@pytest.mark.parametrize(
-    ("details", "words"),
-    [
-        ({"member": "v01", "late_s": 0.5, "heard": ["v02"]}, "v02 suspect: member v01, late_s 0.5, heard v02"),
-        ({}, "v02 suspect"),
-        ({"why": "a: b"}, "v02 suspect: why a: b"),
-    ],
-)
-def test_events_of_programs_in_words(details: dict[str, object], words: str) -> None:
-    event = Event(0, "event", "v02", {"name": "suspect", "details": details})
-    assert in_words(event_message(event)) == words
-    long = Event(0, "event", "v02", {"name": "suspect", "details": {"text": "x" * 9999}})
-    assert in_words(event_message(long)).startswith("v02 suspect: text: xxx")
 
 
 def test_lengths() -> None:
