@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from emulator.checks.channel import received_twice
 from emulator.checks.own import PREFIX
 from emulator.checks.recomputed import check_metrics, check_outcomes, checked_world
-from emulator.records.backbone_table import backbone_figures
 from emulator.records.code_digest import vnet_digest
 from emulator.records.costs import Costs, PayloadSizes, RunCost, run_cost
 from emulator.records.driven_table import driving_figures
@@ -28,7 +27,7 @@ from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
 from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
-from emulator.records.tables import BACKBONE, DRIVEN, PAYLOADS
+from emulator.records.tables import BACKBONE, DRIVEN, PAYLOADS, backbone_figures
 from emulator.records.verdicts import (
     MOST_ROWS,
     CheckResult,

@@ -13,9 +13,8 @@ from rich.progress import track
 
 from emulator.cli.options import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
 from emulator.records.run_folder import RECORDING, RunFolder
-from emulator.stream.pace import play as play_scheduled
-from emulator.stream.pace import schedule
-from emulator.stream.playback import Message, messages
+from emulator.stream.playback import Message, messages, schedule
+from emulator.stream.playback import play as play_scheduled
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.safe_console import SafeConsole
 from emulator.viewer.sinks import Sinks, has_display, place_to_serve

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.cli.options import LATEST, RunArgument
-from emulator.records.frame_log import FrameEntry, frame_log
+from emulator.records.parting import FrameEntry, frame_log
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.program import split_file
 from emulator.terminal.console import one_line_errors

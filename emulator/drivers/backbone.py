@@ -15,7 +15,7 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from emulator.radio.trace import payload_digest
-from emulator.records.backbone_table import BackboneRow, backbone_table
+from emulator.records.tables import BackboneRow, backbone_table
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.roadside import Backbone
 from emulator.scenario.scenario import Scenario

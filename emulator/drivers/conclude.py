@@ -21,7 +21,6 @@ from emulator.checks.own import PREFIX, own_findings
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
-from emulator.records.busy import busy_table
 from emulator.records.costs import run_cost
 from emulator.records.events import EventKind
 from emulator.records.manifest import write_manifest
@@ -35,7 +34,7 @@ from emulator.records.run_folder import (
     RunFolder,
     write_text,
 )
-from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES
+from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES, busy_table
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised
 from emulator.scenario.declared import declared_checks

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import pyarrow as pa
 
-from emulator.records.background_table import background_table
 from emulator.records.driven_table import driven_table
 from emulator.records.events import KINDS
 from emulator.records.run_folder import RunFolder
+from emulator.records.tables import background_table
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
 from emulator.world.world import World

@@ -29,8 +29,8 @@ from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.records.costs import Costs
 from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
-from emulator.records.payloads import PayloadRecorder
 from emulator.records.run_folder import RunFolder
+from emulator.records.tables import PayloadRecorder
 from emulator.scenario.fault_families import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.lookahead import least_latency_ns
 from emulator.scenario.program import Program

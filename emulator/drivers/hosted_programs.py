@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from emulator.drivers.program_output import output_kept
-from emulator.records.node_logs import NodeLogs
+from emulator.records.node_files import NodeLogs
 from emulator.records.run_folder import RunFolder
 from vnet.node import Node
 from vnet.runtime import running_node

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from emulator.records.node_logs import NodeLogs
+from emulator.records.node_files import NodeLogs
 from vnet.node import Node
 from vnet.runtime.outside_loop import present_node
 

@@ -14,8 +14,7 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.memory import resident_kb
 from emulator.faults.plan import PlannedFault
 from emulator.radio.outcomes import Outcome
-from emulator.records.events import MEASURED, SAID, Event
-from emulator.records.failures import merged
+from emulator.records.events import MEASURED, SAID, Event, merged
 from emulator.records.period_figures import POSITION_FIGURES
 from vnet.units import NS_PER_S
 

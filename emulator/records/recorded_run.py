@@ -26,10 +26,8 @@ from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.trace import ACKNOWLEDGED, LATE
-from emulator.records.busy import busy_windows
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events
 from emulator.records.metrics import rows_of
-from emulator.records.payloads import KeptPayloads
 from emulator.records.period_figures import ProgramFigures, figures_if_here
 from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
@@ -54,12 +52,13 @@ from emulator.records.tables import (
     TRACE,
     Column,
     Condition,
+    KeptPayloads,
     Table,
     always,
+    busy_windows,
     columns_of,
 )
-from emulator.records.verdict_file import Record, read_record
-from emulator.records.verdicts import MOST_ROWS
+from emulator.records.verdicts import MOST_ROWS, Record, read_record
 from emulator.scenario.fault_families import ProcessFault, SenderFault
 from emulator.scenario.faults import Range, Swizzle
 from emulator.scenario.recorded import parse_recorded_scenario

@@ -17,8 +17,7 @@ from emulator.faults.plan import PlannedFault
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import BACKBONE, BACKGROUND, DRIVEN
-from emulator.records.verdict_file import Record
-from emulator.records.verdicts import CheckResult, NotExercised, Verdict
+from emulator.records.verdicts import CheckResult, NotExercised, Record, Verdict
 from emulator.scenario.fault_families import GnssFault
 from emulator.scenario.scenario import Scenario
 from emulator.world.graph import components_of_links

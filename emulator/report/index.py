@@ -16,7 +16,7 @@ from emulator.pages.page import put_page, render
 from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE, is_run_folder
-from emulator.records.verdict_file import Record
+from emulator.records.verdicts import Record
 from vnet.errors import VnetError, first_names
 
 MOST_REPORTED = 6

@@ -19,7 +19,7 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import Reference, reference_of, reference_series
 from emulator.records.reported import reported_figures
 from emulator.records.tables import STATES, TRACE
-from emulator.records.verdict_file import Record
+from emulator.records.verdicts import Record
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
 from vnet.types import Array

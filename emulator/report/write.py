@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from emulator.pages.page import Table, put_page, render, table
-from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS
 from emulator.records.events import SAID, SAMPLES, Event
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE
-from emulator.records.verdict_file import Record
-from emulator.records.verdicts import CheckResult, Verdict
+from emulator.records.tables import on_backbone
+from emulator.records.verdicts import CheckResult, Record, Verdict
 from emulator.report.figures import draw
 from emulator.report.index import write_index
-from emulator.report.radio import radio_section
+from emulator.report.radio_figures import radio_section
 from emulator.report.source import Source, maybe, why_not
 from emulator.report.timeline import timeline
 from vnet.counted import counted

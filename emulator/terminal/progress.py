@@ -16,8 +16,7 @@ from rich.console import Console
 
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.status import Course, Snapshot
-from emulator.records.events import GROUPED, Event
-from emulator.records.failures import key_of, kinds_of
+from emulator.records.events import GROUPED, Event, key_of, kinds_of
 from emulator.terminal.console import LogFormat
 from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import EVERY_S, Painter

@@ -19,11 +19,11 @@ from rich.text import Text
 from emulator.checks.judge import Judgement, Verdict
 from emulator.checks.own import PREFIX
 from emulator.pages.text import as_text, cell
-from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS, RunCost, read_cost
 from emulator.records.period_figures import KeyFigure, shown_figures
 from emulator.records.reported import ReportedFigure
 from emulator.records.run_folder import RECORDING, REPORT
+from emulator.records.tables import on_backbone
 from emulator.records.verdicts import CheckResult
 from emulator.viewer.sinks import is_closed, repair_command
 

@@ -19,9 +19,8 @@ import rerun as rr
 from emulator.records.period_figures import ProgramFigures, figures_if_here
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.recorded import parse_recorded_scenario
-from emulator.viewer.blueprints import blueprint
+from emulator.viewer.blueprints import Content, blueprint
 from emulator.viewer.drawing import Canvas, Period
-from emulator.viewer.layout import Content
 from emulator.viewer.overview_scene import OverviewScene
 from emulator.viewer.program_scene import ProgramScene
 from emulator.viewer.radio_scene import RadioScene

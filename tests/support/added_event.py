@@ -21,8 +21,7 @@ def main(folder: Path) -> None:
     """Simulate a run in which the event befalls two vehicles, and print where it shows."""
     from docs.generate.files import page
     from emulator.drivers.session import Session
-    from emulator.records.events import EventKind
-    from emulator.records.failures import merged
+    from emulator.records.events import EventKind, merged
     from emulator.records.recorded_run import RecordedRun
     from emulator.report.timeline import marks_of
     from emulator.report.write import write_report

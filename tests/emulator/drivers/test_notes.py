@@ -10,7 +10,7 @@ import pytest
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.log_book import MOST_NOTES
-from emulator.records.node_logs import NodeLogs
+from emulator.records.node_files import NodeLogs
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import STATES
 from emulator.report.source import Source
@@ -107,7 +107,7 @@ def test_a_flood_is_cut_and_counted() -> None:
 
 
 def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.records.node_logs.LARGEST_LOG_BYTES", 20)
+    monkeypatch.setattr("emulator.records.node_files.LARGEST_LOG_BYTES", 20)
     logs = NodeLogs(tmp_path)
     for number in range(5):
         logs.write("v01", f"line {number:03}")

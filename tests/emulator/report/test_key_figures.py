@@ -16,8 +16,7 @@ from emulator.checks.judge import check_run
 from emulator.drivers.session import Session
 from emulator.drivers.status import Course
 from emulator.records.period_figures import program_figures
-from emulator.report.compare_page import comparison_page
-from emulator.report.comparison import Comparison
+from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.index import index_page
 from emulator.report.source import Source
 from emulator.report.sweep_page import heading

@@ -15,9 +15,9 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
-from emulator.records.busy import mean_busy
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
+from emulator.records.tables import mean_busy
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import LATENCY_BIN_NS, LATENCY_BINS, unpack, unpack_pairs
 from emulator.stream.playback import messages

@@ -8,7 +8,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from agents.cooperative.paper_values import paper_rmse
+from agents.cooperative.declared import paper_rmse
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
