@@ -24,6 +24,7 @@ from emulator.linear_model import convergence_factor, deviation_covariance
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.topology import Topology
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.tables import METRICS
 from emulator.scenario.lookahead import lookahead_ns
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
@@ -101,11 +102,11 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
     `noise_m` is, by rule, the noise per axis and round with which the linear model deviates as much.
     """
-    recorded = RecordedRun.open(run)
-    figure = next((each.name for each in recorded.declared.key if each.of_agreement), None)
+    key = RecordedRun.open(run).declared.key
+    figure = next((each.name for each in key if each.of_agreement), None)
     if figure is None:
         raise VnetError(f"{run}: its program declares no deviation between vehicles")
-    values = recorded.metrics[figure].to_pylist()
+    values = RecordedRun.open(run, {METRICS: [figure]}).metrics[figure].to_pylist()
     settled = [value for value in values[len(values) // 5 :] if value is not None]
     if not settled:
         raise VnetError(f"{run}: no {figure} in it; its program reported nothing of the kind")

@@ -174,13 +174,13 @@ def period_message(
     `background_m` (k, 2) are positions of vehicles without programs.
     """
     return {
-        **{name: pack(beliefs.columns[name]) for name in VECTORS},
         "period": instant.period,
         "time_ns": instant.time_ns,
         "position_m": pack(instant.position_m),
         "heading_rad": pack(instant.heading_rad),
         "fix_m": pack(instant.fix_m),
         "common_error_m": pack(instant.common_error_m),
+        **{name: pack(beliefs.columns[name]) for name in VECTORS},
         "columns": {name: pack(column) for name, column in beliefs.columns.items() if name not in VECTORS},
         "lists": _packed(beliefs.lists),
         "peers": _packed(beliefs.peers),

@@ -267,7 +267,7 @@ def test_events_are_told_at_their_time_and_those_after_the_last_period_too(
     events = [event for _, message in told for event in message.get("events", [])]
     logged = entities["/events"].at["TextLog:text"]
     assert {event["time_ns"] / 1e9 for event in events} == set(logged)
-    assert logged[1.2] == ["fault started: fault partition-1, nodes v01, v02, v03, v04, v05, v06"]
+    assert logged[1.2] == ["partition-1 started: v01, v02, v03, v04, v05, v06"]
 
 
 def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str, Entity]) -> None:
