@@ -23,7 +23,7 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.session import Session
 from emulator.records.run_folder import RECORDING
 from emulator.scenario.scenario import Scenario
-from emulator.viewer.reference import DrawnReference
+from emulator.viewer.overview_scene import DrawnReference
 from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, Access
 from vnet.transport.session import open_router, router_endpoint

@@ -20,7 +20,6 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -29,16 +28,24 @@ from typing import Any
 from PIL import Image
 from rerun.experimental import ViewerClient
 
+from emulator.records.period_figures import program_figures
 from emulator.records.run_folder import RECORDING
-from emulator.viewer.blueprints import blueprint
-from emulator.viewer.layout import EVERYTHING
+from emulator.scenario.program import Program
+from emulator.viewer.blueprints import Content, blueprint
+from emulator.viewer.drawing import POSITION
 from emulator.viewer.sinks import place_to_serve, viewer_command
 
 SCENARIO = Path(__file__).parent / "pictures" / "pictures.toml"
 VEHICLE = "v08"
 AT_S = 12.0
 TABS = ("overview", "radio", "vehicle", "program")
-CONTENT = replace(EVERYTHING, busy=False, values=("heard", "bytes", "rejected"))
+DECLARED = program_figures(Program(entry="agents.cooperative:main"))
+CONTENT = Content(
+    estimates=(*DECLARED.estimates, POSITION),
+    charts=tuple((chart["id"], chart["axis"]) for chart in DECLARED.charts),
+    peers=DECLARED.peers,
+    values=("heard", "bytes", "rejected"),
+)
 """Data of the run, from which the tabs of the native viewer are made."""
 DESK, PHONE = (1600, 900), (390, 844)
 MENU = 36

@@ -100,15 +100,18 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
     `noise_m` is, by rule, the noise per axis and round with which the linear model deviates as much.
     """
-    recorded = RecordedRun.open(run, {METRICS: ["deviation_m"]})
-    values = recorded.metrics["deviation_m"].to_pylist()
+    key = RecordedRun.open(run).declared.key
+    figure = next((each.name for each in key if each.of_agreement), None)
+    if figure is None:
+        raise VnetError(f"{run}: its program declares no deviation between vehicles")
+    values = RecordedRun.open(run, {METRICS: [figure]}).metrics[figure].to_pylist()
     settled = [value for value in values[len(values) // 5 :] if value is not None]
     if not settled:
-        raise VnetError(f"{run}: no deviation in it; its program reported no common error")
+        raise VnetError(f"{run}: no {figure} in it; its program reported nothing of the kind")
     deviation = float(np.sqrt(np.mean(np.square(settled))))
     variance = {name: figures["deviation_variance"] for name, figures in rules.items()}
     noise = {name: deviation / float(np.sqrt(2 * value)) for name, value in variance.items() if value}
-    return {"deviation_m": deviation, "noise_m": noise}
+    return {"deviation": deviation, "noise_m": noise}
 
 
 # Graphs.
@@ -235,7 +238,7 @@ def analysis_table(analysis: dict[str, Any]) -> Group:
         graph.add_row(name, value)
     parts: list[Any] = [graph, _rules_table(analysis), *map(Text, analysis["left_out"])]
     if "measured" in analysis:
-        parts.append(f"measured: deviation {analysis['measured']['deviation_m']:.4g} m")
+        parts.append(f"measured: deviation {analysis['measured']['deviation']:.4g} m")
     return Group(*parts)
 
 

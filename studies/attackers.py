@@ -17,6 +17,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import links_within
 from emulator.world.world import build_world
 from studies.comparisons import COOPERATIVE
+from studies.measure import study_cell
 from studies.paper import Labels
 from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
@@ -77,7 +78,7 @@ def attack_cells(
         for name, attack in ATTACKS.items():
             for seed in seeds:
                 labels: Labels = {"network": network, "attack": name, "seed": seed}
-                cells.append(Cell(labels, _scenario(section, seed, duration_s, attack, best), duration_s / 2))
+                cells.append(study_cell(labels, _scenario(section, seed, duration_s, attack, best), duration_s / 2))
     return cells
 
 

@@ -21,6 +21,7 @@ from emulator.cells.cells import Cell, has_result, has_states, read_series, read
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
+from studies.measure import study_cell
 from studies.paper import SETTLED_S, everybody
 from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
@@ -81,7 +82,7 @@ def place(
 def city_cells(place: Mapping[str, Any], seeds: Sequence[int], duration_s: float) -> list[Cell]:
     """One filter that hears all, and each mechanism; `place` are the sections `network` and, if any, `map`."""
     return [
-        Cell(
+        study_cell(
             {"mechanism": mechanism, "seed": seed},
             city_scenario(place, seed, mechanism, duration_s),
             min(SETTLED_S, duration_s / 2),

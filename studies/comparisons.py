@@ -16,9 +16,9 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.cells.cells import Cell, has_result, read_series
-from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
 from emulator.scenario.loading import scenario_of
 from emulator.scenario.scenario import Scenario
+from studies.measure import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS, study_cell
 from studies.paper import BOUND, BOUND_POSITION, Labels, counted_from
 from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
@@ -155,7 +155,7 @@ def comparison_cells(
                 start = {"world.common_error.start_s": COMMON_APART_S * (seed - 1)} if world else {}
                 faults = list(_churn(duration_s)) if study == "churn" else []
                 scenario = _scenario(section, seed, variant, duration_s, {**(world or {}), **start}, faults)
-                cells.append(Cell(labels, scenario, counted_from(duration_s)))
+                cells.append(study_cell(labels, scenario, counted_from(duration_s)))
     return cells
 
 

@@ -32,6 +32,7 @@ from emulator.linear_model import convergence_factor
 from emulator.pages.palette import PALETTE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
+from studies.measure import study_cell
 from studies.paper import network_sections
 from studies.paper_values import PAPER_RANGE_M
 from vnet.errors import VnetError
@@ -149,7 +150,7 @@ def _cell(
         "latency_ms": radio.get("latency_ms", NEAR_MS),
         "seed": seed,
     }
-    return Cell(labels, _scenario(network, rule, seed, rounds, radio, silent))
+    return study_cell(labels, _scenario(network, rule, seed, rounds, radio, silent))
 
 
 def _scenario(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from emulator.cells.cells import Cell
-from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
+from studies.measure import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS, study_cell
 from studies.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
 from studies.reports import Result, column, select, unique
 from studies.tables import MISSING, markdown_table
@@ -26,7 +26,7 @@ def divergence_cells(
         for seed in seeds:
             labels: Labels = {"network": network, "mechanism": "optimized", "seed": seed, "duration_s": duration_s}
             scenario = default_scenario(section, seed, DEFAULT_ROWS["optimized"], duration_s)
-            cells.append(Cell(labels, scenario, counted_from(duration_s)))
+            cells.append(study_cell(labels, scenario, counted_from(duration_s)))
     return cells
 
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from emulator.cells.cells import Cell
-from emulator.cells.measure import REFERENCE
 from emulator.scenario.scenario import Scenario
 from emulator.world.networks import generate_network, load_network
 from emulator.world.world import build_world, components
+from studies.measure import REFERENCE, study_cell
 from studies.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
 from vnet.errors import VnetError
 
@@ -69,7 +69,7 @@ def table2_cells(
                 for seed in seeds:
                     labels: Labels = {"network": network, "sides": side_count, "mechanism": mechanism, "seed": seed}
                     scenario = paper_scenario(section, seed, mechanism, side_count)
-                    cells.append(Cell(labels, scenario))
+                    cells.append(study_cell(labels, scenario))
     return cells
 
 
@@ -82,7 +82,7 @@ def default_cells(
         for seed in seeds:
             for mechanism, options in (rows or DEFAULT_ROWS | ONE_HOP_ROWS).items():
                 labels: Labels = {"network": network, "mechanism": mechanism, "seed": seed}
-                cells.append(Cell(labels, default_scenario(section, seed, options), SETTLED_S))
+                cells.append(study_cell(labels, default_scenario(section, seed, options), SETTLED_S))
     return cells
 
 
@@ -111,7 +111,7 @@ def table1_cells(seeds: Sequence[int], network: Path) -> list[Cell]:
     rules: list[tuple[str, dict[str, Any]]] = [("optimized", {"fusion": "optimized"})]
     rules += [(f"{alpha:g}", {"fusion": "constant", "alpha": alpha}) for alpha in ALPHAS]
     return [
-        Cell(
+        study_cell(
             {"weights": name, "seed": seed},
             _paper(section, seed, {"profile": "paper", **options}, np.array(RING)),
         )

@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from emulator.cells.cells import Cell
 from emulator.records.metrics import anees_band
+from studies.measure import study_cell
 from studies.paper import DEFAULT_S, Labels, bound_scenario, counted_from, default_scenario
 from studies.reports import Result, column, select, unique
 from studies.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
@@ -60,7 +61,7 @@ def tempering_cells(
                         scenario = bound_scenario(section, seed, True, options, duration_s)
                     else:
                         scenario = default_scenario(section, seed, options, duration_s)
-                    cells.append(Cell(labels, scenario, counted_from(duration_s)))
+                    cells.append(study_cell(labels, scenario, counted_from(duration_s)))
     return cells
 
 

@@ -153,10 +153,10 @@ def test_what_only_looks_like_an_import_is_none() -> None:
 def test_circles_and_upward_imports_would_be_seen() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set(), "e": {"a"}}) == [["a", "b", "c"]]
     assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
-    graph = {"vnet.errors": {"emulator.cli"}, "emulator.checks.run": {"emulator.stream.pace", "vnet.errors"}}
+    graph = {"vnet.errors": {"emulator.cli"}, "emulator.checks.run": {"emulator.stream.playback", "vnet.errors"}}
     assert violations(graph, LAYERS) == [
         "vnet.errors -> emulator.cli",
-        "emulator.checks.run -> emulator.stream.pace",
+        "emulator.checks.run -> emulator.stream.playback",
     ]
 
 
@@ -199,15 +199,25 @@ EXAMPLES = re.compile(
 )
 NAMING_EXAMPLES = {"vnet/cmm.py", "vnet/runtime/programs.py"}
 """The former place of the mathematics, and the former name of a program."""
+MEAN_OF_FIXES = "emulator/checks/senders.py"
+"""A check whose figure, the mean of the fixes' errors, has the name of the program's mean."""
 
 
-def test_neither_vnet_nor_the_emulator_names_an_example_program() -> None:
-    """A program declares all that belongs to it; only the studies are about one. Figures are not held yet."""
+FIGURES = re.compile(
+    r"common_error_(estimate|covariance|rmse|anees)|\b(deviation|bias|cloud)_m\b|stacked_(common|rmse|deviation)"
+    r"|consensus_error|component_(rmse|deviation)_m|[\"'`]mean_m[\"'`]|weight\.v\d|\b[Pp]articles\b"
+)
+"""Figures, columns and views of the cooperative program."""
+
+
+def test_neither_vnet_nor_the_emulator_names_an_example_program_or_its_figures() -> None:
+    """A program declares all that belongs to it; only the studies are about one."""
     listed = subprocess.run(["git", "ls-files", "vnet", "emulator"], cwd=ROOT, capture_output=True, text=True)
     files = [name for name in listed.stdout.split() if (ROOT / name).is_file() and "/experiments/" not in name]
     assert len(files) > 300
     naming = {name for name in files if EXAMPLES.search((ROOT / name).read_text())}
     assert naming == NAMING_EXAMPLES
+    assert [name for name in files if FIGURES.search((ROOT / name).read_text())] == [MEAN_OF_FIXES]
 
 
 def test_there_are_no_circles() -> None:

@@ -17,9 +17,7 @@ LONGEST_TEXT = 64
 Value = bool | float | Annotated[str, Meta(max_length=LONGEST_TEXT)] | list[float]
 """A reported value besides the estimates."""
 
-RESERVED_NAMES = frozenset(
-    ["period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_estimate_m", "values"]
-)
+RESERVED_NAMES = frozenset(["period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "values"])
 """Names that no reported value can have: columns that the emulator fills in every row of a run's states."""
 COVARIANCE_TOLERANCE = 1e-6
 """Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
@@ -93,7 +91,7 @@ def check_name(name: str) -> None:
 
 
 def checked_value(name: str, value: ArrayLike) -> Value:
-    if name == "common_error_covariance_m2":
+    if name.endswith("covariance_m2"):
         return checked_covariance(name, value)
     if isinstance(value, (bool, np.bool_)):
         return bool(value)

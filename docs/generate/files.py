@@ -6,12 +6,15 @@ from collections.abc import Iterable, Mapping
 
 import pyarrow as pa
 
+from agents.cooperative.figures import Figures
 from docs.generate.markdown import attribute_docstrings, docstring, table
 from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import EventKind
+from emulator.records.period_figures import program_figures
 from emulator.records.recorded_world import ARRAYS
-from emulator.records.tables import TABLES, Table
+from emulator.records.tables import METRICS, STATES, TABLES, Column, Table, columns_of
+from emulator.scenario.program import Program
 from vnet.units import unit_of
 
 INTRODUCTION = """
@@ -22,6 +25,10 @@ to the newest. Times are emulated nanoseconds from the start of the run; positio
 The folder of a finished run is complete: `vnet check`, `report`, `render`, `play`, `compare`, `export` and `radio`
 give the same results on another machine, without input files, program, or SUMO. Repeating the run
 (`vnet run FOLDER/scenario.toml`) needs these.
+"""
+COOPERATIVE = """
+Runs of `agents.cooperative`, and of programs that declare the same, have more columns: these in `states.parquet`,
+and those below in `metrics.parquet`. Others [declare theirs](../how-to/results.md#declare-figures-of-periods).
 """
 FOLDER = {
     "scenario.toml": "[the scenario](#scenariotoml) with every default, and digests of inputs and code; it "
@@ -62,6 +69,7 @@ KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
 `format` in `verdict.json` is the version of the whole folder.
 
+- 4: `states.parquet` and `metrics.parquet` have the columns that the run's program declares, and no other's.
 - 3: the folder has a `manifest.json`. Without one, checks that compare files with each other are *unknown*
   instead of *invalid*.
 - 2: the folder has a `world.npz`, and `scenario.toml` a section `[code]`.
@@ -105,6 +113,7 @@ VERDICT = {
     "frames_by_outcome": "receptions by [outcome](#outcomes), copies included",
     "packet_delivery_ratio": "[of broadcasts](../export.md#radio-figures), without copies; null without any",
     "figures": "means of some metrics, after the first fifth of the run",
+    "key_figures": "those of them that summaries show, with their titles, as the program declares them",
     "roadside_units": "number of roadside units",
     "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",
     "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",
@@ -126,7 +135,9 @@ def page() -> str:
     parts = [INTRODUCTION, table(["file", "what"], rows)]
     for each in TABLES:
         about = docstring(each.fields_of) if each.fields_of else each.about
-        parts += [f"## `{each.file}`", about, columns(each), each.further]
+        parts += [f"## `{each.file}`", about, columns(each.columns, each.fields_of), each.further]
+    parts += ["## Columns of the cooperative program", COOPERATIVE, columns(_of_program(STATES), None)]
+    parts += [docstring(Figures), columns(_of_program(METRICS), Figures)]
     parts += ["## Outcomes", "Each reception has exactly one."]
     public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
@@ -152,12 +163,18 @@ def world_rows() -> list[list[str]]:
     ]
 
 
-def columns(of: Table) -> str:
+def _of_program(kind: Table) -> dict[str, Column]:
+    """The columns that the cooperative program adds to a table."""
+    declared = program_figures(Program(entry="agents.cooperative:main"))
+    return {name: each for name, each in columns_of(kind, declared).items() if name not in kind.columns}
+
+
+def columns(of: Mapping[str, Column], fields_of: type | None) -> str:
     """The columns of a table with their types, units and texts. Raises LookupError where a text is missing."""
-    said = {name: column.text for name, column in of.columns.items()}
-    said |= attribute_docstrings(of.fields_of) if of.fields_of else {}
-    _check_texts("column", of.columns, {name: text for name, text in said.items() if text})
-    rows = ([f"`{n}`", f"`{_type(c.type)}`", unit_of(n), said[n]] for n, c in of.columns.items())
+    said = {name: column.text for name, column in of.items()}
+    said |= attribute_docstrings(fields_of) if fields_of else {}
+    _check_texts("column", of, {name: text for name, text in said.items() if text})
+    rows = ([f"`{n}`", f"`{_type(c.type)}`", unit_of(n), said[n]] for n, c in of.items())
     return table(["column", "type", "unit", "what"], rows)
 
 

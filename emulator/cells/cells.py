@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache
@@ -22,8 +22,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.cells.executors import each_done, progress_bar
-from emulator.cells.measure import judged_figures, measure
 from emulator.cells.worker import modules_of
+from emulator.checks.own import PREFIX
+from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.records.atomic import atomically, disk_errors, write_atomically
 from emulator.records.code_digest import digests_of
@@ -32,7 +33,11 @@ from emulator.scenario.loading import dump_scenario
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 
-FORMAT = 2
+FORMAT = 3
+WALL_CLOCK = ("wall_s", "real_time_factor")
+"""Figures that the machine decides: they differ from run to run."""
+Measure = Callable[[Emulation, float], tuple[dict[str, Any], pa.Table]]
+"""A function of a module: figures of a run from some second on, and its metrics."""
 _code_digests = cache(digests_of)
 
 
@@ -45,14 +50,15 @@ class Cell:
     from_s: float = 0.0
     keeps_states: bool = False
     """True if every vehicle's state in every period is kept too."""
-    is_judged: bool = False
-    """True if its figures are those of its verdict; else they are an experiment's, which a crash ends."""
+    measure: Measure | None = None
+    """Gives an experiment's figures, which a crash ends; without one they are those of the run's verdict."""
 
     @property
     def digest(self) -> str:
         """Names the cell's files: everything that its result depends on."""
-        code = _code_digests(modules_of(self.scenario), self.scenario.program.folders)
-        text = json.dumps([FORMAT, code, self.from_s, self.is_judged, dump_scenario(self.scenario)])
+        measure = () if self.measure is None else (f"{self.measure.__module__}:{self.measure.__name__}",)
+        code = _code_digests((*modules_of(self.scenario), *measure), self.scenario.program.folders)
+        text = json.dumps([FORMAT, code, self.from_s, *measure, dump_scenario(self.scenario)])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -111,16 +117,48 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
     if session.interrupted:
         raise KeyboardInterrupt
     emulation = session.emulation
-    if cell.is_judged:
+    if cell.measure is None:
         _, verdict = session.close()
         figures, metrics = judged_figures(verdict), emulation.metrics.metrics_table()
     else:
         if broken := [event for event in session.folder.events if event.level is Level.FAILURE]:
             event = broken[0]
             raise VnetError(f"{event.node} {event.kind}: {event.details.get('error', '')}")
-        figures, metrics = measure(emulation, cell.from_s)
+        figures, metrics = cell.measure(emulation, cell.from_s)
     states = emulation.metrics.states_table() if cell.keeps_states else None
     return CellResult(figures, metrics, states)
+
+
+def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of a judged run as one flat row.
+
+    `failed`: the names of invalid checks; `frames_OUTCOME`: receptions by outcome; `packet_delivery_ratio`; all of
+    vnet's figures by name; of each value that programs report the mean over all reports by its name, and as
+    `last.NAME` the mean over the vehicles of their last one; of own checks each number by `own:NAME.FIGURE`. Texts
+    and rows are left out.
+    """
+    frames = verdict["frames_by_outcome"]
+    row = {
+        "verdict": verdict["verdict"],
+        "failed": ", ".join(check["name"] for check in verdict["checks"] if check["verdict"] == "invalid"),
+        "vehicles": verdict["vehicles"],
+        "emulated_s": verdict["emulated_s"],
+        "packet_delivery_ratio": verdict["packet_delivery_ratio"],
+        **{f"frames_{outcome}": count for outcome, count in frames.items()},
+        **verdict["figures"],
+        "trace_sha256": verdict["trace_sha256"],
+        "metrics_sha256": verdict["metrics_sha256"],
+        **{name: verdict[name] for name in WALL_CLOCK},
+    }
+    for name, figure in verdict["reported"].items():
+        if figure["mean"] is not None:
+            row[name if name not in row else f"reported.{name}"] = figure["mean"]
+            row[f"last.{name}"] = figure["last"]
+    for check in verdict["checks"]:
+        if check["name"].startswith(PREFIX):
+            figures = check.get("figures", {}).items()
+            row |= {f"{check['name']}.{key}": value for key, value in figures if isinstance(value, int | float)}
+    return row
 
 
 # Results.

@@ -66,7 +66,7 @@ class SweepPlan:
             except ScenarioError as error:
                 raise ScenarioError(f"sweep, {_words(labels)}: {str(error).removeprefix('scenario: ')}") from None
             draws = not keeps_network and one.network.kind == "generated"
-            cells += [Cell(_row(labels, seed), _seeded(one, seed, draws), is_judged=True) for seed in numbers]
+            cells += [Cell(_row(labels, seed), _seeded(one, seed, draws)) for seed in numbers]
         return cls(plain, tuple(cells), tuple(values))
 
     def shard(self, number: int, of: int) -> tuple[Cell, ...]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from emulator.checks.channel import binomial_band, received_twice
 from emulator.faults.plan import PlannedFault
-from emulator.records.exchanges import sent_by_programs
+from emulator.records.radio_metrics import sent_by_programs
 from emulator.records.recorded_run import NO_FAULT, ON_AIR, UNHEARD_OF, RecordedRun
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.faults import (

@@ -16,13 +16,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from emulator.records.events import Event, EventKind
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.run import Run
-from emulator.records.verdict_file import Record
-from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, unknown
+from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Record, Verdict, unknown
+from emulator.records.verdicts import result as finding
+from emulator.scenario.faults import OwnRule
 from emulator.scenario.own_functions import declared_checks, in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
+from vnet.counted import counted
 from vnet.errors import VnetError, printable, shown
 from vnet.runtime.programs import search_programs_in
+from vnet.units import NS_PER_S
 
 PREFIX = "own:"
 """Names of own checks begin with it, so that none is taken for one of vnet's."""
@@ -189,3 +194,30 @@ def recorded_findings(record: Record) -> list[Finding]:
     """Return the findings of own checks that a folder's verdict holds."""
     findings: list[Finding] = [*record.checks, *record.not_exercised]
     return [finding for finding in findings if finding.name.startswith(PREFIX)]
+
+
+def check_own_rules(recorded: RecordedRun) -> Finding:
+    """Check that no rule of the user's own raised, answered nonsense, or did not answer at all."""
+    name = "own_rules"
+    rules = [fault for fault in recorded.scenario.fault if isinstance(fault, OwnRule)]
+    failed = recorded.event(EventKind.rule_failed)
+    sensors = recorded.scenario.world.sensor
+    if not rules and not sensors and not failed:
+        return NotExercised(name, "no rule and no sensor of your own")
+    answered = [f"{counted(len(rules), 'rule')} of your own answered every frame"] if rules else []
+    answered += [f"{counted(len(sensors), 'sensor')} of your own answered every period"] if sensors else []
+    text = " and ".join(answered)
+    broken_text = "; ".join(map(_told, failed))
+    return finding(name, len(failed), text, broken_text, list(map(_row, failed)), failed=len(failed))
+
+
+def _told(event: Event) -> str:
+    said = event.details
+    when = f"at {event.time_ns / NS_PER_S:.3f} s"
+    if (sender := said.get("sender")) is not None:
+        when += f", on a frame of {sender}"
+    return f"{said.get('fault')} ({said.get('rule')}) {said.get('error')}, {when}"
+
+
+def _row(event: Event) -> dict[str, Any]:
+    return {"time_ns": event.time_ns, **event.details}

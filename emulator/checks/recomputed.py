@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from emulator.radio.engine import Engine
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, EventKind, kinds_with
 from emulator.records.metrics import rows_of, sha256_of_rows
-from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of
+from emulator.records.period_figures import Period, figures_of
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.recorded_world import ARRAYS, RecordedWorld
 from emulator.records.run_folder import WORLD_FILE
@@ -72,11 +72,11 @@ def check_metrics(recorded: OpenedRun) -> Finding:
     return result(name, len(wrong), text, broken_text, wrong)
 
 
-def _wrong_metrics(recorded: RecordedRun, rows: list[PeriodFigures]) -> Iterator[dict[str, Any]]:
+def _wrong_metrics(recorded: RecordedRun, rows: list[Any]) -> Iterator[dict[str, Any]]:
     if len(rows) != recorded.periods:
         yield {"period": None, "figure": "periods", "kept": len(rows), "computed": recorded.periods}
     for kept, computed in zip(rows, _computed_figures(recorded), strict=False):
-        for field in fields(PeriodFigures):
+        for field in fields(computed):  # a folder may have more, of a program that is not installed
             ours, theirs = getattr(kept, field.name), getattr(computed, field.name)
             # The states have the last report of a period only, and no empty one.
             counts_reports = field.name in ("reporting", "not_finite")
@@ -92,14 +92,11 @@ def _alike(ours: Any, theirs: Any) -> bool:
     return bool(same_numbers(np.asarray(ours, float), np.asarray(theirs, float)))
 
 
-def _computed_figures(recorded: RecordedRun) -> list[PeriodFigures]:
+def _computed_figures(recorded: RecordedRun) -> list[Any]:
     """Return the figures of all periods, from the states alone."""
     position_m, heading = recorded.vectors("position_m"), np.zeros(0)
     fix_m, common_m = recorded.vectors("fix_m"), recorded.vectors("common_error_m")
-    columns = {
-        name: (recorded.vectors(name) if size == 2 else recorded.matrices(name)).reshape(-1, size)
-        for name, size in VECTORS.items()
-    }
+    columns = {name: recorded.by_period(name).reshape(-1, size) for name, size in recorded.declared.vectors.items()}
     period_ns, component = recorded.scenario.period_ns, None
     periods = []
     for period in range(recorded.periods):
@@ -110,7 +107,7 @@ def _computed_figures(recorded: RecordedRun) -> list[PeriodFigures]:
             period, period * period_ns, position_m[period], heading, common_m[period, 0], fix_m[period], heading
         )
         periods.append(Period(instant, component, int(recorded.reported[period].sum()), not_finite=0))
-    return figures_of(periods, columns) if periods else []
+    return figures_of(periods, columns, recorded.declared) if periods else []
 
 
 def input_of(scenario: Scenario) -> str:

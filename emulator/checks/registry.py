@@ -31,10 +31,11 @@ from emulator.checks.faults import (
     check_pause_respected,
 )
 from emulator.checks.latency import check_latency
-from emulator.checks.memory_growth import FLOOR_KIB, RISING_TENTHS
-from emulator.checks.own_rules import check_own_rules
+from emulator.checks.own import check_own_rules
 from emulator.checks.radio import check_fading, check_medium
 from emulator.checks.run import (
+    FLOOR_KIB,
+    RISING_TENTHS,
     check_agents_alive,
     check_finite,
     check_kept_up,

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from emulator.records.parting import partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.records.reported import value_columns
 from emulator.records.run_folder import AGAIN
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result
 from vnet.errors import VnetError, printable
@@ -108,20 +108,26 @@ def _tables(run: OpenedRun) -> tuple[pa.Table, pa.Table, pa.Table]:
     return run.trace, run.states, run.metrics
 
 
-def _with_values(states: pa.Table, others: pa.Table) -> pa.Table:
-    """The states, with an empty column for each value that only the other run's programs report."""
-    for name in value_columns(others.schema):
-        if name not in states.column_names:
-            states = states.append_column(name, pa.nulls(len(states), others.schema.field(name).type))
-    return states
+def _with_columns(ours: pa.Table, theirs: pa.Table) -> tuple[pa.Table, pa.Table]:
+    """Two tables with the columns of both, null in the one that has none; those that are empty are left out."""
+    tables = [ours, theirs]
+    for here, there in ((0, 1), (1, 0)):
+        for name in set(tables[there].column_names) - set(tables[here].column_names):
+            column = tables[there][name]
+            values = pc.list_flatten(column) if pa.types.is_list(column.type) else column
+            if values.null_count == len(values):
+                tables[there] = tables[there].drop_columns([name])
+            else:
+                tables[here] = tables[here].append_column(name, pa.nulls(len(tables[here]), column.type))
+    return tables[0], tables[1]
 
 
 def compare_tables(ours: Sequence[pa.Table], theirs: Sequence[pa.Table]) -> CheckResult:
     """Compare the tables of two runs, as `TABLES` calls them. Raises ValueError for other columns in one."""
     tables = []
     for name, mine, other in zip(TABLES, ours, theirs, strict=True):
-        if name == "states":
-            mine, other = _with_values(mine, other), _with_values(other, mine)
+        if name != "trace":
+            mine, other = _with_columns(mine, other)
         if set(mine.column_names) != set(other.column_names):
             raise ValueError(f"the table of the {name} has other columns")
         tables.append((name, mine, other))

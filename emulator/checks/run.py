@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -9,11 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from emulator.checks.memory_growth import is_long_enough, steady_growth_kib_per_s
 from emulator.records.distributions import lowest_share
-from emulator.records.events import Event, EventKind
-from emulator.records.failures import in_words, kinds_of
-from emulator.records.period_figures import VECTORS
+from emulator.records.events import Event, EventKind, in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result, unknown
@@ -77,7 +75,7 @@ def check_no_exceptions(recorded: RecordedRun) -> Finding:
     )
     rows = [
         {
-            "what": kind.why,
+            "what": kind.first.why,
             "vehicles": len(kind.nodes),
             "node": kind.first.node,
             "time_ns": kind.first.time_ns,
@@ -150,7 +148,7 @@ def check_finite(recorded: RecordedRun) -> Finding:
 def _not_finite_rows(recorded: RecordedRun) -> IntArray:
     """Number of rows of the states in each period of the metrics that hold NaN or infinity."""
     broken = np.zeros(len(recorded.states), dtype=bool)
-    for name in (*VECTORS, "cloud_m", *recorded.value_names):
+    for name in recorded.reported_names:
         column = recorded.states[name].combine_chunks()
         if is_text(column.type):
             continue
@@ -361,3 +359,29 @@ def memory_exceeded(event: Event) -> str:
     details = event.details
     held = f"process {event.node} ({first_names(details['nodes'])}) holds {details['memory_mb']:g} MB"
     return f"{held} at {event.time_ns / 1e9:.3f} s; run.memory_limit_mb = {details['limit_mb']:g}"
+
+
+SPAN_S = 27.0
+"""Least time in s from the first sample to the last: in a run of 30 s both lie within 1.5 s of its ends."""
+TENTHS = 10
+"""Parts of the second half of a series."""
+RISING_TENTHS = 8
+"""Tenths in which steady growth shows; memory that is taken once, or in a few steps, rises in fewer."""
+FLOOR_KIB = 512.0
+"""Growth over the second half, in KiB, that is the allocator's and the collector's own; less is no growth."""
+
+
+def is_long_enough(time_s: Sequence[float]) -> bool:
+    """Return whether a series with these times can be judged."""
+    return len(time_s) > TENTHS and time_s[-1] - time_s[0] >= SPAN_S
+
+
+def steady_growth_kib_per_s(time_s: Sequence[float], size_kb: Sequence[float]) -> float:
+    """Return the rate at which memory grew steadily in the second half of its series, in KiB a second; else 0."""
+    if not is_long_enough(time_s):
+        return 0.0
+    from_s, to_s = (time_s[0] + time_s[-1]) / 2, time_s[-1]
+    levels_kb = np.interp(np.linspace(from_s, to_s, TENTHS + 1), time_s, size_kb)
+    grown_kb = float(levels_kb[-1] - levels_kb[0])
+    is_steady = int((np.diff(levels_kb) > 0).sum()) >= RISING_TENTHS and grown_kb >= FLOOR_KIB
+    return grown_kb / (to_s - from_s) if is_steady else 0.0

@@ -21,8 +21,6 @@ from vnet.reports import COVARIANCE_TOLERANCE, LONGEST_TEXT, check_name
 from vnet.types import Mask
 
 KINDS = {str(kind): kind for kind in EventKind}
-COVARIANCES = ("covariance_m2", "common_error_covariance_m2")
-"""Columns of the states that hold covariance matrices."""
 KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
 """Columns by which the rows of the trace are sorted."""
 
@@ -96,7 +94,8 @@ def check_reports(recorded: RecordedRun) -> Finding:
     ]
     wrong += [
         {"what": f"{column}: no covariance matrix", "period": period, "node": recorded.node_ids[node]}
-        for column in COVARIANCES
+        for column in recorded.reported_names
+        if column.endswith("covariance_m2")
         for period, node in np.argwhere(_not_covariances(recorded, column)).tolist()
     ]
     for column in recorded.value_names:

@@ -17,13 +17,11 @@ from rich.table import Table
 
 from emulator.cli.options import LATEST, RunArgument
 from emulator.export.mcap_file import write_mcap
-from emulator.export.measured_links import write_links
 from emulator.export.pcapng import write_pcapng
-from emulator.export.tables import write_csv
+from emulator.export.tables import write_csv, write_links
 from emulator.records.atomic import atomically, disk_errors
-from emulator.records.radio_metrics import BIN_M, RadioMetrics, radio_metrics
+from emulator.records.radio_metrics import BIN_M, RadioMetrics, UnicastFigures, radio_metrics, unicast_figures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.records.unicast_figures import UnicastFigures, unicast_figures
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import VnetError

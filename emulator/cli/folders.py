@@ -14,8 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.cli.options import LATEST, ChecksOption, RunArgument, path_of
-from emulator.records.frame_log import FrameEntry, frame_log
-from emulator.records.parting import Parting, before, partings
+from emulator.records.parting import FrameEntry, Parting, before, frame_log, partings
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.program import from_here, split_file
 from emulator.terminal.console import one_line_errors

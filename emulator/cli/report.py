@@ -57,7 +57,7 @@ def compare(
         comparison = Comparison.of(first, second)
         print_comparison(comparison, SafeConsole())
         if out is not None:
-            from emulator.report.compare_page import write_comparison
+            from emulator.report.comparison import write_comparison
 
             print(write_comparison(comparison, out))
         raise typer.Exit(0 if comparison.same_trace else 1)

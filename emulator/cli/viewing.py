@@ -25,9 +25,8 @@ from emulator.cli.options import (
 )
 from emulator.drivers.control import read_control_file
 from emulator.records.run_folder import RECORDING, RunFolder, check_is_finished, check_is_run
-from emulator.stream.pace import play as play_scheduled
-from emulator.stream.pace import schedule
-from emulator.stream.playback import Message, messages
+from emulator.stream.playback import Message, messages, schedule
+from emulator.stream.playback import play as play_scheduled
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.safe_console import SafeConsole
 from emulator.viewer.sinks import (

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from emulator.radio.engine import Engine
 from emulator.radio.trace import payload_digest
-from emulator.records.backbone_table import BackboneRow, backbone_table
+from emulator.records.tables import BackboneRow, backbone_table
 from emulator.scenario.program import Backbone
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Scenario

@@ -21,7 +21,6 @@ from emulator.checks.own import PREFIX, own_findings
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
-from emulator.records.busy import busy_table
 from emulator.records.costs import run_cost
 from emulator.records.events import EventKind
 from emulator.records.manifest import write_manifest
@@ -35,7 +34,7 @@ from emulator.records.run_folder import (
     RunFolder,
     write_text,
 )
-from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES
+from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES, busy_table
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised
 from emulator.scenario.own_functions import declared_checks
@@ -111,6 +110,7 @@ def conclude(
         "trace_sha256": judgement.trace_sha256,
         "metrics_sha256": emulation.metrics.sha256(),
         **verdict_figures(recorded, emulation.metrics.rows),
+        "key_figures": [asdict(each) for each in emulation.metrics.declared.key],
         "start_up_s": _start_up_s(emulation),
         "wall_s": round(wall_s, 3),
         "real_time_factor": round(emulated_s / wall_s, 3) if wall_s > 0 else None,

@@ -27,14 +27,12 @@ from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
 from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.radio.topology import connectivity_of
-from emulator.records.background_table import background_table
 from emulator.records.costs import Costs
 from emulator.records.driven_table import driven_table
 from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
-from emulator.records.payloads import PayloadRecorder
-from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
+from emulator.records.tables import PayloadRecorder, background_table
 from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.program import Program, RoadsideUnit
 from emulator.scenario.scenario import Scenario, least_latency_ns
@@ -329,7 +327,7 @@ class PeriodView:
     counts: dict[str, int]
 
     @property
-    def figures(self) -> PeriodFigures:
+    def figures(self) -> Any:
         """Its figures."""
         return self.metrics.rows[self.instant.period]
 
@@ -386,7 +384,7 @@ class Emulation:
         self._acting: set[str] = set()
         self._acted_ns = -1
         self._next_change_ns = self._find_next_change_ns()
-        self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns)
+        self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns, scenario.program)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
         self.driving = Driving(world, folder, self.number)
         for node, up in self.up.items():

@@ -23,7 +23,7 @@ from emulator.drivers.emulation import Emulation, PeriodView, ProcessActions
 from emulator.drivers.processes import Heard, Processes
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.usage import first_over
-from emulator.records.node_logs import NodeLogs
+from emulator.records.node_files import NodeLogs
 from emulator.records.run_folder import RunFolder
 from vnet.node import Node
 from vnet.runtime import running_node

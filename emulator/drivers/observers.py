@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
-from emulator.records.busy import mean_busy
 from emulator.records.events import Event
 from emulator.records.recorded_world import RecordedWorld
+from emulator.records.tables import mean_busy
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import beliefs_of, event_message, period_message, scene_message
 
@@ -53,7 +53,7 @@ class Messages:
             emulation.world.node_ids,
             view.instant,
             end_ns,
-            beliefs_of(emulation.number, view.reports),
+            beliefs_of(emulation.number, view.reports, emulation.metrics.declared),
             view.figures,
             self._rows(end_ns),
             [emulation.up[node] for node in emulation.world.node_ids],

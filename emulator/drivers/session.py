@@ -137,6 +137,7 @@ class Session:
             search_programs_in(scenario.program.folders)
             for entry in entries_of(scenario):
                 load_program(entry)
+        _ = self.emulation.metrics.declared  # what cannot be is refused before anything is written
         self.folder.open(scenario)
         return self
 

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.usage import resident_kb
 from emulator.faults.plan import PlannedFault
 from emulator.radio.outcomes import Outcome
-from emulator.records.events import MEASURED, SAID, Event
-from emulator.records.failures import merged
+from emulator.records.events import MEASURED, SAID, Event, merged
+from emulator.records.period_figures import POSITION_FIGURES
 from vnet.units import NS_PER_S
 
 BINS = 120
@@ -25,8 +25,6 @@ RATES_OVER_S = 1.0
 SPEED_OVER_S = 10.0
 """Wall-clock time over which the speed is averaged."""
 SPEED_EVERY_S = 0.1
-FIGURES = ("common_error_rmse_m", "deviation_m", "position_rmse_m", "fix_rmse_m")
-"""Figures of `PeriodFigures` that are shown."""
 EVENTS_KEPT = 8
 EVENTS_LOOKED_AT = 200
 """Last events among which those of one kind of failure are told as one."""
@@ -52,7 +50,8 @@ class Snapshot:
     but for `remaining_s`, `idle_s` (since a period last ended), `wall_s` (since the command began) and
     `join_timeout_s`, which are of wall clock. `frames_by_outcome` counts attempted receptions so far,
     `frames_per_s` those of the last emulated second. Figures are those of the last period, and None where programs
-    report nothing of the kind; `over_time` has their means in `BINS` equal parts of the run.
+    report nothing of the kind; `over_time` has their means in `BINS` equal parts of the run. `lines` are label and
+    remark of those that a program wants to be shown, by figure.
     """
 
     run: str
@@ -69,10 +68,7 @@ class Snapshot:
     remaining_s: float | None
     idle_s: float
     wall_s: float
-    common_error_rmse_m: float | None
-    deviation_m: float | None
-    position_rmse_m: float | None
-    fix_rmse_m: float | None
+    figures: dict[str, float | None]
     over_time: dict[str, tuple[float | None, ...]]
     frames_by_outcome: dict[str, int]
     frames_per_s: dict[str, float]
@@ -80,6 +76,7 @@ class Snapshot:
     events: tuple[Event, ...]
     emulator_memory_mb: float | None
     absent: tuple[str, ...] = ()
+    lines: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     def never_reported(self, figure: str) -> bool:
         """Return whether no program has reported anything of this kind yet."""
@@ -95,10 +92,14 @@ class Course:
         self._began_s = self._period_ended_s = clock()
         self._phase = "starting"
         self._missing: tuple[str, ...] = ()
-        self._figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+        key = emulation.metrics.declared.key
+        self._lines = {each.name: each.live for each in key if each.live is not None}
+        self._figures: dict[str, float | None] = dict.fromkeys(
+            [*self._lines, *(each.name for each in POSITION_FIGURES)]
+        )
         self._periods = 0
         """Number of the periods whose figures are in `_over_time`."""
-        self._over_time = {name: _Series(emulation.duration_ns) for name in FIGURES}
+        self._over_time = {name: _Series(emulation.duration_ns) for name in self._figures}
         self._speed: deque[tuple[float, int]] = deque()  # wall clock in s, emulated ns
         self._counts: deque[tuple[int, dict[Outcome, int]]] = deque([(0, dict(emulation.engine.counts))])
         emulation.watch(self._period)
@@ -129,7 +130,7 @@ class Course:
         emulation = self._emulation
         rows = emulation.metrics.rows
         for row in rows[self._periods :]:
-            self._figures = {name: getattr(row, name) for name in FIGURES}
+            self._figures = {name: getattr(row, name) for name in self._figures}
             end_ns = min((row.period + 1) * emulation.world.period_ns, emulation.duration_ns)
             for name, series in self._over_time.items():
                 series.add(end_ns, self._figures[name])
@@ -169,7 +170,8 @@ class Course:
             remaining_s=None if not factor else (emulation.duration_ns - now_ns) / NS_PER_S / factor,
             idle_s=self._clock() - self._period_ended_s,
             wall_s=self.wall_s,
-            **self._figures,
+            figures=dict(self._figures),
+            lines=self._lines,
             over_time={name: series.means() for name, series in self._over_time.items()},
             frames_by_outcome={outcome.name: count for outcome, count in emulation.engine.counts.items() if count},
             frames_per_s=self._rates(),

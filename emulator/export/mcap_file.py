@@ -53,7 +53,6 @@ _STATE = _object(
     fix_m=_list(NUMBER),
     estimate_m=_list(NUMBER),
     covariance_m2=_list(NUMBER),
-    common_error_estimate_m=_list(NUMBER),
     values={"type": "object"},
 )
 _FRAME = _object(
@@ -76,8 +75,8 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "/events": ("vnet.Event", _object(kind=TEXT, node=TEXT, details={"type": "object"})),
 }
 """Name and content of each topic's schema."""
-_STATE_COLUMNS = ("position_m", "heading_rad", "fix_m", "estimate_m", "covariance_m2", "common_error_estimate_m")
-"""Columns of `states.parquet` in `/states`."""
+_STATE_COLUMNS = ("position_m", "heading_rad", "fix_m")
+"""Columns of `states.parquet` in `/states`, beside those that programs report."""
 
 
 def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
@@ -112,7 +111,8 @@ def _streams(recorded: OpenedRun) -> list[Iterator[Message]]:
 
 
 def _periods(recorded: RecordedRun) -> Iterator[Message]:
-    count, names = len(recorded.node_ids), recorded.value_names
+    count, values = len(recorded.node_ids), recorded.value_names
+    names = [*_STATE_COLUMNS, *(name for name in recorded.reported_names if name not in values)]
     for start in range(0, len(recorded.states), max(count, 1)):
         rows = recorded.states.slice(start, count).to_pylist()
         time_ns = rows[0]["time_ns"]
@@ -126,16 +126,16 @@ def _periods(recorded: RecordedRun) -> Iterator[Message]:
             {
                 "period": rows[0]["period"],
                 "common_error_m": _finite(rows[0]["common_error_m"]),
-                "vehicles": [_state(row, names) for row in rows if _is_point(row["position_m"])],
+                "vehicles": [_state(row, names, values) for row in rows if _is_point(row["position_m"])],
             },
         )
 
 
-def _state(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return the state of a vehicle; `names` are those of its reported values that have columns."""
-    columns = {name: _finite(row[name]) for name in _STATE_COLUMNS}
+def _state(row: dict[str, Any], names: Sequence[str], own: Sequence[str]) -> dict[str, Any]:
+    """Return the state of a vehicle: `names` are columns, `own` those of values by names of the program's own."""
+    columns = {name: _finite(row[name]) for name in names}
     values = {name: _finite(value) for name, value in row["values"] or ()}
-    values |= {name: _finite(row[name]) for name in names if row[name] is not None}
+    values |= {name: _finite(row[name]) for name in own if row[name] is not None}
     return {
         "node": row["node"],
         **{name: value for name, value in columns.items() if value is not None},

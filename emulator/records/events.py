@@ -8,13 +8,14 @@ cells and the reference page draw from it.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Flag, IntEnum, StrEnum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vnet.errors import VnetError, printable
+from vnet.errors import VnetError, first_names, printable
 
 if TYPE_CHECKING:
     from typing import Self
@@ -55,6 +56,8 @@ class Part(Flag):
 
 NOTE, TOLD, CHANGE, WARNING, FAILURE = Level
 SAMPLES, MEASURED, SAID, GROUPED, ENDS_PROGRAM, CUTS_RUN = Part
+REASONS, PAGES = ("how", "error", "reason"), ("where", "log_tail", "key")
+"""Details that are told without their names, and those that are not told in a line."""
 QUIET_LEVELS = ("debug", "info")
 """Levels of log lines that are no warnings."""
 
@@ -215,11 +218,6 @@ class Event:
         return self.kind in KINDS and bool(KINDS[self.kind].part & part)
 
     @property
-    def words(self) -> str:
-        """Its kind in words."""
-        return self.kind.replace("_", " ")
-
-    @property
     def name(self) -> str:
         """Name that the program gave to an event of its own (`node.event`); else the kind."""
         return str(self.details.get("name", "")) if self.kind == EventKind.event else self.kind
@@ -230,9 +228,51 @@ class Event:
         values = self.details.get("details") if self.kind == EventKind.event else self.details
         return values if isinstance(values, dict) else {}
 
+    @property
+    def why(self) -> str:
+        """Error of a failure, or how its process ended, and where an exception came up."""
+        error = str(self.details.get("error") or self.details.get("how", ""))
+        place = str(self.details.get("place", ""))
+        return error + (", " if ":" in error else ": ") * bool(place) + place
+
+    @property
+    def said(self) -> str:
+        """Details in words: reasons first, without pages of text, which are in the run's folder."""
+        if self.kind == EventKind.log:
+            return str(self.details.get("text", ""))
+        if self.kind == EventKind.exception:
+            return self.why
+        if self.kind == EventKind.started:
+            start_up_s = self.details.get("start_up_s") or 0.0
+            return f"all have joined in {start_up_s:.1f} s" if start_up_s else ""
+        left_out = () if self.kind == EventKind.event else (*PAGES, *REASONS, "fault", "nodes")
+        told = {key: _listed(value) for key, value in self.values.items()}
+        said = [told[key] for key in (*REASONS, "nodes") if key in left_out and told.get(key)]
+        return ", ".join(said + [f"{key} {value}" for key, value in told.items() if key not in left_out])
+
+    @property
+    def what(self) -> str:
+        """Name and details in words, without whom it befell."""
+        if self.kind in (EventKind.log, EventKind.exception):
+            return self.said
+        name = self.name if self.kind == EventKind.event else self.kind.replace("_", " ")
+        name = name.removeprefix("fault ") if "fault" in self.details else name
+        return f"{name}: {self.said}" if self.said else name
+
+    @property
+    def text(self) -> str:
+        """One line: whom it befell, what, and why. `v04 died: SIGKILL`."""
+        who = str(self.node or self.details.get("fault") or "")
+        colon = ":" * (self.kind in (EventKind.log, EventKind.exception))
+        return f"{who}{colon} {self.what}".strip()
+
     def line(self) -> str:
         """Return the event as a line of `events.jsonl`."""
         return json.dumps({"time_ns": self.time_ns, "kind": self.kind, "node": self.node, **self.details}) + "\n"
+
+
+def _listed(value: object) -> str:
+    return first_names(value, with_total=True) if isinstance(value, list) else str(value)
 
 
 def parse_events(path: Path, content: bytes) -> list[Event]:
@@ -250,3 +290,87 @@ def parse_events(path: Path, content: bytes) -> list[Event]:
             raise VnetError(f"{path}: not vnet's events: {printable(line, 100)}")
         events.append(Event(time_ns, kind, node, data))
     return events
+
+
+_FRAME = re.compile(r'^ *File "(.*)", line (\d+)', re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Failures of one kind: events in the order of their instants."""
+
+    events: tuple[Event, ...]
+
+    @property
+    def first(self) -> Event:
+        """The first of them."""
+        return self.events[0]
+
+    @property
+    def nodes(self) -> list[str]:
+        """Ids of the vehicles that it befell, each once."""
+        return list(dict.fromkeys(str(event.node) for event in self.events))
+
+    @property
+    def who(self) -> str:
+        """The vehicle, or how many there are."""
+        return self.nodes[0] if len(self.nodes) == 1 else f"{len(self.nodes)} vehicles"
+
+    @property
+    def when(self) -> str:
+        """The instant, or that of the first one."""
+        instant = f"at {shown_s(self.first.time_ns)}"
+        if self.first.kind == EventKind.exception:
+            return instant if len(self.events) == 1 else f"first {instant}"
+        return instant if len({event.time_ns for event in self.events}) == 1 else f"first {instant}"
+
+    @property
+    def untimed(self) -> str:
+        """The kind in one line without its instant."""
+        ended = "" if self.first.kind == EventKind.exception else f" {self.first.kind}"
+        return f"{self.who}{ended}: {self.first.why}"
+
+    def __str__(self) -> str:
+        if self.first.kind == EventKind.exception:
+            return f"{self.untimed}, {self.when}"
+        comma = "," if self.when.startswith("first") else ""
+        return f"{self.who} {self.first.kind}{comma} {self.when}: {self.first.why}"
+
+
+def shown_s(time_ns: int) -> str:
+    """Return an instant in seconds, to the millisecond, without zeros that say nothing."""
+    return f"{round(time_ns / 1e9, 3)} s"
+
+
+def in_words(kinds: Sequence[Kind], most: int = 5) -> str:
+    """Return the first kinds in one line."""
+    return "; ".join([*map(str, kinds[:most]), *(["…"] if len(kinds) > most else [])])
+
+
+def merged(events: Iterable[Event]) -> list[Event]:
+    """Return the events with one for each kind of failure, which names how many vehicles it befell."""
+    by_kind: dict[tuple[str, ...] | int, list[Event]] = {}
+    for number, event in enumerate(events):
+        by_kind.setdefault(key_of(event) if event.has(GROUPED) else number, []).append(event)
+    return [replace(each[0], node=Kind(tuple(each)).who) if len(each) > 1 else each[0] for each in by_kind.values()]
+
+
+def kinds_of(events: Iterable[Event]) -> list[Kind]:
+    """Sort failures into their kinds: the same type of error, raised in the same line."""
+    kinds: dict[tuple[str, ...], list[Event]] = {}
+    for event in sorted(events, key=lambda event: event.time_ns):
+        kinds.setdefault(key_of(event), []).append(event)
+    return [Kind(tuple(events)) for events in kinds.values()]
+
+
+def key_of(event: Event) -> tuple[str, ...]:
+    """Return what failures of one kind have in common."""
+    error = str(event.details.get("error") or event.details.get("how", ""))
+    place = str(event.details.get("place") or _last_line(str(event.details.get("where", ""))))
+    return event.kind, error.partition(":")[0], place
+
+
+def _last_line(trace: str) -> str:
+    """File and line of the innermost frame of a traceback."""
+    frames = _FRAME.findall(trace)
+    return f"{Path(frames[-1][0]).name}:{frames[-1][1]}" if frames else ""

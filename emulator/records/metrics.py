@@ -1,7 +1,6 @@
-"""The figures of a run, period by period (MODEL 6): how wrong the vehicles are, and how much they differ.
+"""The figures of a run, period by period (MODEL 6): how wrong the vehicles are, and what their program declares.
 
-`states` has a row for each node and period, `metrics` one for each period. Programs that report no common error
-(or nothing at all) leave nulls.
+`states` has a row for each node and period, `metrics` one for each period. What programs do not report is null.
 """
 
 from __future__ import annotations
@@ -9,6 +8,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, make_dataclass
+from functools import cached_property
+from keyword import iskeyword
 from typing import Any
 
 import numpy as np
@@ -16,43 +18,61 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.records.distributions import chi2_quantiles
-from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of, vectors
+from emulator.records.period_figures import (
+    NUMBER,
+    Period,
+    ProgramFigures,
+    figures_of,
+    program_figures,
+    vectors,
+)
 from emulator.records.reported import ValueColumns, figures_among
-from emulator.records.states import COMMON_VALUES
-from emulator.records.tables import METRICS, STATES
+from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, columns_of, schema_of
+from emulator.scenario.program import Program
 from emulator.world.world import Instant
 from vnet.reports import Report, Value
+from vnet.runtime.programs import search_programs_in
 
 ROWS_A_PIECE = 2048
 """Largest number of states kept as Python numbers, except for the rest of a period."""
-TRUTH = ("period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_m")
-"""Columns of the states that reports have no part in."""
-REPORTED = tuple(name for name in STATES.columns if name not in TRUTH)
-"""The other columns of `STATES`."""
 
 
 class Metrics:
     """Collects reports and truth. `component` (N,) labels each node's connected component; -1 if not there."""
 
-    def __init__(self, node_ids: Sequence[str], component: NDArray[np.intp], period_ns: int) -> None:
+    def __init__(
+        self, node_ids: Sequence[str], component: NDArray[np.intp], period_ns: int, program: Program | None = None
+    ) -> None:
+        self._program = program or Program()
         self._number = {node: number for number, node in enumerate(node_ids)}
         self._node_ids = list(node_ids)
         self._component = component
         self._period_ns = period_ns
-        self._rows: list[PeriodFigures] = []
+        self._rows: list[Any] = []
         self._waiting: list[Period] = []
         """Periods whose reports are the last of `_states`, and whose figures nobody has asked for yet."""
         self._recorded = 0
         self._instants: list[Instant] = []
         """Truth of the periods whose reports are in `_states`."""
-        self._states: dict[str, list[Any]] = {name: [] for name in REPORTED}
+        self._states: dict[str, list[Any]] = {}
         self._values = ValueColumns()
         self._packed: list[pa.Table] = []
         self._table: pa.Table | None = None
 
+    @cached_property
+    def declared(self) -> ProgramFigures:
+        """Declaration of the program. Raises ScenarioError for what cannot be."""
+        search_programs_in(self._program.folders)
+        return program_figures(self._program)
+
+    @cached_property
+    def schema(self) -> pa.Schema:
+        """The columns of the states, without those of reported values."""
+        return schema_of(columns_of(STATES, self.declared))
+
     @property
-    def rows(self) -> list[PeriodFigures]:
-        """The figures of all periods so far."""
+    def rows(self) -> list[Any]:
+        """The figures of all periods so far: `PeriodFigures`, with those that the program declares."""
         self._compute()
         return self._rows
 
@@ -75,20 +95,23 @@ class Metrics:
         if not self._waiting:
             return
         first = (len(self._instants) - len(self._waiting)) * len(self._node_ids)
-        reported = {name: vectors(self._states[name][first:], size) for name, size in VECTORS.items()}
-        self._rows += figures_of(self._waiting, reported)
+        of = self.declared
+        reported = {name: vectors(self._states[name][first:], size) for name, size in of.vectors.items()}
+        self._rows += figures_of(self._waiting, reported, of)
         self._waiting = []
 
     def _store(self, instant: Instant, last: dict[str, Report]) -> None:
         states, count = self._states, len(self._node_ids)
+        if not states:
+            states |= {name: [] for name in self.schema.names if name not in TRUTH}
         self._instants.append(instant)
         self._table = None
         reports = [last.get(node) for node in self._node_ids]
         states["estimate_m"] += [None if report is None else report.estimate_m for report in reports]
         states["covariance_m2"] += [None if report is None else report.covariance_m2 for report in reports]
         values = [{} if report is None else report.values for report in reports]
-        for name, column in COMMON_VALUES.items():
-            states[column] += [_fitting(each.get(name), column) for each in values]
+        for name, column in self.declared.columns.items():
+            states[column.name] += [_fitting(each.get(name), column.size) for each in values]
         first_row = self._recorded * count
         states["values"] += [self._other_values(row, each) for row, each in enumerate(values, first_row)]
         self._recorded += 1
@@ -100,10 +123,10 @@ class Metrics:
         others: list[tuple[str, list[float]]] = []
         if not values:
             return others
-        figures = figures_among(values)
+        figures, declared = figures_among(values, self.declared), self.declared.columns
         for name, value in sorted(values.items()):
             has_column = name in figures and self._values.put(row, name, figures[name])
-            if not has_column and not isinstance(value, str) and name not in COMMON_VALUES:
+            if not has_column and not isinstance(value, str) and name not in declared:
                 others.append((name, value if isinstance(value, list) else [value]))
         return others
 
@@ -112,8 +135,8 @@ class Metrics:
         self._compute()
         if self._instants:
             columns = {**_truth(self._instants, self._node_ids), **self._states}
-            self._packed.append(pa.table(columns, STATES.schema))
-        self._instants, self._states = [], {name: [] for name in REPORTED}
+            self._packed.append(pa.table(columns, self.schema))
+        self._instants, self._states = [], {}
 
     def states_table(self) -> pa.Table:
         """A row for each node and period; the columns of `STATES`, then those of reported values."""
@@ -124,23 +147,30 @@ class Metrics:
         return self._table
 
     def metrics_table(self) -> pa.Table:
-        """A row for each period; columns are the fields of `PeriodFigures`."""
-        columns = {name: [getattr(row, name) for row in self.rows] for name in METRICS.columns}
-        return pa.table(columns, METRICS.schema)
+        """A row for each period; columns are the fields of `PeriodFigures`, and those that the program declares."""
+        schema = schema_of(columns_of(METRICS, self.declared))
+        return pa.table({name: [getattr(row, name) for row in self.rows] for name in schema.names}, schema)
 
     def sha256(self) -> str:
         """A hash of the metrics' content, bit by bit."""
         return sha256_of_rows(self.rows)
 
 
-def sha256_of_rows(rows: Sequence[PeriodFigures]) -> str:
+def sha256_of_rows(rows: Sequence[Any]) -> str:
     """Return a hash of the figures of all periods, bit by bit."""
     return hashlib.sha256(repr(list(rows)).encode()).hexdigest()
 
 
-def rows_of(metrics: pa.Table) -> list[PeriodFigures]:
-    """Return the rows of a table of metrics."""
-    return [PeriodFigures(**row) for row in metrics.select(list(METRICS.columns)).to_pylist()]
+def rows_of(metrics: pa.Table) -> list[Any]:
+    """Return the rows of a table of metrics, with all columns that it has."""
+    types = {each.name: [name for name, kind in ARROW.items() if kind == each.type] for each in metrics.schema}
+    known = {name: kind[0] for name, kind in types.items() if kind and _is_name(name)}
+    row = make_dataclass("PeriodFigures", known.items(), frozen=True)
+    return [row(**each) for each in metrics.select(list(known)).to_pylist()]
+
+
+def _is_name(name: str) -> bool:
+    return name.isidentifier() and not iskeyword(name)
 
 
 def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa.Array]:
@@ -162,19 +192,10 @@ def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa
     }
 
 
-def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:
-    """Means over the run after its first fifth, in which filters find their feet."""
+def summarize(rows: Sequence[Any]) -> dict[str, float | None]:
+    """Means over the run after its first fifth, in which filters find their feet; nothing without periods."""
     settled = rows[len(rows) // 5 :]
-    names = [
-        "common_error_rmse_m",
-        "deviation_m",
-        "bias_m",
-        "position_rmse_m",
-        "fix_rmse_m",
-        "consensus_error_m",
-        "common_error_anees",
-        "position_anees",
-    ]
+    names = [each.name for each in fields(rows[0]) if each.type == NUMBER] if rows else []
     summary: dict[str, float | None] = {}
     for name in names:
         values = [value for row in settled if (value := getattr(row, name)) is not None]
@@ -182,9 +203,9 @@ def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:
     return summary
 
 
-def _fitting(value: Value | None, column: str) -> Value | None:
+def _fitting(value: Value | None, size: int | None) -> Value | None:
     """Return a reported value, or None if it is no list of the size of its column."""
-    return value if isinstance(value, list) and len(value) == VECTORS.get(column, len(value)) else None
+    return value if isinstance(value, list) and size in (None, len(value)) else None
 
 
 def anees_band(samples: int) -> tuple[float, float]:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import takewhile, zip_longest
+from itertools import pairwise, takewhile, zip_longest
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.records.events import SAMPLES, Event
 from emulator.records.recorded_run import OpenedRun
-from emulator.records.reported import value_columns
+from emulator.records.reported import reported_columns
 from emulator.records.tape import TAPE_FILE, TapeEntry, described, read_tape
 from vnet.transport.wire import Deviation
 from vnet.units import NS_PER_S
 
 FRAME = ("sent_ns", "sender", "seq", "size_bytes", "payload_digest")
 RECEPTION = ("sent_ns", "sender", "seq", "copy", "receiver", "outcome", "cause", "arrival_ns")
-REPORT = ("estimate_m", "covariance_m2", "common_error_estimate_m", "mean_m")
-"""Columns of states that programs report, beside those of their own names."""
 MOST_BEFORE = 8
 """Events and frames that are told of before a parting."""
 
@@ -155,7 +154,7 @@ def _first_vehicle(first: OpenedRun, second: OpenedRun) -> Parting | None:
 
 def _first_value(first: pa.Table, second: pa.Table) -> Parting | None:
     """Return the first value that programs of vehicles of both runs report otherwise, at its period's beginning."""
-    columns = list(dict.fromkeys([*REPORT, *value_columns(first.schema), *value_columns(second.schema)]))
+    columns = list(dict.fromkeys([*reported_columns(first.schema), *reported_columns(second.schema)]))
     both = pc.unique(first["node"].cast(pa.string()))
     both = both.filter(pc.is_in(both, pc.unique(second["node"].cast(pa.string()))))
     for ours, theirs in zip_longest(_values(first, both, columns), _values(second, both, columns)):
@@ -187,3 +186,53 @@ def _values(states: pa.Table, nodes: pa.Array, columns: Sequence[str]) -> Iterat
     for row in table.take(order).to_pylist():
         shown = {name: str(row.get(name)) for name in columns}
         yield {"time_ns": row["time_ns"], "node": row["node"], **shown}
+
+
+@dataclass(frozen=True)
+class FrameEntry:
+    """A frame: its sender, its payload if the run has kept it, and its receivers by outcome."""
+
+    sent_ns: int
+    sender: str
+    seq: int
+    copy: int
+    size_bytes: int
+    digest: int
+    payload: bytes | None
+    outcomes: dict[str, list[str]]
+
+
+def frame_log(recorded: OpenedRun, node: str | None, start_ns: int, end_ns: int | None) -> Iterator[FrameEntry]:
+    """Yield the frames that were sent in [start, end) in the order of time.
+
+    With `node` only those that it sent, with all receivers, and those that it could hear, with it alone. A frame
+    that arrived altered at some receivers is listed with its first receiver's digest.
+    """
+    chosen = recorded.sent_ns >= start_ns
+    if end_ns is not None:
+        chosen &= recorded.sent_ns < end_ns
+    if node is not None:
+        number = recorded.number[node]
+        chosen &= (recorded.sender == number) | (recorded.receiver == number)
+    rows = np.flatnonzero(chosen)
+    rows = rows[np.lexsort((recorded.receiver[rows], recorded.emission[rows], recorded.sent_ns[rows]))]
+    outcome = recorded.trace["outcome"].cast(pa.string()).take(pa.array(rows)).to_pylist()
+    edges = np.flatnonzero(np.diff(recorded.emission[rows])) + 1
+    sizes, names, kept = recorded.column("size_bytes"), recorded.node_ids, recorded.payloads
+    bounds = [0, *edges.tolist(), len(rows)] if len(rows) else []
+    for first, end in pairwise(bounds):
+        row = int(rows[first])
+        outcomes: dict[str, list[str]] = {}
+        for index in range(first, end):
+            outcomes.setdefault(outcome[index], []).append(names[int(recorded.receiver[rows[index]])])
+        sender, seq, digest = names[int(recorded.sender[row])], int(recorded.seq[row]), int(recorded.digest[row])
+        yield FrameEntry(
+            sent_ns=int(recorded.sent_ns[row]),
+            sender=sender,
+            seq=seq,
+            copy=int(recorded.copy[row]),
+            size_bytes=int(sizes[row]),
+            digest=digest,
+            payload=None if kept is None else kept.of(sender, seq, recorded.digest[rows[first:end]].tolist()),
+            outcomes=outcomes,
+        )

@@ -1,31 +1,33 @@
-"""The figures of periods, of many at once: an operation on arrays costs the same for one period and for a hundred.
+"""The figures of periods: vnet's own, and those that a run's program declares.
 
+They are computed of many periods at once: an operation on arrays costs the same for one period and for a hundred.
 Every figure is the same bit by bit however many periods are computed together: a run's hash of its metrics has it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, make_dataclass
+from functools import cache
 from itertools import starmap
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.own_functions import CONSTANT, declared, load_entry
+from emulator.scenario.program import Program
 from emulator.world.world import Instant
+from vnet.errors import ScenarioError
 from vnet.types import Array
 
-VECTORS = {
-    "estimate_m": 2,
-    "covariance_m2": 4,
-    "common_error_estimate_m": 2,
-    "common_error_covariance_m2": 4,
-    "mean_m": 2,
-    "stacked_common_error_m": 2,
-}
-"""Columns of the states of which figures are made, and the numbers that each entry has."""
+VECTORS = {"estimate_m": 2, "covariance_m2": 4}
+"""Columns of the states of which vnet's own figures are made, and the numbers that each entry has."""
+SAME = 1e-9
+"""Relative difference of two errors up to which they are those of the same positions."""
+NUMBER, NUMBERS = "float | None", "list[float | None]"
+"""Types of a figure, as annotations."""
 _Mask: TypeAlias = NDArray[np.bool_]
 
 
@@ -33,7 +35,6 @@ _Mask: TypeAlias = NDArray[np.bool_]
 class PeriodFigures:
     """One row of the metrics. Lengths in metres; None where no node reported what is needed.
 
-    x_i is vehicle i's estimate of the common error c, x̄ the mean of all x_i, m_i what vehicle i takes for the mean.
     ANEES are means of εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
     """
 
@@ -43,32 +44,157 @@ class PeriodFigures:
     """Its start."""
     reporting: int
     """Number of vehicles that reported in it."""
-    common_error_rmse_m: float | None
-    """√(mean‖x_i − c‖²) over the network."""
-    deviation_m: float | None
-    """√(mean‖x_i − x̄‖²): how far the vehicles are from agreeing."""
-    bias_m: float | None
-    """‖x̄ − c‖."""
-    stacked_rmse_m: float | None
-    """As `common_error_rmse_m`, right after fusion, before the map."""
-    stacked_deviation_m: float | None
-    """As `deviation_m`, right after fusion, before the map."""
-    component_rmse_m: list[float | None]
-    """`common_error_rmse_m` of each connected component of the network: of the period's, where links change."""
-    component_deviation_m: list[float | None]
-    """`deviation_m` of each connected component, from its own mean."""
     position_rmse_m: float | None
     """RMSE of the vehicles' estimates of their positions."""
     fix_rmse_m: float | None
     """RMSE of the raw fixes."""
-    consensus_error_m: float | None
-    """√(mean‖m_i − x̄‖²), with x̄ of the vehicle's component."""
-    common_error_anees: float | None
-    """ANEES of the common error."""
     position_anees: float | None
     """ANEES of the positions."""
     not_finite: int
     """Number of reports that held NaN or infinity."""
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """A figure of the periods, in metres, whose mean after the first fifth of a run is shown by `title`."""
+
+    name: str
+    title: str
+    chart: tuple[str, str, str] | None = None
+    """Id, title and axis of its chart in a comparison."""
+    column: str = ""
+    """Title of its column in the list of runs."""
+    is_less: bool = False
+    """True if narrow screens go without that column."""
+    of_positions: bool = False
+    """True for an error of positions, shown only where programs estimate them."""
+    of_agreement: bool = False
+    """True for the deviation of vehicles' estimates from their mean, which `vnet analyze` explains."""
+    live: tuple[str, str] | None = None
+    """Label and remark of its line in the picture of a run that is on."""
+
+
+POSITION_FIGURES = (
+    KeyFigure(
+        "position_rmse_m",
+        "position, RMSE of the estimates",
+        ("position", "Position", "RMSE of position (m)"),
+        of_positions=True,
+    ),
+    KeyFigure("fix_rmse_m", "position, RMSE of the raw fixes", of_positions=True),
+)
+"""vnet's own key figures."""
+
+
+@dataclass(frozen=True)
+class ReportedColumn:
+    """A column of the states for the lists that programs report by one name; `size` is None for any length."""
+
+    name: str
+    size: int | None
+    text: str
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimate of two lengths that a recording shows around the truth: columns of the states by their names."""
+
+    name: str
+    title: str
+    estimate: str
+    covariance: str
+    truth: str
+    rings_m: tuple[float, ...]
+    view_m: float
+    """Half of what the view shows at first."""
+    cloud: str = ""
+    """Column of points, x and y in turns."""
+
+
+@dataclass(frozen=True)
+class ProgramFigures:
+    """Figures that a run's program declares, with vnet's own: docs/how-to/own-figures.md."""
+
+    row: type = PeriodFigures
+    """The class of a row of the metrics."""
+    columns: Mapping[str, ReportedColumn] = field(default_factory=dict)
+    """By reported name, the columns that the states have for its lists."""
+    peers: tuple[str, ...] = ()
+    """Names before a dot that stand for one value of each pair of vehicles: they stay in `values`."""
+    key: tuple[KeyFigure, ...] = POSITION_FIGURES
+    """Figures that summary, report, comparison, sweep, list of runs and terminal show, in this order."""
+    charts: tuple[Mapping[str, Any], ...] = ()
+    """Charts of the report: `id`, `title`, `axis`, `text`, and `lines`, names of figures by label."""
+    estimates: tuple[Estimate, ...] = ()
+    """Estimates that a recording shows around the truth, beside positions."""
+    compute: Callable[[Periods], Mapping[str, Sequence[Any]]] = lambda periods: {}
+
+    @property
+    def vectors(self) -> dict[str, int]:
+        """Columns of the states of which figures are made, and the numbers that each entry has."""
+        return VECTORS | {each.name: each.size for each in self.columns.values() if each.size is not None}
+
+    def is_of_peer(self, name: str) -> bool:
+        """Return whether a reported name stands for a value of a pair of vehicles."""
+        return name.partition(".")[0] in self.peers and "." in name
+
+
+def program_figures(program: Program) -> ProgramFigures:
+    """Return the figures of a scenario's program: of several that declare some, the first one's.
+
+    Where the declared module cannot be imported there are none: its check says so. Raises ScenarioError for a
+    declaration that cannot be.
+    """
+    try:
+        entries = declared(program, "FIGURES")
+    except ScenarioError:
+        entries = []
+    return _of_entry(entries[0]) if entries else ProgramFigures()
+
+
+def figures_if_here(program: Program) -> ProgramFigures:
+    """Return the figures of a scenario's program; vnet's own where what it declares cannot be imported."""
+    try:
+        return program_figures(program)
+    except ScenarioError:
+        return ProgramFigures()
+
+
+@cache
+def _of_entry(entry: str) -> ProgramFigures:
+    kind = load_entry(entry)
+    try:
+        own = {each.name: each for each in fields(PeriodFigures)}
+        theirs = {each.name: str(each.type) for each in fields(kind)}
+        if wrong := [name for name, of in theirs.items() if name not in own and of not in (NUMBER, NUMBERS)]:
+            raise TypeError(f"{wrong[0]}: {theirs[wrong[0]]}, where {NUMBER} or {NUMBERS} is allowed")
+        # A figure of vnet's stands where the program's class has it: the order is part of the hash.
+        names = [*(name for name in own if name not in theirs), *theirs]
+        types = [(name, own[name].type if name in own else theirs[name]) for name in names]
+        columns = getattr(kind, "COLUMNS", {}).items()
+        return ProgramFigures(
+            make_dataclass("PeriodFigures", types, frozen=True),
+            {reported: ReportedColumn(*column) for reported, column in columns},
+            tuple(getattr(kind, "PEERS", ())),
+            (*(KeyFigure(**each) for each in getattr(kind, "KEY_FIGURES", ())), *POSITION_FIGURES),
+            tuple(getattr(kind, "CHARTS", ())),
+            tuple(Estimate(**each) for each in getattr(kind, "ESTIMATES", ())),
+            kind.compute,
+        )
+    except (AttributeError, TypeError) as error:
+        raise ScenarioError(f"{CONSTANT}: {entry!r} declares no figures of periods: {error}") from None
+
+
+def shown_figures(key: Sequence[KeyFigure], figures: Mapping[str, float | None]) -> dict[str, float]:
+    """Return the key figures that a run has, by title: errors of positions only where programs estimate them."""
+    own = estimates_differ(figures.get("position_rmse_m"), figures.get("fix_rmse_m"))
+    values = {each.title: figures.get(each.name) for each in key if own or not each.of_positions}
+    return {title: value for title, value in values.items() if value is not None}
+
+
+def estimates_differ(estimate_m: float | None, fix_m: float | None) -> bool:
+    """Return whether these errors (in metres) are those of estimates that are more than the raw fixes again."""
+    return estimate_m is not None and (fix_m is None or not math.isclose(estimate_m, fix_m, rel_tol=SAME))
 
 
 @dataclass(frozen=True)
@@ -83,6 +209,58 @@ class Period:
     """Number of reports that held NaN or infinity."""
 
 
+@dataclass(frozen=True)
+class Periods:
+    """K periods of N vehicles in which these form the same components: what figures are computed from.
+
+    `columns` are arrays (K, N, size) of the states by name, NaN where nothing was reported, and (K, 1, 2) of the
+    true `common_error_m`. The functions take such arrays, and return a number for each period, or None.
+    """
+
+    columns: Mapping[str, Array]
+    component: NDArray[np.intp]
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    @property
+    def components(self) -> list[_Mask]:
+        """The vehicles (N,) of each connected component."""
+        return [self.component == label for label in range(int(self.component.max()) + 1)]
+
+    @staticmethod
+    def mean(array: Array) -> Array:
+        """Return the mean (K, 1, 2) of the vectors (K, N, 2) of each period, of those that are known."""
+        known = _finite(array)
+        whole, partly = _divide(known)
+        means = np.full((len(array), 1, array.shape[2]), np.nan)
+        if len(whole):
+            means[whole] = array[whole].mean(axis=1, keepdims=True)
+        for number in partly:
+            means[number] = array[number][known[number]].mean(axis=0)
+        return means
+
+    @staticmethod
+    def rms(array: Array) -> list[float | None]:
+        """Return the root mean square of the vectors (K, N, 2) of each period, of those that are known."""
+        means = _means_of_known(np.sum(array**2, axis=2), _finite(array))
+        return [None if mean is None else math.sqrt(mean) for mean in means]
+
+    @staticmethod
+    def anees(error: Array, covariance: Array) -> list[float | None]:
+        """Return the ANEES of errors (K, N, 2) whose covariances (K, N, 4) are positive definite."""
+        matrix = covariance.reshape(*error.shape, 2)
+        usable = _finite(error) & _finite(covariance)
+        usable[usable] = _are_positive_definite(matrix[usable])
+        inverse = np.linalg.inv(matrix[usable])
+        x, y = error[usable].T
+        # Not einsum, whose order of summation depends on the number of vehicles.
+        (xx, xy), (yx, yy) = inverse.transpose(1, 2, 0)
+        square = np.zeros(error.shape[:2])
+        square[usable] = x * xx * x + x * xy * y + y * yx * x + y * yy * y
+        return [None if mean is None else mean / 2 for mean in _means_of_known(square, usable)]
+
+
 def vectors(values: Sequence[Sequence[float] | None], size: int) -> Array:
     """Return a column of the states as an array (rows, size); NaN where nothing was reported."""
     array = np.full((len(values), size), np.nan)
@@ -92,18 +270,18 @@ def vectors(values: Sequence[Sequence[float] | None], size: int) -> Array:
     return array
 
 
-def figures_of(periods: Sequence[Period], reported: Mapping[str, Array]) -> list[PeriodFigures]:
-    """Return the figures of each period.
+def figures_of(periods: Sequence[Period], reported: Mapping[str, Array], of: ProgramFigures) -> list[Any]:
+    """Return the figures of each period, of the class `of.row`.
 
-    `reported` has the columns `VECTORS`, each an array (rows, size) with a row for each vehicle and period, vehicle
-    by vehicle within a period.
+    `reported` has the columns `of.vectors`, each an array (rows, size) with a row for each vehicle and period,
+    vehicle by vehicle within a period.
     """
-    found: list[PeriodFigures] = []
+    found: list[Any] = []
     vehicles = len(periods[0].component)
     for first, end in _alike(periods):
         rows = slice(first * vehicles, end * vehicles)
         columns = {name: array[rows].reshape(end - first, vehicles, -1) for name, array in reported.items()}
-        found += _figures(periods[first:end], columns)
+        found += _figures(periods[first:end], columns, of)
     return found
 
 
@@ -118,74 +296,25 @@ def _alike(periods: Sequence[Period]) -> Iterator[tuple[int, int]]:
     yield first, len(periods)
 
 
-def _figures(periods: Sequence[Period], columns: Mapping[str, Array]) -> list[PeriodFigures]:
+def _figures(periods: Sequence[Period], columns: dict[str, Array], of: ProgramFigures) -> list[Any]:
     """Return the figures of K periods whose `columns` are arrays (K, N, size)."""
     instants = [period.instant for period in periods]
     position, fix = np.array([each.position_m for each in instants]), np.array([each.fix_m for each in instants])
-    truth = np.array([each.common_error_m for each in instants])[:, None]
-    common, stacked = columns["common_error_estimate_m"], columns["stacked_common_error_m"]
-    error, position_error = common - truth, columns["estimate_m"] - position
-    mean, component = _means(common), periods[0].component
-    groups = [component == label for label in range(int(component.max()) + 1)]
-    of_component = np.full_like(common, np.nan)
-    for group in groups:
-        of_component[:, group] = _means(common[:, group])
-    bias = (mean - truth)[:, 0]
-    found: Iterator[Any] = zip(
-        _rms(error),
-        _rms(common - mean),
-        map(_number_or_none, np.hypot(bias[:, 0], bias[:, 1]).tolist()),
-        _rms(stacked - truth),
-        _rms(stacked - _means(stacked)),
-        _by_period([_rms(error[:, group]) for group in groups], len(periods)),
-        _by_period([_rms(common[:, group] - _means(common[:, group])) for group in groups], len(periods)),
-        _rms(position_error),
-        _rms(fix - position),
-        _rms(columns["mean_m"] - of_component),
-        _anees(error, columns["common_error_covariance_m2"]),
-        _anees(position_error, columns["covariance_m2"]),
-        strict=True,
-    )
-    heads = [(each.instant.period, each.instant.time_ns, each.reporting) for each in periods]
-    rows = zip(heads, found, periods, strict=True)
-    return list(starmap(PeriodFigures, ((*head, *figures, period.not_finite) for head, figures, period in rows)))
-
-
-def _by_period(figures: list[list[float | None]], periods: int) -> list[list[float | None]]:
-    """Turn the figures of each component in each period into those of each period by component."""
-    return [[figure[number] for figure in figures] for number in range(periods)]
-
-
-def _means(array: Array) -> Array:
-    """Return the mean (K, 1, 2) of the vectors (K, N, 2) of each period, of those that are known."""
-    known = _finite(array)
-    whole, partly = _divide(known)
-    means = np.full((len(array), 1, array.shape[2]), np.nan)
-    if len(whole):
-        means[whole] = array[whole].mean(axis=1, keepdims=True)
-    for number in partly:
-        means[number] = array[number][known[number]].mean(axis=0)
-    return means
-
-
-def _rms(array: Array) -> list[float | None]:
-    """Return the root mean square of the vectors (K, N, 2) of each period, of those that are known."""
-    means = _means_of_known(np.sum(array**2, axis=2), _finite(array))
-    return [None if mean is None else math.sqrt(mean) for mean in means]
-
-
-def _anees(error: Array, covariance: Array) -> list[float | None]:
-    """Return the ANEES of each period, of errors (K, N, 2) whose covariances (K, N, 4) are positive definite."""
-    matrix = covariance.reshape(*error.shape, 2)
-    usable = _finite(error) & _finite(covariance)
-    usable[usable] = _are_positive_definite(matrix[usable])
-    inverse = np.linalg.inv(matrix[usable])
-    x, y = error[usable].T
-    # Not einsum, whose order of summation depends on the number of vehicles.
-    (xx, xy), (yx, yy) = inverse.transpose(1, 2, 0)
-    square = np.zeros(error.shape[:2])
-    square[usable] = x * xx * x + x * xy * y + y * yx * x + y * yy * y
-    return [None if mean is None else mean / 2 for mean in _means_of_known(square, usable)]
+    columns |= {"position_m": position, "fix_m": fix}
+    columns["common_error_m"] = np.array([each.common_error_m for each in instants])[:, None]
+    together = Periods(columns, periods[0].component)
+    error = columns["estimate_m"] - position
+    found: dict[str, Sequence[Any]] = {
+        "period": [each.period for each in instants],
+        "time_ns": [each.time_ns for each in instants],
+        "reporting": [period.reporting for period in periods],
+        "position_rmse_m": together.rms(error),
+        "fix_rmse_m": together.rms(fix - position),
+        "position_anees": together.anees(error, columns["covariance_m2"]),
+        "not_finite": [period.not_finite for period in periods],
+    }
+    found |= of.compute(together)
+    return list(starmap(of.row, zip(*(found[each.name] for each in fields(of.row)), strict=True)))
 
 
 def _means_of_known(numbers: Array, known: _Mask) -> list[float | None]:
@@ -217,7 +346,3 @@ def _are_positive_definite(matrix: Array) -> _Mask:
     """Return which of the matrices (n, 2, 2) are positive definite."""
     definite: _Mask = (np.linalg.det(matrix) > 1e-18) & (np.trace(matrix, axis1=1, axis2=2) > 0)
     return definite
-
-
-def _number_or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None

@@ -328,3 +328,51 @@ def _mean(values: Array) -> float | None:
 def _column(values: Numbers) -> pa.Array:
     """Numbers as a column; null where they are NaN."""
     return pa.array(values, mask=np.isnan(values))
+
+
+def sent_by_programs(recorded: RecordedRun) -> Mask:
+    """Return the mask of the rows of frames that programs sent, each attempt included.
+
+    What faults send again, its retries, and duplicates of a reception are left out. A retry is a copy as those are;
+    but a sender ends one exchange before it begins another of the same frame.
+    """
+    mask: Mask = np.asarray(recorded.copy == 0)
+    if not recorded.attempt.any():
+        return mask
+    rows = np.flatnonzero((recorded.attempt > 0) & (recorded.on_air_ns >= 0))
+    frame, on_air_ns = recorded.frame[rows], recorded.on_air_ns[rows]
+    order = np.lexsort((recorded.copy[rows], on_air_ns, frame))
+    twice = (np.diff(frame[order]) == 0) & (np.diff(on_air_ns[order]) == 0)
+    rows = rows[order[np.append(True, ~twice)[: len(order)]]]
+    first = np.flatnonzero(recorded.attempt[rows] == 1)
+    exchange = np.searchsorted(first, np.arange(len(rows)), side="right") - 1
+    known = exchange >= 0
+    mask[rows[known]] = recorded.copy[rows[first]][exchange[known]] == 0
+    return mask
+
+
+@dataclass(frozen=True)
+class UnicastFigures:
+    """Frames to single vehicles: sent, acknowledged, and transmissions beyond the first of each."""
+
+    sent: int
+    acknowledged: int
+    retries: int
+
+    def __str__(self) -> str:
+        """Return the figures in one line."""
+        share = f"{self.acknowledged / self.sent:.2%}"
+        return f"{self.sent:,} sent, {self.acknowledged:,} acknowledged: {share}; {self.retries:,} retries"
+
+
+def unicast_figures(recorded: RecordedRun) -> UnicastFigures | None:
+    """Return the figures of a run without what faults send again; None without frames to single vehicles."""
+    rows = np.flatnonzero((recorded.attempt > 0) & sent_by_programs(recorded))
+    if not len(rows):
+        return None
+    frame = recorded.frame[rows]
+    return UnicastFigures(
+        sent=len(np.unique(frame)),
+        acknowledged=len(np.unique(frame[recorded.acked[rows]])),
+        retries=int((recorded.attempt[rows] > 1).sum()),
+    )

@@ -25,13 +25,12 @@ from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.topology import connectivity_of
 from emulator.radio.trace import ACKNOWLEDGED, LATE
-from emulator.records.busy import busy_windows
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events
-from emulator.records.payloads import KeptPayloads
-from emulator.records.period_figures import PeriodFigures
+from emulator.records.metrics import rows_of
+from emulator.records.period_figures import ProgramFigures, figures_if_here
 from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
-from emulator.records.reported import numbers_of, value_columns
+from emulator.records.reported import numbers_of, reported_columns, value_columns
 from emulator.records.run_folder import (
     EVENTS_FILE,
     FORMAT,
@@ -44,9 +43,21 @@ from emulator.records.run_folder import (
     not_finished,
 )
 from emulator.records.run_tables import VALUES_AS_LIST, StatesReader, TableFile, TraceReader, open_table
-from emulator.records.tables import BUSY, METRICS, PAYLOADS, STATES, TRACE, Condition, Table, always
-from emulator.records.verdict_file import Record, read_record
-from emulator.records.verdicts import MOST_ROWS
+from emulator.records.tables import (
+    BUSY,
+    METRICS,
+    PAYLOADS,
+    STATES,
+    TRACE,
+    Column,
+    Condition,
+    KeptPayloads,
+    Table,
+    always,
+    busy_windows,
+    columns_of,
+)
+from emulator.records.verdicts import MOST_ROWS, Record, read_record
 from emulator.scenario.faults import ProcessFault, Range, SenderFault, Swizzle
 from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
 from emulator.scenario.scenario import Scenario
@@ -403,6 +414,16 @@ class RecordedRun:
         spread[self._place] = numbers_of(self.states[name])
         return spread
 
+    @property
+    def reported_names(self) -> list[str]:
+        """Names of the columns of the states for what programs report, without `values`."""
+        return reported_columns(self.states.schema)
+
+    @cached_property
+    def declared(self) -> ProgramFigures:
+        """Figures that the program declares; none where it is not installed."""
+        return figures_if_here(self.scenario.program)
+
     @cached_property
     def value_names(self) -> list[str]:
         """Names of the values that have a column of the states, in the order in which they were first reported."""
@@ -420,9 +441,7 @@ class RecordedRun:
         """(periods, N), who reported anything in which period."""
         values = self.states["values"].combine_chunks().cast(VALUES_AS_LIST)
         something = np.asarray(pc.fill_null(pc.list_value_length(values), 0)) > 0
-        for name in ("estimate_m", "common_error_estimate_m", "mean_m", "stacked_common_error_m", "cloud_m"):
-            something |= np.asarray(self.states[name].combine_chunks().is_valid())
-        for name in self.value_names:
+        for name in self.reported_names:
             something |= np.asarray(self.states[name].combine_chunks().is_valid())
         reported = np.zeros((self.periods, len(self.node_ids)), dtype=bool)
         reported[self._place] = something
@@ -728,12 +747,13 @@ class OpenedRun(RecordedRun):
 
     def states_reader(self, number: Mapping[str, int]) -> StatesReader:
         """The states period by period; `number` gives each node's."""
-        return StatesReader(self.folder / STATES.file, number, self.scenario.period_ns)
+        return StatesReader(self.folder / STATES.file, number, self.scenario.period_ns, self.declared)
 
-    def figures(self) -> list[PeriodFigures]:
+    def figures(self) -> list[Any]:
         """The rows of the metrics. Raises VnetError unless there is one for each period in turn."""
         file = TableFile(self.folder / METRICS.file, list(METRICS.columns))
-        figures = [PeriodFigures(**row) for piece in file.pieces() for row in piece.to_pylist()]
+        file.want([name for name in file.schema.names if name not in METRICS.columns])
+        figures = [row for piece in file.pieces() for row in rows_of(piece)]
         if [row.period for row in figures] != list(range(len(figures))):
             raise file.error("its rows are not those of one period after the other")
         return figures
@@ -787,16 +807,24 @@ class OpenedRun(RecordedRun):
         file = self._read(path, lambda: open_table(path, names))
         self._bound_rows(kind, path, file.metadata.num_rows)
         kept = file.schema_arrow
-        for name in wanted or kind.columns:
-            column = kind.columns[name]
+        columns = self._columns_of(kind)
+        for name in wanted or columns:
+            column = columns.get(name) or Column(pa.null(), "")
             found = name in kept.names and kept.field(name).type == column.type
             if not found and self._holds(column.is_due):
                 raise VnetError(f"{path}: has no column {name!r} of {column.type}")
         table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
         for name in table.column_names:
-            if name in kind.columns and not kind.columns[name].has_gaps and table[name].null_count:
+            if name in columns and not columns[name].has_gaps and table[name].null_count:
                 raise VnetError(f"{path}: column {name!r} has gaps")
         return table.unify_dictionaries()
+
+    def _columns_of(self, kind: Table) -> Mapping[str, Column]:
+        """Return the columns that a table must have; those that a program declares if the scenario can be read."""
+        try:
+            return columns_of(kind, self.declared) if kind in (STATES, METRICS) else kind.columns
+        except VnetError:
+            return kind.columns
 
     def _unkept(self) -> list[str]:
         """Return a line for each file that the disk refused at the end of the run."""

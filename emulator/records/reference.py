@@ -6,7 +6,6 @@ have their names.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -88,23 +87,3 @@ def reference_series(recorded: RecordedRun) -> dict[str, Array]:
         raise VnetError(f"no program reported what the {made.NAME} is compared with")
     missing = {name: np.full_like(value, np.nan, dtype=float) for name, value in some.items()}
     return {name: np.array([row.get(name, missing[name]) for row in rows], dtype=float) for name in some}
-
-
-def after(series: Mapping[str, Array], first: int) -> dict[str, float | list[float | None] | None]:
-    """Return each figure from period `first` on: the root of the mean square of one in metres, of others the mean.
-
-    None of nothing.
-    """
-    return {
-        name: _settled(name, values[first:])
-        if values.ndim == 1
-        else [_settled(name, column[first:]) for column in values.T]
-        for name, values in series.items()
-    }
-
-
-def _settled(name: str, values: Array) -> float | None:
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return None
-    return math.sqrt((known**2).mean()) if name.endswith("_m") else float(known.mean())

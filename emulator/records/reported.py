@@ -1,7 +1,7 @@
 """Values that programs report by names of their own: columns of the states, and a run's figures of them.
 
 Numbers, booleans and texts have a column each. Lists stay in the column `values`, as do further names once there
-are `MOST_COLUMNS`, and the weights of a fusion of common errors (`weight.v03`): one for each pair of vehicles.
+are `MOST_COLUMNS`, and what a program declares to be a value of each pair of vehicles (`delay_ms.v03`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from emulator.records.beliefs import WEIGHT
-from emulator.records.states import TAKEN
+from emulator.records.period_figures import ProgramFigures
+from emulator.records.tables import STATES, TRUTH
 from vnet.reports import Value
 from vnet.types import Array
 from vnet.units import title_of, unit_of
@@ -34,23 +34,21 @@ TEXT = pa.dictionary(pa.int32(), pa.string())
 _BOOLEAN, _NUMBER, _TEXT = range(3)
 
 
-def figures_among(values: Mapping[str, Value]) -> dict[str, Figure]:
+def figures_among(values: Mapping[str, Value], declared: ProgramFigures) -> dict[str, Figure]:
     """Return the figures among the values of one report: numbers, booleans and texts with names of their own."""
     return {
         name: value
         for name, value in values.items()
-        if not isinstance(value, list) and _is_name(name) and not is_weight(name, values)
+        if not isinstance(value, list)
+        and _is_name(name)
+        and name not in declared.columns
+        and not declared.is_of_peer(name)
     }
-
-
-def is_weight(name: str, values: Mapping[str, Value]) -> bool:
-    """Return whether a value of a report is a weight of the fusion of common errors that is reported beside it."""
-    return name.startswith(WEIGHT) and "common_error_m" in values
 
 
 @lru_cache(maxsize=4096)  # asked of each value of each report
 def _is_name(name: str) -> bool:
-    return name.partition(".")[0].isidentifier() and name not in TAKEN
+    return name.partition(".")[0].isidentifier() and name not in STATES.columns
 
 
 @dataclass
@@ -115,6 +113,11 @@ class ValueColumns:
         for i, value in zip(row.tolist(), number.tolist(), strict=True):
             texts[i] = known[int(value)]
         return pa.array(texts, pa.string()).dictionary_encode()
+
+
+def reported_columns(schema: pa.Schema) -> list[str]:
+    """Return the names of all columns of what programs report, without `values`, which has what has no column."""
+    return [name for name in schema.names if name not in (*TRUTH, "values")]
 
 
 def value_columns(schema: pa.Schema) -> list[str]:

@@ -14,12 +14,10 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.faults.plan import PlannedFault
-from emulator.records.divergence import first_lasting
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import BACKBONE, BACKGROUND, DRIVEN
-from emulator.records.verdict_file import Record
-from emulator.records.verdicts import CheckResult, NotExercised, Verdict
+from emulator.records.verdicts import CheckResult, NotExercised, Record, Verdict
 from emulator.scenario.faults import GnssFault
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import components_of_links
@@ -287,3 +285,15 @@ class Run:
             end_s = periods * self.period_s
             raise VnetError(f"time_s = {time_s:g}: the run has periods from 0 s to {end_s:g} s")
         return period
+
+
+def first_lasting(holds: Mask, period_ns: int, duration_s: float) -> dict[int, int]:
+    """Return the period in which a condition (periods, N) had first held for `duration_s`, by vehicle."""
+    needed = max(1, round(duration_s * NS_PER_S / period_ns))
+    length = np.zeros(holds.shape[1], dtype=int)
+    first: dict[int, int] = {}
+    for period, over in enumerate(holds):
+        length = np.where(over, length + 1, 0)
+        for node in np.flatnonzero(length == needed).tolist():
+            first.setdefault(node, period)
+    return first

@@ -44,7 +44,7 @@ AGAIN = "again"
 """The folder, in a run's own, of the second run of `--check-determinism`."""
 VERDICT_ROOM_BYTES = 1 << 16
 """Size of most verdicts, with their manifests."""
-FORMAT = 3
+FORMAT = 4
 """Version of the folder's files; `verdict.json` holds it. docs/reference/files.md says what changed with each."""
 
 

@@ -7,18 +7,20 @@ import os
 import resource
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import NOT_ARRIVING, ROW, decided_ns
-from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
-from emulator.records.reported import is_text, numbers_of, value_columns
+from emulator.records.period_figures import VECTORS, ProgramFigures
+from emulator.records.reported import is_text, numbers_of, reported_columns, value_columns
 from emulator.world.world import Instant
 from vnet.bounded import open_regular
 from vnet.errors import VnetError
@@ -31,6 +33,7 @@ LARGEST_RATIO = 1000
 """Bytes of memory for a byte of a file; runs have written 15 at most."""
 LEAST_BOUND_BYTES = 1 << 26
 """Memory that every table may take."""
+_TRUTH = {"position_m": 2, "fix_m": 2, "common_error_m": 2}
 VALUES_AS_LIST = pa.list_(pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))]))
 """The type of the states' column `values` as a list, which more functions of Arrow know than maps."""
 
@@ -187,24 +190,34 @@ class TraceReader:
         return np.asarray(np.array(known, dtype=np.int64)[column.indices.to_numpy()])
 
 
+@dataclass(frozen=True)
+class Beliefs:
+    """Reports of one period: arrays (n, size) of the states' columns by name, NaN where a node reported nothing.
+
+    By column and node, the numbers of `lists` of any length. By name and node, the values (n,) that it has for its
+    `peers`. By name, the figures (n,) of programs' own, true as 1, and texts (n), "" where a node reported none.
+    """
+
+    columns: Mapping[str, Array]
+    lists: Mapping[str, Mapping[str, ArrayLike]]
+    peers: Mapping[str, Mapping[str, Array]]
+    values: Mapping[str, Array]
+    texts: Mapping[str, list[str]]
+
+
 class StatesReader:
     """The states of a run, period by period. `number` gives each node's, in the order of the rows of a period."""
 
-    _VECTORS: Mapping[str, int] = {
-        "position_m": 2,
-        "fix_m": 2,
-        "common_error_m": 2,
-        "estimate_m": 2,
-        "covariance_m2": 4,
-        "common_error_estimate_m": 2,
-        "common_error_covariance_m2": 4,
-    }
-
-    def __init__(self, path: Path, number: Mapping[str, int], period_ns: int) -> None:
-        columns = ("period", "node", "heading_rad", *self._VECTORS, "cloud_m", "values")
+    def __init__(self, path: Path, number: Mapping[str, int], period_ns: int, declared: ProgramFigures) -> None:
+        columns = ("period", "node", "heading_rad", *_TRUTH, *VECTORS, "values")
         self._file = TableFile(path, columns)
-        self._value_names = value_columns(self._file.schema)
-        self._file.want(self._value_names)
+        schema = self._file.schema
+        self._value_names = value_columns(schema)
+        lists = {name: schema.field(name).type for name in reported_columns(schema)}
+        self._vectors = {n: kind.list_size for n, kind in lists.items() if pa.types.is_fixed_size_list(kind)}
+        self._lists = [name for name, kind in lists.items() if pa.types.is_list(kind)]
+        self._file.want([n for n in (*self._value_names, *self._vectors, *self._lists) if n not in columns])
+        self._peers = declared.peers
         self._number = number
         self._period_ns = period_ns
         self._next_period = 0
@@ -258,15 +271,17 @@ class StatesReader:
         heading = np.asarray(table["heading_rad"].to_numpy(), dtype=float).reshape(-1, count)
         vectors = {
             name: _vectors(table[name].combine_chunks(), size).reshape(-1, count, size)
-            for name, size in self._VECTORS.items()
+            for name, size in {**_TRUTH, **self._vectors}.items()
         }
-        clouds = _clouds(table["cloud_m"].combine_chunks())
-        weights = _weights(table["values"].combine_chunks(), self._number)
+        lists = {name: _by_row(table[name].combine_chunks()) for name in self._lists}
+        values_of = table["values"].combine_chunks()
+        peers = {name: _of_peers(values_of, f"{name}.", self._number) for name in self._peers}
         values, texts = self._values(table)
         first = table["period"][0].as_py()
         for place in range(len(heading)):
             here = {name: array[place] for name, array in vectors.items()}
             row_of = dict(zip(node_ids, range(place * count, (place + 1) * count), strict=True))
+            in_rows = partial(_of_nodes, row_of)
             instant = Instant(
                 first + place,
                 (first + place) * self._period_ns,
@@ -279,12 +294,9 @@ class StatesReader:
             yield (
                 instant,
                 Beliefs(
-                    here["estimate_m"],
-                    here["covariance_m2"],
-                    here["common_error_estimate_m"],
-                    here["common_error_covariance_m2"],
-                    {node: clouds[row] for node, row in row_of.items() if row in clouds},
-                    {node: weights[row] for node, row in row_of.items() if row in weights},
+                    {name: here[name] for name in self._vectors},
+                    {name: in_rows(each) for name, each in lists.items()},
+                    {name: in_rows(each) for name, each in peers.items()},
                     {name: each[place] for name, each in values.items() if np.isfinite(each[place]).any()},
                     {name: each[place] for name, each in texts.items() if any(each[place])},
                 ),
@@ -312,26 +324,31 @@ def _vectors(column: pa.Array, size: int) -> Array:
     return array
 
 
-def _clouds(column: pa.Array) -> dict[int, Array]:
-    """The numbers of each cloud, by row."""
+def _of_nodes(row_of: Mapping[str, int], found: Mapping[int, Array]) -> dict[str, Array]:
+    """Find by node the entries of the rows of a period."""
+    return {node: found[row] for node, row in row_of.items() if row in found}
+
+
+def _by_row(column: pa.Array) -> dict[int, Array]:
+    """The numbers of each list, by row."""
     rows = np.flatnonzero(np.asarray(column.is_valid()))
     lists = column.drop_null()
     ends = np.cumsum(np.asarray(pc.list_value_length(lists), dtype=np.intp))
-    clouds = np.split(np.asarray(lists.flatten(), dtype=float), ends[:-1]) if len(rows) else []
-    return {row: cloud for row, cloud in zip(rows.tolist(), clouds, strict=True) if is_cloud(len(cloud))}
+    numbers = np.split(np.asarray(lists.flatten(), dtype=float), ends[:-1]) if len(rows) else []
+    return dict(zip(rows.tolist(), numbers, strict=True))
 
 
-def _weights(column: pa.Array, number: Mapping[str, int]) -> dict[int, Array]:
-    """The weights (n,) of each node's fusion, by row; 0 where none, and no entry where none at all."""
+def _of_peers(column: pa.Array, prefix: str, number: Mapping[str, int]) -> dict[int, Array]:
+    """The values (n,) that each node has for others, by row; 0 where none, and no entry where none at all."""
     lists = column.cast(VALUES_AS_LIST)
     entries = lists.flatten()
     name, value = pc.struct_field(entries, "key"), pc.struct_field(entries, "value")
-    one = pc.and_(pc.starts_with(name, WEIGHT), pc.equal(pc.list_value_length(value), 1))
+    one = pc.and_(pc.starts_with(name, prefix), pc.equal(pc.list_value_length(value), 1))
     row = pc.list_parent_indices(lists).filter(one).to_numpy()
     amount = np.asarray(value.filter(one).flatten(), dtype=float)
-    weights: dict[int, Array] = {}
-    for place, key, weight in zip(row.tolist(), name.filter(one).to_pylist(), amount.tolist(), strict=True):
-        other = number.get(key.removeprefix(WEIGHT))
+    found: dict[int, Array] = {}
+    for place, key, one_value in zip(row.tolist(), name.filter(one).to_pylist(), amount.tolist(), strict=True):
+        other = number.get(key.removeprefix(prefix))
         if other is not None:
-            weights.setdefault(place, np.zeros(len(number)))[other] = weight
-    return weights
+            found.setdefault(place, np.zeros(len(number)))[other] = one_value
+    return found

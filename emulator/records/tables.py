@@ -6,13 +6,21 @@ the code that fills it (`emulator.drivers.conclude.gather`); `recorded.table(…
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from emulator.records.period_figures import PeriodFigures
+from emulator.radio.medium import WINDOW_NS
+from emulator.radio.trace import payload_digest
+from emulator.records.period_figures import NUMBER, NUMBERS, PeriodFigures, ProgramFigures
 from emulator.scenario.scenario import Scenario
+from emulator.world.driven.stepped import Background
+from vnet.errors import VnetError
+from vnet.types import Array
 
 Condition = Callable[[Scenario], bool]
 
@@ -66,21 +74,42 @@ class Table:
     @property
     def schema(self) -> pa.Schema:
         """All columns with their types."""
-        return pa.schema([(name, column.type) for name, column in self.columns.items()])
+        return schema_of(self.columns)
+
+
+def schema_of(columns: Mapping[str, Column]) -> pa.Schema:
+    """Return the types of columns."""
+    return pa.schema([(name, column.type) for name, column in columns.items()])
+
+
+def columns_of(table: Table, declared: ProgramFigures) -> Mapping[str, Column]:
+    """Return the columns of a table in a run whose program declares these figures."""
+    if table is METRICS:
+        return _figures(declared.row)
+    own = declared.columns.values() if table is STATES else ()
+    return {
+        **table.columns,
+        **{each.name: Column(pa.list_(FLOAT, each.size or -1), each.text, True) for each in own},
+    }
+
+
+def _figures(row: type) -> dict[str, Column]:
+    return {each.name: Column(ARROW[str(each.type)], "", str(each.type) == NUMBER) for each in fields(row)}
 
 
 ID = "id of the vehicle"
 NAME, TEXT = pa.dictionary(pa.int32(), pa.string()), pa.string()
 INT, FLOAT = pa.int64(), pa.float64()
 POINT, MATRIX = pa.list_(FLOAT, 2), pa.list_(FLOAT, 4)
-_ARROW = {"int": INT, "float": FLOAT, "float | None": FLOAT, "list[float | None]": pa.list_(FLOAT)}
+ARROW = {"int": INT, NUMBER: FLOAT, NUMBERS: pa.list_(FLOAT)}
+"""Types of the columns of the metrics by those of the figures."""
+TRUTH = ("period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_m")
+"""Columns of the states that reports have no part in."""
 
 # fmt: off
 METRICS = Table(
-    "metrics", "a row for each period",
-    {field.name: Column(_ARROW[str(field.type)], "", "None" in str(field.type) and "list" not in str(field.type))
-     for field in fields(PeriodFigures)},
-    which=": errors and deviation", fields_of=PeriodFigures,
+    "metrics", "a row for each period", _figures(PeriodFigures), which=": errors", fields_of=PeriodFigures,
+    further="Then the figures that the program declares: [own figures](../how-to/own-figures.md).",
 )
 STATES = Table(
     "states", "a row for each vehicle and period",
@@ -98,25 +127,15 @@ STATES = Table(
                                     "reported "
                              "none", True),
         "covariance_m2": Column(MATRIX, "of `estimate_m`, as it reported: a 2 × 2 matrix by rows", True),
-        "common_error_estimate_m": Column(POINT, "`common_error_m` of its report", True),
-        "common_error_covariance_m2": Column(MATRIX, "of its report: a 2 × 2 matrix by rows", True),
-        "mean_m": Column(POINT, "of its report: what it takes for the mean of all estimates of the common "
-                                "error", True),
-        "stacked_common_error_m": Column(POINT, "of its report: the common error right after fusion, before the "
-                                                "map",
-                                         True),
-        "cloud_m": Column(pa.list_(FLOAT), "of its report: some hypotheses of the common error, x and y in "
-                                           "turns", True),
         "values": Column(pa.map_(TEXT, pa.list_(FLOAT)), "what it reported besides and has no column, by name: "
                                                          "lists, "
-                         "and weights of a fusion (`weight.v03`)", True),
+                         "and values of each pair of vehicles", True),
     },
     which=": truth and beliefs",
-    further="Then a column for each number (`double`), boolean (`bool`) or text (`string`) that programs report "
-            "by a "
-    "name of their own, called as they call it: [own figures](../how-to/results.md#report-figures). "
-    "Those after the first 64 "
-    "names stay in `values`.",
+    further="Then the columns that the program declares for lists, and a column for each number (`double`), "
+            "boolean (`bool`) or text (`string`) that programs report by a "
+    "name of their own, called as they call it: [own figures](../how-to/results.md#report-figures). Those after "
+    "the first 64 names stay in `values`.",
 )
 BUSY = Table(
     "busy", "a row for each vehicle and 100 ms",
@@ -222,3 +241,128 @@ PAYLOADS = Table(
 )
 # fmt: on
 TABLES = [TRACE, STATES, BUSY, DRIVEN, BACKBONE, BACKGROUND, METRICS, PAYLOADS]
+
+
+def background_table(background: Background | None) -> pa.Table | None:
+    """Return a row for each period and vehicle that is there at its start; None where there is no such traffic."""
+    if background is None:
+        return None
+    counts = [len(numbers) for numbers in background.numbers]
+    number = np.concatenate([np.zeros(0, np.int32), *background.numbers])
+    position_m = np.concatenate([np.zeros((0, 2)), *background.position_m])
+    names = pa.array(list(background.names), pa.string())
+    columns = [
+        pa.array(np.repeat(np.array(background.time_ns, dtype=np.int64), counts)),
+        pa.DictionaryArray.from_arrays(pa.array(number), names),
+        pa.array(position_m[:, 0]),
+        pa.array(position_m[:, 1]),
+    ]
+    return pa.table(columns, BACKGROUND.schema)
+
+
+def positions_by_time(table: pa.Table | None) -> dict[int, Array]:
+    """Return the positions (k, 2) of the vehicles by each time in ns at which there were any."""
+    if table is None or not len(table):
+        return {}
+    time_ns, position_m = table["time_ns"].to_numpy(), np.column_stack([table["x_m"], table["y_m"]])
+    first = np.flatnonzero(np.diff(time_ns, prepend=-1))
+    return dict(zip(time_ns[first].tolist(), np.split(position_m, first[1:]), strict=True))
+
+
+class BackboneRow(NamedTuple):
+    """Outcome of a message at one receiver; `arrival_ns` is None if it was lost."""
+
+    sent_ns: int
+    sender: str
+    number: int
+    receiver: str
+    size_bytes: int
+    payload_digest: int
+    arrival_ns: int | None
+    outcome: str
+
+
+def backbone_table(rows: Sequence[BackboneRow]) -> pa.Table:
+    """Return a row for each message and receiver, in the order of sending, sender, number and receiver."""
+    in_order = sorted(rows, key=lambda row: row[:4])
+    columns = zip(*in_order, strict=True) if in_order else [[]] * len(BACKBONE.columns)
+    return pa.table(list(map(pa.array, columns, BACKBONE.schema.types)), BACKBONE.schema)
+
+
+def backbone_figures(table: pa.Table | None) -> dict[str, int]:
+    """Return the number of receptions by outcome; none without roadside units."""
+    if table is None:
+        return {}
+    counted = pc.value_counts(table["outcome"]).to_pylist()
+    return {each["values"]: each["counts"] for each in sorted(counted, key=lambda each: each["values"])}
+
+
+def on_backbone(figures: Mapping[str, int]) -> str:
+    """Return the figures of a run's backbone in words."""
+    return f"{figures.get('delivered', 0):,} of {sum(figures.values()):,} delivered"
+
+
+def busy_table(windows: Array, node_ids: Sequence[str]) -> pa.Table:
+    """Busy ratios (windows, N) as a table, a row for each window and vehicle."""
+    count = len(windows)
+    node = pa.array(np.tile(np.arange(len(node_ids), dtype=np.int32), count))
+    return pa.table(
+        {
+            "time_ns": pa.array(np.repeat(np.arange(count, dtype=np.int64) * WINDOW_NS, len(node_ids))),
+            "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
+            "busy_ratio": pa.array(windows.ravel()),
+        },
+        BUSY.schema,
+    )
+
+
+def busy_windows(table: pa.Table | None, node_ids: Sequence[str]) -> Array:
+    """The ratios (windows, N) of such a table; no windows if it is None. Raises VnetError if it is another one."""
+    count = len(node_ids)
+    if table is None:
+        return np.zeros((0, count))
+    windows = len(table) // max(1, count)
+    number = pc.index_in(table["node"].cast(pa.string()), value_set=pa.array(list(node_ids), pa.string()))
+    if not np.array_equal(pc.fill_null(number, -1).to_numpy(), np.tile(np.arange(count), windows)):
+        raise VnetError(f"{BUSY.file}: its rows are not those of {count} vehicles, one window after the other")
+    return np.asarray(table["busy_ratio"].cast(pa.float64()).to_numpy()).reshape(windows, count)
+
+
+def mean_busy(windows: Sequence[Array] | Array, count: int, start_ns: int, end_ns: int) -> Array:
+    """The means (count,) of the windows (count,) that ended in (start, end], else the last before; NaN if none."""
+    end = min(end_ns // WINDOW_NS, len(windows))
+    some = windows[max(0, min(start_ns // WINDOW_NS, end - 1)) : end]
+    return np.mean(some, axis=0) if len(some) else np.full(count, np.nan)
+
+
+class PayloadRecorder:
+    """Collects the payloads of a run in memory. Nodes have the numbers 0 … N-1 in the order of `node_ids`."""
+
+    def __init__(self, node_ids: Sequence[str]) -> None:
+        self._node_ids = node_ids
+        self._rows: list[tuple[int, int, int, bytes]] = []
+
+    def add(self, time_ns: int, node: int, seq: int, payload: bytes) -> None:
+        """Keep the payload of a frame."""
+        self._rows.append((time_ns, node, seq, payload))
+
+    def to_table(self) -> pa.Table:
+        """Return the rows of `payloads.parquet`."""
+        times_ns, nodes, seqs, payloads = zip(*self._rows, strict=True) if self._rows else ((), (), (), ())
+        return pa.table(
+            [times_ns, [self._node_ids[node] for node in nodes], seqs, payloads], schema=PAYLOADS.schema
+        )
+
+
+class KeptPayloads:
+    """The payloads of a recorded run, by sender and number of the frame."""
+
+    def __init__(self, table: pa.Table) -> None:
+        self.table = table
+        columns = (table[name].to_pylist() for name in ("sender", "seq", "payload"))
+        self._payload = {(sender, seq): payload for sender, seq, payload in zip(*columns, strict=True)}
+
+    def of(self, sender: str, seq: int, digests: Collection[int]) -> bytes | None:
+        """Return the payload of a frame; None if no digest is its own, as where a fault has altered it."""
+        payload = self._payload.get((sender, seq))
+        return payload if payload is not None and payload_digest(payload) in digests else None

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from emulator.records.costs import RunCost
+from emulator.records.period_figures import POSITION_FIGURES, KeyFigure, shown_figures
+from emulator.records.reported import ReportedFigure
+from emulator.scenario.sections import first_problem
+from vnet.bounded import read_regular
+from vnet.errors import VnetError
+from vnet.units import title_of
 
 MOST_ROWS = 10
 """Offending rows that a failed check shows."""
@@ -97,3 +109,93 @@ def result(
 def unknown(name: str, text: str, **figures: Any) -> CheckResult:
     """A check that should have seen something, and did not."""
     return CheckResult(name, Verdict.UNKNOWN, text, figures)
+
+
+LARGEST_BYTES = 64 * 2**20
+RENAMED_CHECKS = {"bit:": "effect:"}
+"""Prefixes of the names of checks: that of format 1, and today's."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """The fields of `verdict.json`; lengths in metres, times in seconds."""
+
+    format: int
+    verdict: Verdict
+    checks: list[CheckResult]
+    not_exercised: list[NotExercised]
+    trace_sha256: str
+    emulated_s: float
+    wall_s: float
+    seed: int
+    vehicles: int
+    frames_by_outcome: dict[str, int]
+    figures: dict[str, float | None]
+    reproduce: str
+    real_time_factor: float | None = None
+    start_up_s: float | None = None
+    metrics_sha256: str = ""
+    packet_delivery_ratio: float | None = None
+    reported: dict[str, ReportedFigure] = field(default_factory=dict)
+    driving: dict[str, float | None] = field(default_factory=dict)
+    backbone: dict[str, int] = field(default_factory=dict)
+    roadside_units: int = 0
+    cost: RunCost | None = None
+    order: dict[str, Any] | None = None
+    versions: dict[str, str] = field(default_factory=dict)
+    key_figures: list[KeyFigure] = field(default_factory=list)
+    """Those of `figures` that sum the run up, as its program declares them."""
+
+    @property
+    def judgement(self) -> Judgement:
+        """The checks as they were judged."""
+        return Judgement(self.checks, self.not_exercised, self.trace_sha256)
+
+    @property
+    def shown_figures(self) -> dict[str, float]:
+        """The key figures that the run has, by title."""
+        return shown_figures(self.key_figures, self.figures)
+
+    @property
+    def in_range(self) -> int:
+        """Number of attempted receptions: one frame at one receiver in range."""
+        return sum(count for outcome, count in self.frames_by_outcome.items() if outcome != "out_of_range")
+
+    def share_of(self, outcome: str) -> float | None:
+        """Share of the attempted receptions with this outcome, copies and retries included; None without any."""
+        return self.frames_by_outcome.get(outcome, 0) / self.in_range if self.in_range else None
+
+
+_RECORD = TypeAdapter(Record)
+
+
+def read_record(path: Path) -> Record:
+    """Read a verdict.json. Raises OSError, and VnetError where it is not what vnet writes."""
+    try:
+        data = json.loads(read_regular(path, LARGEST_BYTES))
+        record = _RECORD.validate_python(data)
+    except ValidationError as error:
+        raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
+    except (ValueError, RecursionError) as error:
+        raise VnetError(f"{path}: not JSON: {error}") from None
+    if "key_figures" not in data:  # of an earlier vnet, whose figures have no titles
+        own = [each.name for each in POSITION_FIGURES]
+        others = [
+            KeyFigure(name, title_of(name)) for name in record.figures if name[-2:] == "_m" and name not in own
+        ]
+        record = replace(record, key_figures=[*others, *POSITION_FIGURES])
+    if "packet_delivery_ratio" not in data:  # of an earlier vnet, which counted all receptions
+        record = replace(record, packet_delivery_ratio=record.share_of("delivered"))
+    return replace(
+        record,
+        checks=[replace(check, name=_new_name(check.name)) for check in record.checks],
+        not_exercised=[replace(check, name=_new_name(check.name)) for check in record.not_exercised],
+    )
+
+
+def _new_name(check: str) -> str:
+    """The name that a check has now."""
+    for old, new in RENAMED_CHECKS.items():
+        if check.startswith(old):
+            return new + check.removeprefix(old)
+    return check

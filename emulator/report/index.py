@@ -14,10 +14,9 @@ from urllib.parse import quote
 
 from emulator.pages.page import put_page, render
 from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
-from emulator.records.key_figures import KEY_FIGURES
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE, is_run_folder
-from emulator.records.verdict_file import Record
+from emulator.records.verdicts import Record
 from vnet.errors import VnetError, first_names
 
 MOST_REPORTED = 6
@@ -143,7 +142,7 @@ def _columns(records: Sequence[Record]) -> list[Column]:
         Column("vehicles", True, lambda record: _number(record.vehicles, "d")),
         Column("emulated (s)", True, lambda record: _number(record.emulated_s, ".1f")),
     ]
-    for key in KEY_FIGURES:
+    for key in {each.name: each for record in records for each in record.key_figures}.values():
         if key.column and any(record.figures.get(key.name) is not None for record in records):
             columns.append(Column(key.column, key.is_less, partial(_figure, key.name)))
     columns.append(Column("PDR (%)", False, _delivered))

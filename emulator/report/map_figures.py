@@ -16,9 +16,8 @@ from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, legend
-from emulator.records.background_table import positions_by_time
 from emulator.records.reported import figure_text, is_text
-from emulator.records.tables import BACKGROUND
+from emulator.records.tables import BACKGROUND, positions_by_time
 from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
 from emulator.report.source import NothingToShow, Source

@@ -1,4 +1,4 @@
-"""Figures of the network: delivery against distance, node degrees and fusion weights."""
+"""Figures of the network: delivery against distance, node degrees, and what vehicles report of each other."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from matplotlib.ticker import MaxNLocator
 from emulator.pages.canvas import BLUE, INK, RED, Canvas, canvas, legend, whole_numbers
 from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.radio.topology import component_links
-from emulator.records.beliefs import WEIGHT
 from emulator.records.distributions import binomial_interval
 from emulator.records.radio_metrics import BIN_M
 from emulator.report.drawing import DASHES, Drawing
@@ -23,16 +22,17 @@ from emulator.report.source import NothingToShow, Source
 from emulator.world.world import components
 from vnet.errors import VnetError, printable
 from vnet.types import Array
+from vnet.units import title_of
 
 MOST_LINKS = 800
 """Links up to which each has a point; more are shown in bins."""
 MOST_IN_MATRIX = 150
-"""Vehicles of which the matrix of fusion weights is readable."""
+"""Vehicles of which the matrix of values of each pair is readable."""
 DISTANCE_BINS = 25
 LINK_BAND = 0.99
 """Share of the links that lie in the drawn band by chance alone."""
 OPACITY = {0.05: 0.16, 0.1: 0.32, 0.2: 0.52, 0.4: 0.76, 1.0: 1.0}
-"""Opacity of a fusion weight, by the largest weight that has it."""
+"""Opacity of a value of a pair, by the largest that has it."""
 _NAMED_VALUES = pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))])
 
 
@@ -161,13 +161,13 @@ def degrees(source: Source) -> Drawing:
     return Drawing(made, f"Number of vehicles that each can hear, {how}: {network}.")
 
 
-def weights(source: Source) -> Drawing:
-    """Draw the matrix of the mean fusion weights."""
+def peers(name: str, source: Source) -> Drawing:
+    """Draw the matrix of the mean value, between 0 and 1, that vehicles report for each other by this name."""
     ids = source.recorded.node_ids
-    matrix = mean_weights(source)
+    matrix = mean_of_peers(f"{name}.", source)
     if len(ids) > MOST_IN_MATRIX:
         raise VnetError(f"a matrix of {len(ids)} vehicles would not be readable")
-    made = canvas("weighed vehicle", "fusing vehicle", legend_rows=2, plot_px=270)
+    made = canvas("for vehicle", "reporting vehicle", legend_rows=2, plot_px=270)
     level = np.searchsorted(list(OPACITY), matrix)
     handles = []
     least = 0.0
@@ -182,7 +182,7 @@ def weights(source: Source) -> Drawing:
     _dress_matrix(made, [printable(node, 7) for node in ids])
     legend(made, handles)
     return Drawing(
-        made, "Row by row the mean weight that a vehicle gave each estimate in fusion, its own included."
+        made, f"Row by row the mean {title_of(name)} that a vehicle reported for each other one and itself."
     )
 
 
@@ -197,8 +197,8 @@ def _dress_matrix(made: Canvas, ids: Sequence[str]) -> None:
     axes.grid(visible=False)
 
 
-def mean_weights(source: Source) -> Array:
-    """Return the mean weights (N, N) that vehicles (rows) gave others (columns), over their reports with any.
+def mean_of_peers(prefix: str, source: Source) -> Array:
+    """Return the mean values (N, N) that vehicles (rows) gave others (columns), over their reports with any.
 
     Raises VnetError if nobody reported any.
     """
@@ -207,16 +207,16 @@ def mean_weights(source: Source) -> Array:
     lists = recorded.states["values"].combine_chunks().cast(pa.list_(_NAMED_VALUES))
     row, pair = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
     key, value = pair.field("key"), pair.field("value")
-    single = pc.and_(pc.starts_with(key, WEIGHT), pc.equal(pc.list_value_length(value), 1))
+    single = pc.and_(pc.starts_with(key, prefix), pc.equal(pc.list_value_length(value), 1))
     chosen = np.flatnonzero(pc.fill_null(single, False).to_numpy(zero_copy_only=False))
     names = key.take(pa.array(chosen)).dictionary_encode()
-    numbers = [recorded.number.get(name.removeprefix(WEIGHT), -1) for name in names.dictionary.to_pylist()]
+    numbers = [recorded.number.get(name.removeprefix(prefix), -1) for name in names.dictionary.to_pylist()]
     of = np.array(numbers, dtype=np.intp)[names.indices.to_numpy()]
     weight = pc.list_flatten(value.take(pa.array(chosen))).to_numpy(zero_copy_only=False)
     node = np.array([recorded.number[node] for node in recorded.states["node"].to_pylist()], dtype=np.intp)
     at, fits = node[row[chosen]], (of >= 0) & np.isfinite(weight)
     if not fits.any():
-        raise NothingToShow("no program reported any (as values named weight.ID, beside common_error_m)")
+        raise NothingToShow("no program reported any")
     total = np.bincount((at * count + of)[fits], weights=weight[fits], minlength=count * count)
     reports = np.bincount(node[np.unique(row[chosen])], minlength=count)
     return np.asarray(total.reshape(count, count) / np.maximum(1, reports)[:, None])

@@ -13,13 +13,13 @@ import pyarrow as pa
 
 from emulator.pages.canvas import Span
 from emulator.records.events import CUTS_RUN, Event, EventKind
-from emulator.records.key_figures import KEY_FIGURES, SAME
+from emulator.records.period_figures import SAME, ProgramFigures, figures_if_here
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import Reference, reference_of, reference_series
 from emulator.records.reported import reported_figures
-from emulator.records.tables import METRICS, STATES, TRACE
-from emulator.records.verdict_file import Record
+from emulator.records.tables import STATES, TRACE
+from emulator.records.verdicts import Record
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
 from vnet.types import Array
@@ -28,8 +28,7 @@ TABLES = {
     TRACE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
     STATES: ("period", "time_ns", "node", "position_m", "values"),
 }
-"""The columns that reports need; of the metrics also the key figures."""
-OF_METRICS = ("time_ns", "reporting", "common_error_anees", "position_anees")
+"""The columns that reports need; of the metrics all."""
 T = TypeVar("T")
 
 
@@ -46,8 +45,13 @@ class Source:
     @cached_property
     def recorded(self) -> OpenedRun:
         """The run, with the columns that reports need."""
-        metrics = [*OF_METRICS, *(each.name for each in KEY_FIGURES)]
-        return RecordedRun.open(self.folder, {**TABLES, METRICS: metrics})
+        return RecordedRun.open(self.folder, TABLES)
+
+    @property
+    def declared(self) -> ProgramFigures:
+        """The figures that the program declares."""
+        scenario = maybe(lambda: self.scenario)
+        return ProgramFigures() if scenario is None else figures_if_here(scenario.program)
 
     @property
     def scenario_text(self) -> str:
@@ -145,6 +149,8 @@ class Source:
 
     def metric(self, name: str) -> Array:
         """(periods,) a column of the metrics; NaN where nobody reported. Raises VnetError if nobody ever did."""
+        if name not in self.metrics.column_names:
+            raise NothingToShow("no program reported what it needs")
         column = np.asarray(self.metrics[name].cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=float)
         if not np.isfinite(column).any():
             raise NothingToShow("no program reported what it needs")

@@ -12,7 +12,7 @@ import numpy as np
 
 from emulator.pages.canvas import BLUE, GREEN, GREY, NAVY, ORANGE, PURPLE, RED, SKY, Canvas, canvas, legend
 from emulator.pages.page import render, table
-from emulator.records.key_figures import KEY_FIGURES, estimates_differ, title_of_figure
+from emulator.records.period_figures import KeyFigure, estimates_differ, figures_if_here
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import DASHES, Drawing, draw_charts
 from emulator.scenario.scenario import Scenario
@@ -54,10 +54,15 @@ def mean_of(values: Sequence[float]) -> Mean:
 
 def sweep_page(scenario: Scenario, rows: Rows, varied: Sequence[str]) -> str:
     """Return the page of the rows of a sweep over the keys `varied`."""
-    names = figures_of(rows, varied)
+    key = figures_if_here(scenario.program).key
+    names = figures_of(rows, varied, key)
     shown = _changing(rows, names)
-    drawers = {f"figure-{i}": (heading(name), partial(_draw, rows, varied, name)) for i, name in enumerate(shown)}
-    charts, missing = draw_charts(dict(list(drawers.items())[:MOST_CHARTS]) if varied else {})
+    titles = {name: heading(name, key) for name in (shown[:MOST_CHARTS] if varied else names)}
+    drawers = {
+        f"figure-{i}": (title, partial(_draw, rows, varied, name, title))
+        for i, (name, title) in enumerate(titles.items())
+    }
+    charts, missing = draw_charts(drawers if varied else {})
     counts = Counter(row["verdict"] for row in rows)
     seeds = len({row["seed"] for row in rows})
     return render(
@@ -71,19 +76,19 @@ def sweep_page(scenario: Scenario, rows: Rows, varied: Sequence[str]) -> str:
         verdicts=[(Verdict(name), count) for name, count in sorted(counts.items())],
         charts=charts,
         missing=missing,
-        left_out=len(drawers) - len(charts) if varied else 0,
-        means=table(_means(rows, varied, shown[:MOST_CHARTS] if varied else names)),
+        left_out=len(shown) - len(charts) if varied else 0,
+        means=table(_means(rows, varied, titles)),
         failed=table(_failed(rows, varied)),
     )
 
 
-def figures_of(rows: Rows, varied: Sequence[str]) -> list[str]:
+def figures_of(rows: Rows, varied: Sequence[str], key: Sequence[KeyFigure] = ()) -> list[str]:
     """Return the names of the figures, those that programs report first."""
     names = dict.fromkeys(name for row in rows for name in row)
     found = [n for n in names if n not in (*NO_FIGURES, *varied) and not n.startswith("frames_")]
     numeric = [n for n in found if any(_is_number(row.get(n)) for row in rows)]
     if not any(estimates_differ(row.get("position_rmse_m"), row.get("fix_rmse_m")) for row in rows):
-        of_positions = ["position_anees", *(each.name for each in KEY_FIGURES if each.of_positions)]
+        of_positions = ["position_anees", *(each.name for each in key if each.of_positions)]
         numeric = [name for name in numeric if name not in of_positions]
     own = [name.removeprefix("last.") for name in numeric if name.startswith("last.")]
     return sorted(numeric, key=lambda name: name.removeprefix("last.") not in own)
@@ -94,12 +99,12 @@ def _changing(rows: Rows, names: Sequence[str]) -> list[str]:
     return [name for name in names if len({row[name] for row in rows if _is_number(row.get(name))}) > 1]
 
 
-def heading(name: str) -> str:
+def heading(name: str, key: Sequence[KeyFigure] = ()) -> str:
     """Return the title of a figure, with its unit."""
     last = name.startswith("last.")
     plain = name.removeprefix("last.")
     unit = unit_of(plain)
-    title = title_of_figure(plain) or title_of(plain)
+    title = next((each.title for each in key if each.name == plain), title_of(plain))
     return f"{title}{f' ({unit})' if unit else ''}{', at the end' if last else ''}"
 
 
@@ -120,10 +125,10 @@ def _mean(rows: Rows, name: str) -> Mean | None:
     return mean_of(values) if values else None
 
 
-def _means(rows: Rows, varied: Sequence[str], names: Sequence[str]) -> list[dict[str, Any]]:
+def _means(rows: Rows, varied: Sequence[str], titles: Mapping[str, str]) -> list[dict[str, Any]]:
     return [
         {**dict(zip(varied, values, strict=True)), "runs": len(group)}
-        | {heading(name): "–" if (mean := _mean(group, name)) is None else str(mean) for name in names}
+        | {title: "–" if (mean := _mean(group, name)) is None else str(mean) for name, title in titles.items()}
         for values, group in _groups(rows, varied).items()
     ]
 
@@ -134,13 +139,13 @@ def _failed(rows: Rows, varied: Sequence[str]) -> list[dict[str, Any]]:
     return [{name: row[name] for name in names} for row in rows if row["verdict"] != Verdict.VALID]
 
 
-def _draw(rows: Rows, varied: Sequence[str], name: str) -> Drawing:
+def _draw(rows: Rows, varied: Sequence[str], name: str, title: str) -> Drawing:
     """Draw a figure against the varied key with the most values, of numbers if possible; the others make curves."""
     key = max(varied, key=lambda key: (_all_numbers(rows, key), len({row[key] for row in rows})))
     others = [other for other in varied if other != key]
     curves = _groups(rows, others)
     shown = dict(list(curves.items())[: len(COLOURS)])
-    made = canvas(key, heading(name), -(-len(shown) // 3) if others else 0)
+    made = canvas(key, title, -(-len(shown) // 3) if others else 0)
     ticks = None if _all_numbers(rows, key) else list(dict.fromkeys(str(row[key]) for row in rows))
     for number, ((values, curve), colour) in enumerate(zip(shown.items(), COLOURS, strict=False)):
         label = ", ".join(

@@ -156,20 +156,8 @@ def marks_of(events: Iterable[Event], number: dict[str, int]) -> list[Mark]:
         if kind is None or (event.kind == EventKind.log and kind == EVENT):
             continue
         node = -1 if event.node is None else number.get(event.node, -1)
-        marks.append(Mark(event.time_ns // NS_PER_US, node, kind, printable(_text(event), LONGEST_TEXT)))
+        marks.append(Mark(event.time_ns // NS_PER_US, node, kind, printable(event.what, LONGEST_TEXT)))
     return sorted(marks, key=lambda mark: mark.time_us)
-
-
-def _text(event: Event) -> str:
-    if event.kind == EventKind.log:
-        return f"{str(event.details.get('level', '')).lower()}: {event.details.get('text', '')}"
-    if event.kind == EventKind.event:
-        details = event.details.get("details")
-        told = ", ".join(f"{k} {v}" for k, v in details.items()) if isinstance(details, dict) else ""
-        return f"event {event.details.get('name', '')}" + (f": {told}" if told else "")
-    shown = {key: value for key, value in event.details.items() if key not in ("where", "log_tail")}
-    told = ", ".join(f"{key} {value}" if key != "error" else str(value) for key, value in shown.items())
-    return event.words + (f": {told}" if told else "")
 
 
 def _first_marks(marks: Sequence[Mark]) -> list[Mark]:

@@ -14,20 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from emulator.pages.page import Table, put_page, render, table
-from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS
 from emulator.records.events import SAID, SAMPLES, Event
-from emulator.records.key_figures import shown_figures
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE
-from emulator.records.verdict_file import Record
-from emulator.records.verdicts import CheckResult, Verdict
+from emulator.records.tables import on_backbone
+from emulator.records.verdicts import CheckResult, Record, Verdict
 from emulator.report.figures import draw
 from emulator.report.index import write_index
-from emulator.report.radio import radio_section
+from emulator.report.radio_figures import radio_section
 from emulator.report.source import Source, maybe, why_not
 from emulator.report.timeline import timeline
 from vnet.counted import counted
-from vnet.errors import VnetError, first_names
+from vnet.errors import VnetError
 
 MOST_EVENTS = 200
 MOST_SAID = 2000
@@ -73,7 +71,7 @@ def report_page(source: Source) -> str:
         problems=[check for check in _checks(record) if check["verdict"] is not Verdict.VALID] if record else [],
         not_applicable=record.judgement.not_applicable if record else {},
         key_figures=key_figures(record) if record else {},
-        has_errors=bool(record and shown_figures(record.figures)),
+        has_errors=bool(record and record.shown_figures),
         reported=_reported(record) if record else None,
         charts=draw(source),
         timeline=maybe(lambda: timeline(source)),
@@ -183,7 +181,7 @@ def _one_line(value: Any) -> Any:
 
 def key_figures(record: Record) -> dict[str, str]:
     """Return the figures that sum up a run, by title."""
-    found = {title: f"{value:.3f} m" for title, value in shown_figures(record.figures).items()}
+    found = {title: f"{value:.3f} m" for title, value in record.shown_figures.items()}
     if (delivered := record.packet_delivery_ratio) is not None:
         found["packet delivery ratio"] = f"{delivered:.2%}"
     if record.in_range:
@@ -241,29 +239,14 @@ def _log(source: Source) -> dict[str, Any] | None:
 
 def _said(event: Event) -> dict[str, Any]:
     """A row of the table of log lines and events of programs."""
-    text = str(event.details.get("text") or event.details.get("name", ""))
-    if isinstance(details := event.details.get("details"), dict) and details:
-        text += ": " + ", ".join(f"{name} {value}" for name, value in details.items())
     level = str(event.details.get("level", event.kind))
-    return {"time (s)": f"{event.time_ns / 1e9:.3f}", "node": event.node or "", "level": level, "text": text}
+    return {"time (s)": f"{event.time_ns / 1e9:.3f}", "node": event.node or "", "level": level, "text": event.what}
 
 
 def _event(event: Event) -> dict[str, Any]:
     """A row of the table of events."""
-    details = {name: value for name, value in event.details.items() if name != "where"}
-    text = ", ".join(f"{name} {_listed(value)}" for name, value in details.items())
-    return {
-        "time (s)": f"{event.time_ns / 1e9:.3f}",
-        "event": event.kind,
-        "node": event.node or "",
-        "details": text,
-    }
-
-
-def _listed(value: Any) -> str:
-    if not isinstance(value, list):
-        return str(value)
-    return first_names(value, with_total=True)
+    who = event.node or event.details.get("fault", "")
+    return {"time (s)": f"{event.time_ns / 1e9:.3f}", "event": event.kind, "of": who, "details": event.said}
 
 
 def _scenario(source: Source) -> dict[str, Any]:

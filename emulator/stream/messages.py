@@ -18,13 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.radio.outcomes import Outcome
 from emulator.radio.topology import component_links
 from emulator.radio.trace import decided_ns
-from emulator.records.beliefs import WEIGHT, Beliefs, collect, is_cloud
 from emulator.records.events import Event
-from emulator.records.period_figures import PeriodFigures
+from emulator.records.period_figures import VECTORS, ProgramFigures
 from emulator.records.recorded_world import RecordedWorld
-from emulator.records.reported import MOST_DOTTED, figures_among, is_weight
+from emulator.records.reported import MOST_DOTTED, figures_among
+from emulator.records.run_tables import Beliefs
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
+from vnet.errors import printable
 from vnet.reports import Report
 from vnet.types import Array
 
@@ -83,34 +84,44 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
     }
 
 
-def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
+def beliefs_of(number: Mapping[str, int], reports: Iterable[Report], declared: ProgramFigures) -> Beliefs:
     """Return the last report of each node; `number` is the index of each node."""
     last = {report.node: report for report in reports}
-    weight_index = {WEIGHT + node: index for node, index in number.items()}
-
-    def named(name: str, size: int) -> Array:
-        return collect(number, last, lambda report: report.values.get(name), size)
-
+    columns = {
+        name: _collect(number, {node: getattr(report, name) for node, report in last.items()}, size)
+        for name, size in VECTORS.items()
+    }
+    lists: dict[str, dict[str, ArrayLike]] = {}
+    for reported, column in declared.columns.items():
+        values = {node: report.values.get(reported) for node, report in last.items()}
+        if column.size is None:
+            lists[column.name] = {node: value for node, value in values.items() if isinstance(value, list)}
+        else:
+            columns[column.name] = _collect(number, values, column.size)
     return Beliefs(
-        estimate_m=collect(number, last, lambda report: report.estimate_m, 2),
-        covariance_m2=collect(number, last, lambda report: report.covariance_m2, 4),
-        common_error_m=named("common_error_m", 2),
-        common_error_covariance_m2=named("common_error_covariance_m2", 4),
-        clouds={
-            n: c for n, r in last.items() if isinstance(c := r.values.get("cloud_m"), list) and is_cloud(len(c))
-        },
-        weights={n: w for n, r in last.items() if (w := _weights(weight_index, r)) is not None},
-        values=_values(number, last),
-        texts=_texts(number, last),
+        columns,
+        lists,
+        {name: _of_peers(name, number, last) for name in declared.peers},
+        values=_values(number, last, declared),
+        texts=_texts(number, last, declared),
     )
 
 
-def _values(number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, Array]:
+def _collect(number: Mapping[str, int], values: Mapping[str, Any], size: int) -> Array:
+    """(N, size) of the values of nodes; NaN where there is nothing of that size."""
+    array = np.full((len(number), size), np.nan)
+    fitting = {n: value for n, value in values.items() if isinstance(value, (list, tuple)) and len(value) == size}
+    if fitting:
+        array[[number[node] for node in fitting]] = [*fitting.values()]
+    return array
+
+
+def _values(number: Mapping[str, int], last: Mapping[str, Report], declared: ProgramFigures) -> dict[str, Array]:
     """Return the numbers and booleans that programs report by names of their own, by name, as arrays (n,)."""
     values: dict[str, Array] = {}
     dotted = 0
     for node, report in last.items():
-        for name, value in figures_among(report.values).items():
+        for name, value in figures_among(report.values, declared).items():
             if name not in values and "." in name and dotted == MOST_DOTTED:
                 continue
             if not isinstance(value, str):
@@ -119,29 +130,27 @@ def _values(number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, 
     return {name: each for name, each in values.items() if np.isfinite(each).any()}
 
 
-def _texts(number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, list[str]]:
+def _texts(number: Mapping[str, int], last: Mapping[str, Report], declared: ProgramFigures) -> dict[str, list[str]]:
     """Return the texts that programs report by names of their own, by name, one for each node."""
     texts: dict[str, list[str]] = {}
     for node, report in last.items():
-        for name, value in figures_among(report.values).items():
+        for name, value in figures_among(report.values, declared).items():
             if isinstance(value, str):
                 texts.setdefault(name, [""] * len(number))[number[node]] = value
     return {name: each for name, each in texts.items() if any(each)}
 
 
-def _weights(index: Mapping[str, int], report: Report) -> Array | None:
-    """Return the weights (n,) that a node reported, 0 for missing ones; None if it reported none.
-
-    `index` is that of the node whose weight a value is, by the value's name.
-    """
-    weights = None
-    for name in report.values.keys() & index.keys():
-        value = report.values[name]
-        one = value if isinstance(value, list) else [value]
-        if is_weight(name, report.values) and len(one) == 1 and not isinstance(one[0], str):
-            weights = np.zeros(len(index)) if weights is None else weights
-            weights[index[name]] = one[0]
-    return weights
+def _of_peers(name: str, number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, Array]:
+    """Return the values (n,) that each node reported for others, 0 for missing ones; none where it has none."""
+    index = {f"{name}.{node}": place for node, place in number.items()}
+    found: dict[str, Array] = {}
+    for node, report in last.items():
+        for key in report.values.keys() & index.keys():
+            value = report.values[key]
+            one = value if isinstance(value, list) else [value]
+            if len(one) == 1 and not isinstance(one[0], str):
+                found.setdefault(node, np.zeros(len(number)))[index[key]] = one[0]
+    return found
 
 
 def period_message(
@@ -149,7 +158,7 @@ def period_message(
     instant: Instant,
     end_ns: int,
     beliefs: Beliefs,
-    figures: PeriodFigures,
+    figures: Any,
     rows: NDArray[np.void],
     up: ArrayLike,
     faults: Sequence[str],
@@ -171,12 +180,10 @@ def period_message(
         "heading_rad": pack(instant.heading_rad),
         "fix_m": pack(instant.fix_m),
         "common_error_m": pack(instant.common_error_m),
-        "estimate_m": pack(beliefs.estimate_m),
-        "covariance_m2": pack(beliefs.covariance_m2),
-        "common_error_estimate_m": pack(beliefs.common_error_m),
-        "common_error_covariance_m2": pack(beliefs.common_error_covariance_m2),
-        "clouds": {node: pack(cloud) for node, cloud in beliefs.clouds.items()},
-        "weights": {node: pack(weights) for node, weights in beliefs.weights.items()},
+        **{name: pack(beliefs.columns[name]) for name in VECTORS},
+        "columns": {name: pack(column) for name, column in beliefs.columns.items() if name not in VECTORS},
+        "lists": _packed(beliefs.lists),
+        "peers": _packed(beliefs.peers),
         "values": {name: pack(values) for name, values in beliefs.values.items()},
         "texts": {name: list(texts) for name, texts in beliefs.texts.items()},
         "figures": dict(vars(figures)),
@@ -187,6 +194,10 @@ def period_message(
         **_frames(rows, instant.time_ns, end_ns, len(node_ids)),
         "background_m": pack(background_m),
     }
+
+
+def _packed(found: Mapping[str, Mapping[str, ArrayLike]]) -> dict[str, dict[str, bytes]]:
+    return {name: {node: pack(numbers) for node, numbers in each.items()} for name, each in found.items() if each}
 
 
 def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
@@ -233,11 +244,12 @@ def _one_each(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def event_message(event: Event) -> dict[str, Any]:
-    """Return an event as a map, with long details truncated."""
+    """Return an event as a map, with its words, and long details truncated."""
     return {
         "time_ns": event.time_ns,
         "kind": event.kind,
         "node": event.node,
+        "text": printable(event.text, LONGEST_DETAIL),
         "details": {key: _short(value) for key, value in event.details.items()},
     }
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from emulator.records.background_table import positions_by_time
-from emulator.records.busy import busy_windows, mean_busy
 from emulator.records.events import Event
-from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import check_is_run
 from emulator.records.run_tables import StatesReader, TraceReader
-from emulator.records.tables import BACKGROUND, BUSY, STATES
+from emulator.records.tables import BACKGROUND, BUSY, STATES, busy_windows, mean_busy, positions_by_time
 from emulator.stream.messages import event_message, period_message, scene_message
 from vnet.errors import VnetError
 from vnet.types import Array
@@ -45,7 +43,7 @@ class _Playback:
     """A run's files."""
 
     run: OpenedRun
-    figures: Sequence[PeriodFigures]
+    figures: Sequence[Any]
     trace: TraceReader
     states: StatesReader
     busy: Array
@@ -113,3 +111,47 @@ def _by_period(events: Iterable[Event], period_ns: int, periods: int) -> list[li
     for event in events:
         told[min(event.time_ns // period_ns, periods)].append(event)
     return told
+
+
+def schedule(
+    messages: Iterable[Message], speed: float, from_ns: int = 0, to_ns: int | None = None
+) -> Iterator[tuple[float, Message]]:
+    """Yield the messages of the emulated times [from_ns, to_ns), each with its due time.
+
+    Due times are in seconds of the wall clock from `from_ns` on. The scene is always first and the end last;
+    periods that start before `from_ns`, or at `to_ns` or later, are skipped.
+    """
+    due_s = 0.0
+    for stream, message in messages:
+        if stream == "period":
+            time_ns = message["time_ns"]
+            if time_ns < from_ns:
+                continue
+            if to_ns is not None and time_ns >= to_ns:
+                yield due_s, ("end", {"events": []})
+                return
+            due_s = (time_ns - from_ns) / 1e9 / speed
+        yield due_s, (stream, message)
+
+
+def play(
+    scheduled: Iterable[tuple[float, Message]],
+    show: Callable[[Message], None],
+    now_s: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> int:
+    """Show each message when it is due, or later if those before it take longer; return the number of periods.
+
+    The clock starts with the first period, however long reading up to it takes.
+    """
+    periods = 0
+    started_s = 0.0
+    for due_s, message in scheduled:
+        if message[0] == "period":
+            if periods == 0:
+                started_s = now_s() - due_s
+            periods += 1
+            if (early_s := started_s + due_s - now_s()) > 0:
+                sleep(early_s)
+        show(message)
+    return periods

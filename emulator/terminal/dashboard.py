@@ -20,8 +20,6 @@ from rich.style import Style
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN
-from emulator.records.events import Event, EventKind
-from emulator.records.failures import Kind
 from vnet.errors import printable
 
 Line = list[Segment]
@@ -40,12 +38,16 @@ IDLE_S = 5.0
 """So long without a period that has ended is worth telling."""
 
 # The rows in the order in which they are worth having.
-ROWS = ["title", "time", "vehicles", "common_error", "frames"]
-ROWS += ["events", "faults", "deviation", "shares", "position"]
+ROWS = ["title", "time", "vehicles", "declared", "frames", "events", "faults", "declared", "shares", "position"]
 MORE_ROWS = ["events", "faults"] * 5
-GROUPS = (("title", "time"), ("vehicles",), ("common_error", "deviation", "position"), ("frames", "shares"),
-          ("faults",), ("events",))  # fmt: skip
-FIGURES = {"common_error": "common_error_rmse_m", "deviation": "deviation_m"}
+GROUPS = (
+    ("title", "time"),
+    ("vehicles",),
+    ("declared", "position"),
+    ("frames", "shares"),
+    ("faults",),
+    ("events",),
+)
 PATIENCE_S = 1.0
 """Emulated time after which a value that is not reported has no row."""
 EARLY_ROWS = {"starting": ["title"], "joining": ["title", "joined", "vehicles", "missing"]}
@@ -92,14 +94,17 @@ class Dashboard:
     def _allot(self, height: int) -> Counter[str]:
         """Rows given to each part."""
         shot = self._snapshot
-        most = {**dict.fromkeys(ROWS, height), "faults": len(shot.faults)}
-        if shot.emulated_s >= PATIENCE_S:
-            most |= {row: 0 for row, figure in FIGURES.items() if shot.never_reported(figure)}
+        most = {**dict.fromkeys(ROWS, height), "faults": len(shot.faults), "declared": len(_declared(shot))}
         count: Counter[str] = Counter()
         for row in ROWS + MORE_ROWS:
             if count[row] < most[row] and count.total() < height:
                 count[row] += 1
         return count
+
+
+def _declared(shot: Snapshot) -> list[tuple[str, tuple[str, str]]]:
+    """The figures that the program declares to have a line, but for those that nobody reports."""
+    return [each for each in shot.lines.items() if shot.emulated_s < PATIENCE_S or not shot.never_reported(each[0])]
 
 
 class _Rows:
@@ -114,7 +119,7 @@ class _Rows:
         words = 34 if width >= 90 else 26
         self._axis = max(4, min(width - self._label - words - 2, BINS))
 
-    def _row(self, label: str, axis: Line, words: Line, label_style: Style = DIM) -> Line:
+    def _row(self, label: str, axis: Line, words: Sequence[Segment], label_style: Style = DIM) -> Line:
         """A row over the axis."""
         filled = sum(segment.cell_length for segment in axis)
         start = Segment(_cut_middle(label, self._label - 1).ljust(self._label), label_style)
@@ -205,28 +210,23 @@ class _Rows:
             for part in parts
         )
 
-    def common_error(self, rows: int) -> list[Line]:
-        """RMSE of the common error."""
-        return [self._figure("common error", "common_error_rmse_m", "RMSE")]
-
-    def deviation(self, rows: int) -> list[Line]:
-        """Line with the deviation between vehicles."""
-        return [self._figure("deviation", "deviation_m", "between vehicles")]
+    def declared(self, rows: int) -> list[Line]:
+        """Lines of the figures that the program declares."""
+        return [self._figure(label, name, about) for name, (label, about) in _declared(self._shot)[:rows]]
 
     def position(self, rows: int) -> list[Line]:
         """RMSE of the positions, beside that of the raw fixes; or that alone."""
         if self._shot.never_reported("position_rmse_m"):
             return [self._figure("raw fixes", "fix_rmse_m", "RMSE")]
-        raw_m = self._shot.fix_rmse_m
+        raw_m = self._shot.figures["fix_rmse_m"]
         raw = "" if raw_m is None else f"raw fixes {_short(raw_m)} m"
         return [self._figure("position", "position_rmse_m", raw)]
 
     def _figure(self, label: str, name: str, about: str) -> Line:
-        value = getattr(self._shot, name)
+        value = self._shot.figures[name]
         line = sparkline(self._shot.over_time[name], self._axis)
-        known = value is not None
-        words = [Segment(f"{_short(value):>5} m", BOLD), Segment(f"  {about}", DIM)] if known else []
-        return self._row(label, [Segment(line, SKY)], words)
+        shown = () if value is None else (Segment(f"{_short(value):>5} m", BOLD), Segment(f"  {about}", DIM))
+        return self._row(label, [Segment(line, SKY)], shown)
 
     def frames(self, rows: int) -> list[Line]:
         """Shares of the outcomes of the last second."""
@@ -297,33 +297,12 @@ class _Rows:
         for event in self._shot.events[-rows:]:
             label = "" if lines else "events"
             when = f"{event.time_ns / 1e9:>6.1f} s  "
-            about = _cut(describe(event), max(1, self._width - self._label - len(when)))
+            about = _cut(printable(event.text, 300), max(1, self._width - self._label - len(when)))
             style = BAD if event.is_bad else PLAIN
             lines.append([Segment(label.ljust(self._label), DIM), Segment(when, DIM), Segment(about, style)])
         if not lines:
             lines.append([Segment("events".ljust(self._label), DIM), Segment("none yet", DIM)])
         return lines
-
-
-def describe(event: Event) -> str:
-    """An event in words, in one line: who, what, and the details that say why."""
-    if event.kind == EventKind.started:
-        start_up_s = event.details.get("start_up_s") or 0.0
-        return f"started: all have joined in {start_up_s:.1f} s" if start_up_s else "started"
-    if event.kind == EventKind.exception:
-        return printable(f"{event.node}: {Kind((event,)).why}", 300)
-    details = dict(event.details)
-    fault, nodes = details.pop("fault", None), details.pop("nodes", None)
-    who = event.node or fault or ""
-    what = event.words.removeprefix("fault ") if fault else event.words
-    for key in ("where", "log_tail", "key"):  # pages of text; they are in the run's folder
-        details.pop(key, None)
-    said = [str(details.pop(key)) for key in ("how", "error", "reason") if key in details]
-    if isinstance(nodes, list) and nodes:
-        said.append(_names(nodes, 40))
-    said += [f"{key} {value}" for key, value in details.items() if isinstance(value, (str, int, float))]
-    text = f"{who} {what}".strip()
-    return printable(f"{text}: {', '.join(said)}" if said else text, 300)
 
 
 def sparkline(values: Sequence[float | None], width: int) -> str:

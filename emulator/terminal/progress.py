@@ -16,10 +16,9 @@ from rich.console import Console
 
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.status import Course, Snapshot
-from emulator.records.events import GROUPED, Event
-from emulator.records.failures import key_of, kinds_of
+from emulator.records.events import GROUPED, Event, key_of, kinds_of
 from emulator.terminal.console import LogFormat
-from emulator.terminal.dashboard import Dashboard, describe
+from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import EVERY_S, Painter
 from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import first_names, printable
@@ -199,15 +198,14 @@ class PlainLines(_Lines):
 
     def _progress(self, shot: Snapshot) -> None:
         delivered = shot.frames_by_outcome.get("delivered", 0)
-        rmse_m, rmse = shot.common_error_rmse_m, ""
-        if rmse_m is not None:
-            rmse = f"RMSE {rmse_m:.2f} m  "
+        known = ((*words, shot.figures[name]) for name, words in shot.lines.items())
+        first = next((f"{label} {value:.2f} m  " for label, _, value in known if value is not None), "")
         lost = sum(shot.frames_by_outcome.values()) - delivered
         lost -= sum(shot.frames_by_outcome.get(name, 0) for name in ("out_of_range", "pending"))
         factor = f"{shot.real_time_factor or 0:4.1f}× real time"
         down = f"  down {', '.join(shot.down)}" if shot.down else ""
         receptions = f"delivered {delivered:,} of {delivered + lost:,}"
-        self._write(f"{shot.emulated_s:6.1f} s  {factor}  {rmse}{receptions}{down}")
+        self._write(f"{shot.emulated_s:6.1f} s  {factor}  {first}{receptions}{down}")
 
     def _tell_events(self) -> None:
         """A line for each event, and one for each kind of failure, however many vehicles it befalls."""
@@ -219,7 +217,7 @@ class PlainLines(_Lines):
                 self._write(f"{kind.first.time_ns / 1e9:6.1f} s  {printable(kind.untimed, LONGEST_LINE)}")
         for event in news:
             if event.is_bad and not event.has(GROUPED):
-                self._write(f"{event.time_ns / 1e9:6.1f} s  {describe(event)}")
+                self._write(f"{event.time_ns / 1e9:6.1f} s  {printable(event.text, LONGEST_LINE)}")
 
 
 class JsonLines(_Lines):
@@ -270,9 +268,9 @@ class JsonLines(_Lines):
 
     def _progress(self, shot: Snapshot) -> None:
         acting = [fault.fault for fault in shot.faults if fault.state == "acting"]
-        left_out = {"node_ids", "phase", "missing", "over_time", "faults", "events"}
+        left_out = {"node_ids", "phase", "missing", "over_time", "faults", "events", "figures", "lines"}
         left_out |= {"join_timeout_s", "idle_s", "wall_s"}
-        fields = {key: value for key, value in asdict(shot).items() if key not in left_out}
+        fields = {key: value for key, value in asdict(shot).items() if key not in left_out} | shot.figures
         self._say("progress", **fields, vehicles=len(shot.node_ids), faults_acting=acting)
 
     def _event(self, event: Event) -> None:

@@ -19,11 +19,11 @@ from rich.text import Text
 from emulator.checks.judge import Judgement, Verdict
 from emulator.checks.own import PREFIX
 from emulator.pages.text import as_text, cell
-from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS, RunCost, read_cost
-from emulator.records.key_figures import shown_figures
+from emulator.records.period_figures import KeyFigure, shown_figures
 from emulator.records.reported import ReportedFigure
 from emulator.records.run_folder import RECORDING, REPORT
+from emulator.records.tables import on_backbone
 from emulator.records.verdicts import CheckResult
 from emulator.viewer.sinks import is_closed, repair_command
 
@@ -221,7 +221,8 @@ def _figures(verdict: dict[str, Any]) -> Table:
         table.add_row("collisions", str(verdict["driving"]["collisions"]))
     if verdict.get("backbone"):
         table.add_row("messages on the backbone", on_backbone(verdict["backbone"]))
-    for title, value in shown_figures(verdict["figures"]).items():
+    key = [KeyFigure(**each) for each in verdict["key_figures"]]
+    for title, value in shown_figures(key, verdict["figures"]).items():
         table.add_row(f"{title} (mean after the first fifth)", f"{value:.3f} m")
     return table
 

@@ -29,7 +29,6 @@ from emulator.drivers.session import Local, Session, over_zenoh, refuse_router_r
 from emulator.faults.plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.events import Event
-from emulator.records.period_figures import PeriodFigures
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.faults import LONGEST_S, Fault, OwnRule, parse_fault
@@ -83,7 +82,7 @@ class RunHarness:
         return self._emulation.scenario
 
     @property
-    def figures(self) -> PeriodFigures | None:
+    def figures(self) -> Any:
         """The figures of the last period that is complete, or None."""
         rows = self._emulation.metrics.rows
         return rows[-1] if rows else None

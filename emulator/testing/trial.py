@@ -124,8 +124,7 @@ def _tables(emulation: Emulation) -> tuple[pa.Table, ...]:
 def _greatest(emulation: Emulation) -> float:
     """The greatest number of all positions, common errors and covariances that were reported."""
     states = emulation.metrics.states_table()
-    names = ("estimate_m", "covariance_m2", "common_error_estimate_m", "common_error_covariance_m2", "mean_m")
-    columns = [pc.list_flatten(states[name]).to_numpy() for name in names]
+    columns = [pc.list_flatten(states[name]).to_numpy() for name in emulation.metrics.declared.vectors]
     numbers = np.concatenate([np.asarray(column, dtype=float) for column in columns])
     return float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
 

@@ -2,14 +2,68 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
 import rerun.blueprint as rrb
 
-from emulator.viewer.drawing import TIMELINE
-from emulator.viewer.layout import EVERYTHING, Content
+from emulator.records.period_figures import Estimate, ProgramFigures
+from emulator.viewer.drawing import POSITION, TIMELINE, Period
 from emulator.viewer.program_scene import entity, titled
 from emulator.viewer.radio_scene import WINDOW_S
 
-COMMON_VIEW_M, POSITION_VIEW_M = 1.15, 5.6
+T = TypeVar("T")
+SAME_M = 1e-3
+"""Distance up to which a reported position is the raw fix again, whose float32 rounds to millimetres."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """Kinds of data that a run has; `values` and `texts` are names that programs report.
+
+    Of what its program declares, those that have been reported: `estimates`, `charts`, and `peers`.
+    """
+
+    estimates: tuple[Estimate, ...] = ()
+    """With `POSITION` if estimates are not the raw fixes again."""
+    charts: tuple[tuple[str, str], ...] = ()
+    """Id and title."""
+    peers: tuple[str, ...] = ()
+    busy: bool = False
+    """Channel busy ratios."""
+    values: tuple[str, ...] = ()
+    texts: tuple[str, ...] = ()
+
+    def after(self, period: Period, declared: ProgramFigures, values: list[str], texts: list[str]) -> Content:
+        """Return the content of the run up to and with this period."""
+        off_m = period.points("estimate_m") - period.points("fix_m")
+        seen = [each for each in declared.estimates if np.isfinite(period.points(each.estimate)).any()]
+        if (np.abs(off_m) > SAME_M).any():
+            seen.append(POSITION)
+        charts = [
+            (each["id"], each["axis"])
+            for each in declared.charts
+            if any(np.isfinite(period.figure(name)) for name in each["lines"].values())
+        ]
+        return replace(
+            self,
+            estimates=_joined(self.estimates, seen),
+            charts=_joined(self.charts, charts),
+            peers=_joined(self.peers, [name for name, found in period.peers().items() if found]),
+            busy=self.busy or bool(np.isfinite(period.numbers("busy_ratio")).any()),
+            values=tuple(values),
+            texts=tuple(texts),
+        )
+
+
+def _joined(known: tuple[T, ...], seen: Iterable[T]) -> tuple[T, ...]:
+    return tuple(dict.fromkeys([*known, *seen]))
+
+
+EVERYTHING = Content(estimates=(POSITION,), busy=True)
+"""All of vnet's views of estimates and of the radio."""
 
 
 def blueprint(vehicle: str, tab: int = 0, content: Content = EVERYTHING) -> rrb.Blueprint:
@@ -27,15 +81,16 @@ def blueprint(vehicle: str, tab: int = 0, content: Content = EVERYTHING) -> rrb.
 
 def overview(content: Content) -> rrb.Vertical:
     """The network: map, beliefs, figures, faults, events."""
-    beliefs = _beliefs(content)
+    beliefs = [
+        _around_truth(each.name, f"{each.title.capitalize()} − truth (m)", each) for each in content.estimates
+    ]
     main: list[rrb.Spatial2DView | rrb.Vertical] = [
         rrb.Spatial2DView(origin="map", name="Map (east →, north ↑): vehicles and links of this period")
     ]
     below = [rrb.StateTimelineView(origin="faults", name="Faults acting, vehicles down"), _events()]
     if beliefs:
         main.append(rrb.Vertical(*beliefs))
-    if content.weights:
-        below.insert(0, _matrix("weights", "Weights of the fusion (brighter: more)"))
+    below[:0] = [_matrix(f"peers/{name}", f"{titled(name)} by vehicle (brighter: more)") for name in content.peers]
     return rrb.Vertical(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="about", name="About", titlebar=False),
@@ -52,30 +107,20 @@ def overview(content: Content) -> rrb.Vertical:
             rrb.Vertical(*_curves(content)),
             column_shares=[4, 2.4, 3.6] if beliefs else [4, 4],
         ),
-        rrb.Horizontal(*below, column_shares=[2, 3, 4] if content.weights else [3, 4]),
+        rrb.Horizontal(*below, column_shares=[*[2] * len(content.peers), 3, 4]),
         row_shares=[1.6, 7, 2.8],
         name="Overview",
     )
 
 
-def _beliefs(content: Content) -> list[rrb.Spatial2DView]:
-    """Errors around the truth, of what programs estimate."""
-    views = []
-    if content.common:
-        views.append(_around_truth("common", "Common error − truth (m), with 95 % ellipses", COMMON_VIEW_M))
-    if content.position:
-        views.append(_around_truth("position", "Position − truth (m)", POSITION_VIEW_M))
-    return views
-
-
 def _curves(content: Content) -> list[rrb.TimeSeriesView | rrb.Tabs]:
     """Figures against time, frames last."""
     curves: list[rrb.TimeSeriesView | rrb.Tabs] = []
-    if content.common:
-        curves.append(_against_time("figures/common", "Common error (m)"))
-    more = [_against_time("figures/consensus", "Consensus (m)")] if content.consensus else []
-    more += [_against_time("figures/position", "RMSE of position (m)")] if content.position else []
-    if not content.common:
+    more = [_against_time(f"figures/{key}", title) for key, title in content.charts]
+    if more:
+        curves.append(more.pop(0))
+    more += [_against_time("figures/position", "RMSE of position (m)")] if POSITION in content.estimates else []
+    if not content.charts:
         more += [_against_time(entity("curve", name), titled(name)) for name in content.values]
     if more:
         curves.append(rrb.Tabs(*more))
@@ -140,20 +185,17 @@ def _loads(content: Content) -> list[rrb.TimeSeriesView]:
 def one_vehicle(vehicle: str, content: Content) -> rrb.Vertical:
     """One vehicle."""
     around = [rrb.Spatial2DView(origin="vehicle/hears", name=f"{vehicle} hears (around it, east →, north ↑)")]
-    if content.position:
-        name = f"{vehicle}: position − truth (m), 95 % ellipse"
-        around.append(_around_truth("vehicle/position", name, POSITION_VIEW_M))
-    if content.common:
-        name = f"{vehicle}: common error − truth (m), 95 % ellipse"
-        around.append(_around_truth("vehicle/common", name, COMMON_VIEW_M))
+    for each in content.estimates:
+        name = f"{vehicle}: {each.title} − truth (m), 95 % ellipse"
+        around.append(_around_truth(f"vehicle/{each.name}", name, each))
     curves = [_against_time("vehicle/frames", f"Frames to {vehicle} a period")]
-    if content.position or content.common:
+    if content.estimates:
         curves.insert(0, _against_time("vehicle/errors", f"{vehicle}: distance from the truth (m)"))
     return rrb.Vertical(
         rrb.Horizontal(*around),
         rrb.Horizontal(
             rrb.Vertical(*curves),
-            rrb.TextDocumentView(origin="vehicle/table", name=f"Whom {vehicle} hears and weighs"),
+            rrb.TextDocumentView(origin="vehicle/table", name=f"Whom {vehicle} hears"),
             column_shares=[2, 1],
         ),
         row_shares=[4, 4],
@@ -161,8 +203,8 @@ def one_vehicle(vehicle: str, content: Content) -> rrb.Vertical:
     )
 
 
-def _around_truth(origin: str, name: str, half_m: float) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=(-half_m, half_m), y_range=(-half_m, half_m))
+def _around_truth(origin: str, name: str, of: Estimate) -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=(-of.view_m, of.view_m), y_range=(-of.view_m, of.view_m))
     return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
 
 

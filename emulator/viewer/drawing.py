@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN, Outcome
+from emulator.records.period_figures import Estimate
 from emulator.stream.messages import unpack, unpack_pairs
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
@@ -31,9 +32,10 @@ BLUE, SKY, GREEN, ORANGE, RED, PURPLE, GREY, DARK = (
 OUTCOME_COLOURS: dict[Outcome, Colour] = {outcome: PALETTE[outcome.facts.colour].rgb for outcome in DRAWN}
 """In the order in which they are stacked."""
 
-COMMON_RINGS_M = (0.5, 1.0, 2.0, 5.0, 10.0)
-POSITION_RINGS_M = (1.0, 2.0, 5.0, 10.0, 50.0)
-"""The scales of what is drawn around the truth; the larger ones are seen by zooming out."""
+POSITION = Estimate(
+    "position", "position", "estimate_m", "covariance_m2", "position_m", (1.0, 2.0, 5.0, 10.0, 50.0), 5.6
+)
+"""Rings are the scale of what is drawn around the truth; the larger ones are seen by zooming out."""
 ELLIPSE_95 = 2.4477
 """√χ²(0.95; 2): so many standard deviations hold 95 % of a normal distribution in the plane."""
 ELLIPSE_CORNERS = 32
@@ -74,12 +76,16 @@ class Period:
         return self.time_ns / 1e9
 
     def points(self, name: str) -> Floats:
-        """One of the (n, 2) arrays, in metres."""
-        return unpack(self.message[name], 2)
+        """One of the (n, 2) arrays, in metres; NaN where there is none."""
+        return self._column(name, 2)
 
     def covariances(self, name: str) -> Floats:
-        """One of the (n, 4) arrays as (n, 2, 2), in m²."""
-        return unpack(self.message[name], 4).reshape(-1, 2, 2)
+        """One of the (n, 4) arrays as (n, 2, 2), in m²; NaN where there is none."""
+        return self._column(name, 4).reshape(-1, 2, 2)
+
+    def _column(self, name: str, size: int) -> Floats:
+        found = self.message.get(name, self.message.get("columns", {}).get(name))
+        return np.full((len(self.node_ids), size), np.nan, np.float32) if found is None else unpack(found, size)
 
     def numbers(self, name: str) -> Floats:
         """One of the (n,) arrays."""
@@ -87,7 +93,7 @@ class Period:
 
     def figure(self, name: str) -> float:
         """One of the figures; NaN where there is none."""
-        value = self.message["figures"][name]
+        value = self.message["figures"].get(name)
         return float("nan") if value is None else float(value)
 
     @cached_property
@@ -100,11 +106,6 @@ class Period:
         """The vehicles that are not, though they are in the network."""
         there = np.isfinite(self.points("position_m")[:, 0])
         return [node for node, down in zip(self.node_ids, there & ~self.up, strict=True) if down]
-
-    @cached_property
-    def truth_m(self) -> Floats:
-        """The true common error, (2,)."""
-        return np.asarray(self.points("common_error_m")[0])
 
     @cached_property
     def pairs(self) -> NDArray[np.int32]:
@@ -124,9 +125,16 @@ class Period:
         delivered = self.pairs[:, 2] == Outcome.delivered
         return self.pairs[delivered][:, [0, 1, 3]], self.numbers("pairs_age_ms")[delivered]
 
-    def clouds(self) -> dict[str, Floats]:
-        """Hypotheses of the common error by node, (k, 2)."""
-        return {node: unpack(cloud, 2) for node, cloud in self.message["clouds"].items()}
+    def off_truth(self, of: Estimate) -> Floats:
+        """Errors (n, 2) of an estimate in metres."""
+        return self.points(of.estimate) - self.points(of.truth)
+
+    def clouds(self, of: Estimate) -> dict[str, Floats]:
+        """Points around the truth by node, (k, 2), in metres."""
+        truth = np.broadcast_to(self.points(of.truth), (len(self.node_ids), 2))
+        found = self.message.get("lists", {}).get(of.cloud, {})
+        at = {node: number for number, node in enumerate(self.node_ids)}
+        return {n: unpack(cloud, 2) - truth[at[n]] for n, cloud in found.items() if len(cloud) % 8 == 0}
 
     def values(self) -> dict[str, Floats]:
         """Numbers that programs report by names of their own, (n,) by name; none from an older vnet."""
@@ -136,9 +144,10 @@ class Period:
         """Texts that programs report by names of their own, one a vehicle by name."""
         return {name: list(texts) for name, texts in self.message.get("texts", {}).items()}
 
-    def weights(self) -> dict[str, Floats]:
-        """Weights of the fusion by node, (n,)."""
-        return {node: unpack(weights)[:, 0] for node, weights in self.message["weights"].items()}
+    def peers(self) -> dict[str, dict[str, Floats]]:
+        """By name and node, the values (n,) that it reported for each other one and itself."""
+        found = self.message.get("peers", {})
+        return {name: {node: unpack(each)[:, 0] for node, each in by.items()} for name, by in found.items()}
 
 
 def link_states(period: Period) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int32]]:

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import WARNING, EventKind, level_of
+from emulator.records.period_figures import ProgramFigures, figures_if_here
+from emulator.records.reference import Setting, reference_of
 from emulator.records.run_folder import SCENARIO_FILE
+from emulator.records.tables import STATES, columns_of
 from emulator.scenario.loading import parse_recorded_scenario
+from emulator.scenario.own_functions import declared, load_entry
 from emulator.stream.messages import unpack
 from emulator.viewer.drawing import (
     BLUE,
-    COMMON_RINGS_M,
     DARK,
     GREEN,
     GREY,
     ORANGE,
     OUTCOME_COLOURS,
-    POSITION_RINGS_M,
+    POSITION,
     PURPLE,
     RED,
     SKY,
@@ -39,17 +42,18 @@ from emulator.viewer.drawing import (
     outcome_colours,
 )
 from emulator.viewer.radio_scene import next_charts_s
-from emulator.viewer.reference import DrawnReference, published
 from vnet.errors import VnetError, first_names
+from vnet.types import Array
 
 LANE_HALF_LENGTH_M = 250.0
 ELLIPSES_EVERY_S = 1.0
-CLOUDS_EVERY_S = 1.0
+"""Interval at which ellipses and clouds are drawn."""
+CURVES = (RED, SKY, BLUE, ORANGE)
+"""Colours of the curves of a chart that the program declares."""
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
 LOG_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "critical": "CRITICAL"}
 """Rerun's names of the levels of a program's log."""
-LONGEST_DETAIL = 60
 NAMED_DOWN = 6
 ACTING, NOBODY = "acting", "none"
 """States of faults, and of those who are down."""
@@ -60,22 +64,24 @@ LEGEND_STEP = 3.1
 class OverviewScene:
     """Draws the network, from the scene and period messages of a run."""
 
-    def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
+    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], declared: ProgramFigures) -> None:
         self._canvas = canvas
+        self._declared = declared
         self._node_ids: list[str] = scene["node_ids"]
         try:
             self._reference: DrawnReference | None = DrawnReference(scene)
         except VnetError:
             self._reference = None
-        self._published = published(scene).get("common_error_rmse_m")
-        self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
+        self._published = published(scene)
+        self._peers: dict[str, Floats] = {}
+        """By name, the latest values that vehicles (rows) reported for others (columns)."""
         self._faults: set[str] = set()
         self._known_faults: set[str] = set()
         self._down: list[str] | None = None
         self._up: bytes | None = None
-        self._clouds: dict[str, Floats] = {}  # each vehicle's latest
-        self._trusted = False  # whether any weights have been reported
-        self._next_ellipses_s = self._next_clouds_s = self._next_weights_s = 0.0
+        self._clouds: dict[str, dict[str, Floats]] = {each.name: {} for each in declared.estimates}
+        """Each vehicle's latest, by estimate."""
+        self._next_ellipses_s = self._next_peers_s = 0.0
         self._draw_static(scene)
 
     def _draw_static(self, scene: Mapping[str, Any]) -> None:
@@ -102,17 +108,17 @@ class OverviewScene:
             canvas.point_style("map/background", GREY, 1.5, order=-20.0)
         draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
         draw_legend(canvas, scene)
-        canvas.rings("common", COMMON_RINGS_M)
-        canvas.rings("position", POSITION_RINGS_M)
-        common = [("RMSE", RED, 2.0), ("deviation between vehicles", SKY, 2.0)]
-        if self._reference is not None:
-            common.append((self._reference.label, GREEN, 1.5))
-        if self._published is not None:
-            common.append((self._published[0], GREY, 1.5))
-        canvas.series("figures/common", common)
+        for each in (POSITION, *self._declared.estimates):
+            canvas.rings(each.name, each.rings_m)
+        for chart in self._declared.charts:
+            lines = [(label, colour, 2.0) for label, colour in zip(chart["lines"], CURVES, strict=False)]
+            first = next(iter(chart["lines"].values()))
+            if self._reference is not None:
+                lines.append((self._reference.label, GREEN, 1.5))
+            if first in self._published:
+                lines.append((self._published[first][0], GREY, 1.5))
+            canvas.series(f"figures/{chart['id']}", lines)
         canvas.states("faults/down", {NOBODY: DARK})
-        consensus = [("consensus error", BLUE, 2.0), ("error of the network's mean", GREEN, 1.5)]
-        canvas.series("figures/consensus", consensus)
         canvas.series("figures/position", [("estimate", SKY, 2.0), ("raw fix", GREY, 1.0)])
 
     def _set_styles(self) -> None:
@@ -123,16 +129,17 @@ class OverviewScene:
         canvas.point_style("map/estimate", BLUE, 2.5, order=31.0)
         canvas.point_style("position/fix", GREY, 3.0, self._node_ids)
         canvas.point_style("position/estimate", SKY, 4.0, self._node_ids)
-        canvas.point_style("common/particles", GREY, 1.0)
-        canvas.point_style("common/estimates", SKY, 4.0, self._node_ids)
-        canvas.strip_style("common/ellipses", (*SKY, 130), 1.2)
+        for each in self._declared.estimates:
+            canvas.point_style(f"{each.name}/cloud", GREY, 1.0)
+            canvas.point_style(f"{each.name}/estimate", SKY, 4.0, self._node_ids)
+            canvas.strip_style(f"{each.name}/ellipses", (*SKY, 130), 1.2)
 
     def period(self, period: Period) -> None:
         """Draw a period."""
         self._map(period)
         self._beliefs(period)
         self._figures(period)
-        self._trust(period)
+        self._of_peers(period)
         self._faults_and_downs(period)
         self.events(period.message["events"])
         self._canvas.at(period.time_ns)
@@ -150,46 +157,49 @@ class OverviewScene:
         canvas.points("map/estimate", period.points("estimate_m"))
 
     def _beliefs(self, period: Period) -> None:
-        canvas, truth = self._canvas, period.truth_m
-        position = period.points("position_m")
+        canvas, position = self._canvas, period.points("position_m")
         canvas.points("position/fix", period.points("fix_m") - position)
-        canvas.points("position/estimate", period.points("estimate_m") - position)
-        common = period.points("common_error_estimate_m") - truth
-        canvas.points("common/estimates", common)
-        self._clouds |= {node: cloud - truth for node, cloud in period.clouds().items()}
-        for node, up in zip(self._node_ids, period.up, strict=True):
-            if not up:
-                self._clouds.pop(node, None)
-        if period.time_s >= self._next_ellipses_s:
+        canvas.points("position/estimate", period.off_truth(POSITION))
+        is_time = period.time_s >= self._next_ellipses_s
+        if is_time:
             self._next_ellipses_s = period.time_s + ELLIPSES_EVERY_S
-            outlines = ellipses(common, period.covariances("common_error_covariance_m2"))
-            canvas.strips("common/ellipses", outlines)
-        if self._clouds and period.time_s >= self._next_clouds_s:
-            self._next_clouds_s = period.time_s + CLOUDS_EVERY_S
-            clouds = [self._clouds[node] for node in self._node_ids if node in self._clouds]
-            canvas.points("common/particles", np.concatenate(clouds))
+        for each in self._declared.estimates:
+            off_m, clouds = period.off_truth(each), self._clouds[each.name]
+            canvas.points(f"{each.name}/estimate", off_m)
+            clouds |= period.clouds(each)
+            for node in period.down:
+                clouds.pop(node, None)
+            if is_time:
+                canvas.strips(f"{each.name}/ellipses", ellipses(off_m, period.covariances(each.covariance)))
+                if clouds:
+                    canvas.points(f"{each.name}/cloud", np.concatenate([*clouds.values()]))
 
     def _figures(self, period: Period) -> None:
-        plot, figure = self._canvas.plot, period.figure
-        common = [figure("common_error_rmse_m"), figure("deviation_m")]
-        if self._reference is not None:
-            common.append(self._reference.step(period.message).get("common_error_rmse_m", float("nan")))
-        if self._published is not None:
-            common.append(self._published[1])
-        plot("figures/common", *common)
-        plot("figures/consensus", figure("consensus_error_m"), figure("bias_m"))
-        plot("figures/position", figure("position_rmse_m"), figure("fix_rmse_m"))
+        found = {} if self._reference is None else self._reference.step(period.message)
+        for chart in self._declared.charts:
+            names = list(chart["lines"].values())[: len(CURVES)]
+            values = [period.figure(name) for name in names]
+            if self._reference is not None:
+                values.append(found.get(names[0], float("nan")))
+            if names[0] in self._published:
+                values.append(self._published[names[0]][1])
+            self._canvas.plot(f"figures/{chart['id']}", *values)
+        self._canvas.plot("figures/position", period.figure("position_rmse_m"), period.figure("fix_rmse_m"))
 
-    def _trust(self, period: Period) -> None:
-        for node, row in period.weights().items():
-            self._weights[self._node_ids.index(node)] = row
-            self._trusted = True
-        self._weights[~period.up] = np.nan
-        if not self._trusted or period.time_s < self._next_weights_s or len(self._node_ids) > LARGEST_MATRIX:
+    def _of_peers(self, period: Period) -> None:
+        count = len(self._node_ids)
+        for name, by_node in period.peers().items():
+            matrix = self._peers.setdefault(name, np.full((count, count), np.nan, dtype=np.float32))
+            for node, row in by_node.items():
+                matrix[self._node_ids.index(node)] = row
+        for matrix in self._peers.values():
+            matrix[~period.up] = np.nan
+        if not self._peers or period.time_s < self._next_peers_s or count > LARGEST_MATRIX:
             return
-        self._next_weights_s = next_charts_s(period.time_s)
-        axes = ("fuses", "is weighed")
-        self._canvas.log("weights", rr.Tensor(self._weights, dim_names=axes, value_range=(0, 1)))
+        self._next_peers_s = next_charts_s(period.time_s)
+        for name, matrix in self._peers.items():
+            axes = ("reports", "of")
+            self._canvas.log(f"peers/{name}", rr.Tensor(matrix, dim_names=axes, value_range=(0, 1)))
 
     def _faults_and_downs(self, period: Period) -> None:
         acting = set(period.message["faults"])
@@ -219,34 +229,7 @@ class OverviewScene:
             level = "WARN" if level_of(event["kind"], event["details"]) >= WARNING or planned else "INFO"
             if event["kind"] == EventKind.log:
                 level = LOG_LEVELS.get(str(event["details"].get("level")), level)
-            self._canvas.log("events", rr.TextLog(in_words(event), level=level))
-
-
-def in_words(event: Mapping[str, Any]) -> str:
-    """An event in a line: `v03 died: how SIGKILL`, `v02 suspects: member v01`."""
-    if event["kind"] == EventKind.log:
-        return drawable(f"{event['node']}: {event['details'].get('text', '')}")
-    what, told = event["kind"].replace("_", " "), event["details"]
-    if event["kind"] == EventKind.event:  # of a program, which has named it
-        what, told = _short(told.get("name", what)), _as_map(told.get("details"))
-    details = [f"{key} {_short(value)}".rstrip() for key, value in told.items()]
-    who = f"{event['node']} " if event["node"] else ""
-    return drawable(f"{who}{what}: {', '.join(details)}" if details else f"{who}{what}")
-
-
-def _as_map(details: object) -> Mapping[str, Any]:
-    """Return what a program has told of its event; in one piece where the message was too long for all of it."""
-    try:
-        told = json.loads(str(details))
-    except ValueError:
-        told = {"": details}
-    known = told if isinstance(told, dict) else {}
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in known.items()}
-
-
-def _short(value: object) -> str:
-    text = str(value).translate(str.maketrans("", "", '"[]{}'))
-    return text if len(text) <= LONGEST_DETAIL else f"{text[: LONGEST_DETAIL - 1]}…"
+            self._canvas.log("events", rr.TextLog(drawable(event["text"]), level=level))
 
 
 def draw_scale(canvas: Canvas, point_m: Floats) -> None:
@@ -309,12 +292,58 @@ def describe(scene: Mapping[str, Any]) -> str:
     scenario = tomllib.loads(scene["scenario"])
     run, radio, program = scenario["run"], scenario["radio"], scenario["program"]
     count = int(np.frombuffer(scene["component"], dtype="<i2").max()) + 1
-    fusion = program["options"].get("fusion")
     at_first = " at first" if scene["moves"] else ""
     parts = [
         f"{len(scene['node_ids'])} vehicles in {count} component{'s' if count > 1 else ''}{at_first}",
-        program["entry"].removesuffix(":main") + (f" ({fusion})" if fusion else ""),
+        program["entry"].removesuffix(":main"),
         f"{in_reach(radio)}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
         f"{run['pacing']}, {run['duration_s']:g} s, seed {run['seed']}",
     ]
     return f"### {drawable(scene['name'])}\n\n{drawable(' · '.join(parts))}"
+
+
+class DrawnReference:
+    """Takes the messages of a run; see `emulator.records.reference`. Raises VnetError if it has no reference."""
+
+    def __init__(self, scene: Mapping[str, Any]) -> None:
+        scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
+        kind = reference_of(scenario)
+        self.label, self._columns, self._count = f"{kind.NAME}: {kind.TEXT}", kind.COLUMNS, len(scene["node_ids"])
+        point_m = unpack(scene["lane_point_m"], 2).astype(float)
+        heading_rad = unpack(scene["lane_heading_rad"])[:, 0].astype(float)
+        component = np.frombuffer(scene["component"], dtype="<i2")
+        self._sizes = {
+            name: each.type.list_size if pa.types.is_fixed_size_list(each.type) else 1
+            for name, each in columns_of(STATES, figures_if_here(scenario.program)).items()
+        }
+        if unknown := [name for name in self._columns if name not in self._sizes]:
+            raise VnetError(f"its column {unknown[0]!r} is neither vnet's nor declared")
+        self._reference = kind(Setting(scenario, component, point_m, heading_rad))
+
+    def step(self, period: Mapping[str, Any]) -> dict[str, float]:
+        """Take a period; returns its figures of the whole network by name. Periods may be left out."""
+        told = {**period["columns"], **period}
+        states = {name: self._column(name, told[name]) for name in self._columns}
+        up = np.frombuffer(period["up"], dtype=np.uint8).astype(bool)
+        states["fix_m"] = np.where(up[:, None], states["fix_m"], np.nan)
+        figures = self._reference.step(int(period["time_ns"]), states)
+        return {name: figure for name, figure in figures.items() if not isinstance(figure, list)}
+
+    def _column(self, name: str, data: bytes) -> Array:
+        """Return a column of the states, with a row for each vehicle."""
+        size = self._sizes[name]
+        if size == 1:
+            return unpack(data)[:, 0].astype(float)
+        return np.broadcast_to(unpack(data, size).astype(float), (self._count, size))
+
+
+def published(scene: Mapping[str, Any]) -> dict[str, tuple[str, float]]:
+    """Return what has been published of such a run, as its programs declare it: a label and a value by figure."""
+    found: dict[str, tuple[str, float]] = {}
+    try:
+        scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
+        for entry in declared(scenario.program, "PUBLISHED"):
+            found |= load_entry(entry)(scene)
+    except VnetError:  # a run is drawn all the same
+        return {}
+    return found

@@ -1,6 +1,6 @@
 """A Rerun recording of a run, from what the emulator tells observers.
 
-Few batched entities: one for all vehicles, one for all links, one for all particles. Periods are drawn several at
+Few batched entities: one for all vehicles, one for all links, one for all points. Periods are drawn several at
 a time. `blueprints` says how it is laid out; lengths are in metres, times in emulated seconds, east is right and
 north is up.
 """
@@ -10,14 +10,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import rerun as rr
 
-from emulator.viewer.blueprints import blueprint
+from emulator.records.period_figures import ProgramFigures, figures_if_here
+from emulator.records.run_folder import SCENARIO_FILE
+from emulator.scenario.loading import parse_recorded_scenario
+from emulator.viewer.blueprints import Content, blueprint
 from emulator.viewer.drawing import Canvas, Period
-from emulator.viewer.layout import Content
 from emulator.viewer.overview_scene import OverviewScene
 from emulator.viewer.program_scene import ProgramScene
 from emulator.viewer.radio_scene import RadioScene
@@ -45,6 +48,7 @@ class Recorder:
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
         self._program: ProgramScene | None = None
         self._content = Content()
+        self._declared = ProgramFigures()
         self._node_ids: list[str] = []
         self._waiting: deque[Period] = deque()
         self._last: int | None = None
@@ -79,11 +83,13 @@ class Recorder:
         vehicle = self._vehicle or self._node_ids[0]
         if vehicle not in self._node_ids:
             raise VnetError(f"no such vehicle: {vehicle}; there are {first_names(self._node_ids)}")
-        self._overview = OverviewScene(self._canvas, scene)
+        scenario = parse_recorded_scenario(scene["scenario"], Path(SCENARIO_FILE))
+        self._declared = figures_if_here(scenario.program)
+        self._overview = OverviewScene(self._canvas, scene, self._declared)
         self._parts = [
             self._overview,
             RadioScene(self._canvas, scene),
-            VehicleScene(self._canvas, scene, vehicle),
+            VehicleScene(self._canvas, scene, vehicle, self._declared),
         ]
         self._vehicle = vehicle
         self._program = ProgramScene(self._canvas, scene, vehicle)
@@ -107,7 +113,7 @@ class Recorder:
         """Draw what programs report, and lay out views for what the run has shown for the first time."""
         assert self._program is not None and self._vehicle is not None
         self._program.period(period)
-        content = self._content.after(period, self._program.names, self._program.texts)
+        content = self._content.after(period, self._declared, self._program.names, self._program.texts)
         if content != self._content:
             self._content = content
             self._recording.send_blueprint(blueprint(self._vehicle, content=content))

@@ -9,11 +9,12 @@ import numpy as np
 import rerun as rr
 
 from emulator.radio.outcomes import Outcome
+from emulator.records.period_figures import ProgramFigures
 from emulator.viewer.drawing import (
-    COMMON_RINGS_M,
     GREEN,
     GREY,
-    POSITION_RINGS_M,
+    ORANGE,
+    POSITION,
     RED,
     SKY,
     Canvas,
@@ -28,6 +29,8 @@ from emulator.viewer.radio_scene import WINDOW_S, Window, next_charts_s
 
 SLOW_EVERY_S = 1.0
 """Interval at which ellipses and neighbours are drawn."""
+CURVES = (SKY, RED, ORANGE)
+"""Colours of the errors of its estimates."""
 LABELLED = 40
 """As many neighbours have their names written beside them."""
 
@@ -41,23 +44,27 @@ def range_rings_m(reach_m: float) -> list[float]:
 class VehicleScene:
     """Draws one vehicle below `/vehicle`, from the scene and period messages of a run."""
 
-    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], vehicle: str) -> None:
+    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], vehicle: str, declared: ProgramFigures) -> None:
         self._canvas = canvas
+        self._estimates = (POSITION, *declared.estimates)
         self._node_ids: list[str] = scene["node_ids"]
         self._vehicle = vehicle
         self._number = self._node_ids.index(vehicle)
         periods = round(WINDOW_S * 1e9 / scene["period_ns"])
         self._tried, self._heard = Window(periods), Window(periods)
-        self._weights = np.full(len(self._node_ids), np.nan)
+        self._peers = {name: np.full(len(self._node_ids), np.nan) for name in declared.peers}
         self._next_s = self._next_slow_s = 0.0
         self._is_there = True
         self._set_styles()
-        canvas.rings("vehicle/position", POSITION_RINGS_M)
-        canvas.rings("vehicle/common", COMMON_RINGS_M)
+        for each in self._estimates:
+            canvas.rings(f"vehicle/{each.name}", each.rings_m)
         reach_m: float | None = scene["range_m"]
         if reach_m is not None:
             canvas.rings("vehicle/hears", range_rings_m(reach_m), cross=False)
-        canvas.series("vehicle/errors", (("position", SKY, 2.0), ("common error", RED, 2.0)))
+        canvas.series(
+            "vehicle/errors",
+            [(each.title, colour, 2.0) for each, colour in zip(self._estimates, CURVES, strict=False)],
+        )
         canvas.series("vehicle/frames", (("delivered", GREEN, 2.0), ("not delivered", RED, 1.0)))
 
     def period(self, period: Period) -> None:
@@ -71,9 +78,12 @@ class VehicleScene:
         self._is_there = True
         self._errors(period)
         self._frames(period)
-        weights = period.weights().get(self._vehicle)
-        if weights is not None:
-            self._weights = weights.copy()
+        for name, by_node in period.peers().items():
+            if self._vehicle in by_node:
+                self._peers[name] = by_node[self._vehicle].copy()
+        if not period.up[self._number]:
+            for values in self._peers.values():
+                values[:] = np.nan
         if period.time_s >= self._next_s:
             self._next_s = next_charts_s(period.time_s)
             self._table(period)
@@ -81,53 +91,48 @@ class VehicleScene:
     def _clear(self) -> None:
         """Draw nothing of the vehicle, which has not entered yet or has left."""
         canvas, nothing = self._canvas, np.empty((0, 2), dtype=np.float32)
-        for name in (
-            "position/fix",
-            "position/estimate",
-            "common/estimate",
-            "common/particles",
-            "hears/neighbours",
-        ):
+        for name in ("position/fix", "hears/neighbours"):
             canvas.points(f"vehicle/{name}", nothing)
-        for name in ("position/ellipse", "common/ellipse", "hears/links"):
-            canvas.strips(f"vehicle/{name}", np.empty((0, 2, 2), dtype=np.float32))
+        canvas.strips("vehicle/hears/links", np.empty((0, 2, 2), dtype=np.float32))
+        for each in self._estimates:
+            canvas.points(f"vehicle/{each.name}/estimate", nothing)
+            if each.cloud:
+                canvas.points(f"vehicle/{each.name}/cloud", nothing)
+            canvas.strips(f"vehicle/{each.name}/ellipse", np.empty((0, 2, 2), dtype=np.float32))
         text = f"{self._vehicle} is not in the network: it has not entered yet, or has left."
         canvas.log("vehicle/table", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def _set_styles(self) -> None:
         canvas = self._canvas
         canvas.point_style("vehicle/position/fix", GREY, 5.0)
-        for view in ("position", "common"):
-            canvas.point_style(f"vehicle/{view}/estimate", SKY, 6.0)
-            canvas.strip_style(f"vehicle/{view}/ellipse", SKY, 2.0)
-        canvas.point_style("vehicle/common/particles", GREY, 1.5)
+        for each in self._estimates:
+            canvas.point_style(f"vehicle/{each.name}/estimate", SKY, 6.0)
+            canvas.strip_style(f"vehicle/{each.name}/ellipse", SKY, 2.0)
+            canvas.point_style(f"vehicle/{each.name}/cloud", GREY, 1.5)
         canvas.strip_style("vehicle/hears/links", None, 2.0)
         canvas.point_style("vehicle/hears/neighbours", None, 5.0)
         canvas.point_style("vehicle/hears/self", SKY, 7.0, [self._vehicle], show_labels=True)
         canvas.points("vehicle/hears/self", [[0.0, 0.0]], static=True)
 
     def _errors(self, period: Period) -> None:
-        """Its position and its common error, as differences from the truth."""
+        """Its estimates, as differences from the truth."""
         canvas, one = self._canvas, slice(self._number, self._number + 1)
-        position = period.points("position_m")[one]
-        fix, estimate = period.points("fix_m")[one] - position, period.points("estimate_m")[one] - position
-        common = period.points("common_error_estimate_m")[one] - period.truth_m
-        canvas.points("vehicle/position/fix", fix)
-        canvas.points("vehicle/position/estimate", estimate)
-        canvas.points("vehicle/common/estimate", common)
-        cloud = period.clouds().get(self._vehicle)
-        if not period.up[self._number]:
-            cloud = np.empty((0, 2), dtype=np.float32)
-            self._weights[:] = np.nan
-        if cloud is not None:
-            canvas.points("vehicle/common/particles", cloud - period.truth_m)
-        canvas.plot("vehicle/errors", *(float(np.hypot(*error[0])) for error in (estimate, common)))
-        if period.time_s >= self._next_slow_s:
+        canvas.points("vehicle/position/fix", (period.points("fix_m") - period.points("position_m"))[one])
+        is_slow = period.time_s >= self._next_slow_s
+        errors = {each: period.off_truth(each)[one] for each in self._estimates}
+        for each, off_m in errors.items():
+            canvas.points(f"vehicle/{each.name}/estimate", off_m)
+            cloud = period.clouds(each).get(self._vehicle)
+            if not period.up[self._number]:
+                cloud = np.empty((0, 2), dtype=np.float32)
+            if cloud is not None and each.cloud:
+                canvas.points(f"vehicle/{each.name}/cloud", cloud)
+            if is_slow:
+                covariance = period.covariances(each.covariance)[one]
+                canvas.strips(f"vehicle/{each.name}/ellipse", ellipses(off_m, covariance))
+        canvas.plot("vehicle/errors", *[float(np.hypot(*off_m[0])) for off_m in errors.values()][: len(CURVES)])
+        if is_slow:
             self._next_slow_s = period.time_s + SLOW_EVERY_S
-            covariance = period.covariances("covariance_m2")[one]
-            canvas.strips("vehicle/position/ellipse", ellipses(estimate, covariance))
-            covariance = period.covariances("common_error_covariance_m2")[one]
-            canvas.strips("vehicle/common/ellipse", ellipses(common, covariance))
             self._neighbours(period)
 
     def _neighbours(self, period: Period) -> None:
@@ -156,17 +161,20 @@ class VehicleScene:
         self._heard.add(np.bincount(got_from[:, 0], got_from[:, 3], len(self._node_ids)))
 
     def _table(self, period: Period) -> None:
-        """Neighbours by weight: what was heard of each lately, and how much it counts in the fusion."""
+        """Neighbours: what was heard of each lately, and what the vehicle reports of it, in descending order."""
         tried, heard = self._tried.total, self._heard.total
-        numbers = [n for n in range(len(self._node_ids)) if tried[n] or self._weights[n] > 0]
-        numbers.sort(key=lambda n: (-np.nan_to_num(self._weights[n], nan=-1.0), -heard[n], n))
+        told = np.array([np.nan_to_num(values, nan=-1.0) for values in self._peers.values()])
+        told = told.reshape(-1, len(self._node_ids))
+        numbers = [n for n in range(len(self._node_ids)) if tried[n] or (told[:, n] > 0).any()]
+        numbers.sort(key=lambda n: (*-told[:, n], -heard[n], n))
         rows = [self._row(n, int(tried[n]), int(heard[n])) for n in numbers]
-        head = f"| hears | frames in {WINDOW_S:g} s | delivered | weight |\n|:--|--:|--:|--:|\n"
+        heads = ["hears", f"frames in {WINDOW_S:g} s", "delivered", *self._peers]
+        head = f"| {' | '.join(heads)} |\n|:--{'|--:' * (len(heads) - 1)}|\n"
         text = rr.TextDocument(head + "\n".join(rows), media_type=rr.MediaType.MARKDOWN)
         self._canvas.log("vehicle/table", text)
 
     def _row(self, number: int, tried: int, heard: int) -> str:
-        weight = self._weights[number]
+        told = [f"{values[number]:.3f}".replace("nan", "–") for values in self._peers.values()]
         share = f"{heard / tried:.0%}" if tried else "–"
         name = self._node_ids[number] + (" (itself)" if number == self._number else "")
-        return f"| {name} | {tried or '–'} | {share} | {'–' if np.isnan(weight) else f'{weight:.3f}'} |"
+        return f"| {' | '.join([name, str(tried or '–'), share, *told])} |"

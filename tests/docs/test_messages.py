@@ -134,7 +134,7 @@ def test_a_plain_reader_decodes_what_observers_get(tmp_path: Path) -> None:
         decoded = msgpack.unpackb(wire.encode_observation(message))
         assert PAGE.problem_of(kind, decoded, sizes) == ""
     events = [event for kind, message in told if kind != "Scene" for event in message["events"]]
-    assert all(event.keys() == {"time_ns", "kind", "node", "details"} for event in events)
+    assert all(event.keys() == {"time_ns", "kind", "node", "text", "details"} for event in events)
     assert events
 
 

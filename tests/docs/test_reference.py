@@ -1,7 +1,6 @@
 """The reference pages are what `make docs` makes of the code as it is, and leave nothing out."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -72,7 +71,7 @@ class Example:
 
 def test_a_column_without_a_text_is_refused() -> None:
     with pytest.raises(LookupError, match="cloud_m"):
-        files.columns(replace(STATES, columns={**STATES.columns, "cloud_m": Column(STATES.schema.types[0], "")}))
+        files.columns({**STATES.columns, "cloud_m": Column(STATES.schema.types[0], "")}, None)
 
 
 def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:

@@ -209,6 +209,7 @@ def test_a_network_of_the_published_character() -> None:
 
 def write_metrics(folder: Path, deviation_m: list[float | None]) -> Path:
     pq.write_table(pa.table({"deviation_m": pa.array(deviation_m, pa.float64())}), folder / "metrics.parquet")
+    (folder / "scenario.toml").write_text('program.entry = "agents.cooperative:main"\n')
     return folder
 
 
@@ -216,7 +217,7 @@ def test_a_run_stands_beside_its_analysis(tmp_path: Path) -> None:
     run = write_metrics(tmp_path, [9.0, None, 0.3, 0.4, None, 0.5, 0.3, 0.4, 0.3, 0.4])
     found = analyze(scenario(complete(7)), run)
     settled = np.sqrt(np.mean(np.square([0.3, 0.4, 0.5, 0.3, 0.4, 0.3, 0.4])))
-    assert found["measured"]["deviation_m"] == pytest.approx(settled)
+    assert found["measured"]["deviation"] == pytest.approx(settled)
     # Two axes, and a variance of 6/7 of that of the noise.
     assert found["measured"]["noise_m"]["metropolis"] == pytest.approx(settled / np.sqrt(2 * 6 / 7))
     assert f"{settled:.4g} m" in printed(found)
@@ -225,5 +226,5 @@ def test_a_run_stands_beside_its_analysis(tmp_path: Path) -> None:
 def test_a_run_that_cannot_be_used_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(VnetError, match="not a run's folder"):
         analyze(scenario(ring(4)), tmp_path)
-    with pytest.raises(VnetError, match="no deviation in it; its program reported no common error"):
+    with pytest.raises(VnetError, match="no deviation_m in it; its program reported nothing"):
         analyze(scenario(ring(4)), write_metrics(tmp_path, [None] * 5))

@@ -21,13 +21,12 @@ def main(folder: Path) -> None:
     """Simulate a run in which the event befalls two vehicles, and print where it shows."""
     from docs.generate.files import page
     from emulator.drivers.session import Session
-    from emulator.records.events import EventKind
-    from emulator.records.failures import merged
+    from emulator.records.events import EventKind, merged
     from emulator.records.recorded_run import RecordedRun
     from emulator.report.timeline import marks_of
     from emulator.report.write import write_report
     from emulator.scenario.loading import load_scenario
-    from emulator.terminal.dashboard import describe
+    from emulator.stream.messages import event_message
     from emulator.viewer.overview_scene import OverviewScene
 
     session = Session(load_scenario(ROOT / "scenarios" / "beacon.toml", ["run.duration_s=1"]), folder).open()
@@ -40,11 +39,11 @@ def main(folder: Path) -> None:
     events = run.event("jammed")
     canvas = Mock()
     scene = Mock(_canvas=canvas)
-    OverviewScene.events(scene, [vars(event) for event in events])
+    OverviewScene.events(scene, [event_message(event) for event in events])
     found = {
         "read": [event.node for event in events],
         "dead": len(run.deaths_ns),
-        "words": describe(events[0]),
+        "words": events[0].text,
         "bad": events[0].is_bad,
         "grouped": [event.node for event in merged(events)],
         "timeline": marks_of(events, run.number)[0].kind,

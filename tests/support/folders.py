@@ -13,8 +13,7 @@ from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.recorded_run import RecordedRun
-from emulator.report.compare_page import comparison_page
-from emulator.report.comparison import Comparison
+from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from emulator.stream.playback import messages

@@ -13,8 +13,8 @@ from distributed import Client, LocalCluster
 
 import emulator
 from emulator.cells import cells
+from emulator.cells.cells import WALL_CLOCK
 from emulator.cells.executors import open_executor
-from emulator.cells.measure import WALL_CLOCK
 
 pytestmark = pytest.mark.slow
 

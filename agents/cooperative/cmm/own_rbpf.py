@@ -21,7 +21,6 @@ from agents.cooperative.cmm.common_error import systematic
 from agents.cooperative.cmm.information import Five, Information, inverse, square_root
 from agents.cooperative.cmm.kalman_bound import LaneModel, lane_axes
 from agents.cooperative.cmm.own_kalman import LEAST_VARIANCE_M2, OwnKalman
-from agents.cooperative.cmm.sample_size import sample_size
 from vnet.types import Array
 
 DECIDED = 1e-4
@@ -252,3 +251,25 @@ def _innovation(
     matrix = _product(whitened, slope)
     vector = (whitened * off).sum(axis=1) + (matrix * mean_m).sum(axis=1)
     return distance, Information.from_arrays(matrix, vector)
+
+
+CELL_M = 0.1
+"""Side (m) of a cell: a fraction of what one fix tells."""
+DISTANCE = 0.1
+"""Kullback-Leibler distance ε."""
+QUANTILE = 2.326
+"""z of 99 %."""
+ELLIPSE_SIGMAS = 3.0
+"""Deviations within which cells count."""
+
+
+def sample_size(covariance_m2: Array, least: int, most: int) -> int:
+    """Return the number of particles, between `least` and `most`, for a covariance (2, 2)."""
+    (a, b), (_, d) = covariance_m2.tolist()
+    area_m2 = math.pi * ELLIPSE_SIGMAS**2 * math.sqrt(max(a * d - b * b, 0.0))
+    more = area_m2 / CELL_M**2 - 1
+    if more <= 1:
+        return least
+    term = 2 / (9 * more)
+    wanted = more / (2 * DISTANCE) * (1 - term + math.sqrt(term) * QUANTILE) ** 3
+    return round(min(max(wanted, least), most))

@@ -11,8 +11,7 @@ import pytest
 from msgspec import structs
 
 from agents.cooperative.admission import FORGET_PERIODS, MAX_SENDERS, Admission
-from agents.cooperative.attack import Attack
-from agents.cooperative.attacker import Attacker
+from agents.cooperative.attacker import Attack, Attacker
 from agents.cooperative.estimator import Estimator, usable
 from agents.cooperative.fix_table import CAPACITY, FixTable
 from agents.cooperative.frame import RELAYED, CooperativeFrame, decode, encode, short_name

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from agents.cooperative.gnss_clock import CLOCK_FIXES, GnssClock
+from agents.cooperative.program import CLOCK_FIXES, GnssClock
 from vnet import Fix
 
 MS = 1_000_000

@@ -11,13 +11,14 @@ import pytest
 
 from agents.cooperative.hears_all import lanes_of, reflected_deviation_m, why_no_bound
 from emulator.api import simulate_into
-from emulator.cells.cells import Cell, compute
+from emulator.cells.cells import compute
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.reference import after, reference_series
+from emulator.records.reference import reference_series
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from emulator.scenario.scenario import Scenario
 from emulator.world.trips.motion import lateral_offsets_m
+from studies.measure import after, study_cell
 from vnet.errors import VnetError
 from vnet.node import Node
 from vnet.types import Array
@@ -74,14 +75,14 @@ def test_a_report_has_the_bound_as_a_line(recorded: RecordedRun, tmp_path: Path)
 
 
 def test_a_cell_has_the_figures_of_the_bound(recorded: RecordedRun) -> None:
-    figures = compute(Cell({"seed": 1}, scenario(), 5.0)).figures
+    figures = compute(study_cell({"seed": 1}, scenario(), 5.0)).figures
     assert figures["reference_common_error_rmse_m"] == pytest.approx(settled_m(recorded))
     assert figures["reference_common_error_rmse_m"] < figures["rmse_m"]
 
 
 def test_a_cell_without_the_bound_has_no_such_figures() -> None:
     city = scenario(network={"kind": "city", "vehicles": 3, "size_m": 1000.0}, run={"duration_s": 1.0})
-    assert not [name for name in compute(Cell({"seed": 1}, city)).figures if name.startswith("reference")]
+    assert not [name for name in compute(study_cell({"seed": 1}, city)).figures if name.startswith("reference")]
 
 
 def test_outliers_are_told_to_the_bound(recorded: RecordedRun) -> None:

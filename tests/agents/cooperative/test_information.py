@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.cooperative.attack import Attack, Lie
+from agents.cooperative.attacker import Attack, InformationAttacker, Lie
 from agents.cooperative.cmm.information import Five, Information
 from agents.cooperative.frame import FrameError, name_of_code, short_name
-from agents.cooperative.information_attacker import InformationAttacker
 from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator
 from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
 from agents.cooperative.options import Options

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from agents.cooperative.information_estimator import Passing
 from agents.cooperative.information_frame import passed_increment, passed_record
-from agents.cooperative.passing import Passing
 
 
 def _record(code: int, value: float = 1.0) -> bytes:

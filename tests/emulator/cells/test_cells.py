@@ -7,6 +7,7 @@ import pytest
 from emulator.cells import cells as cells_module
 from emulator.cells.cells import Cell, CellResult, compute, read_series, run_cells
 from emulator.scenario.scenario import Scenario
+from studies.measure import study_cell
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
@@ -20,7 +21,7 @@ def tiny_cell(seed: int, **options: object) -> Cell:
         "network": TINY,
         "program": {"entry": "agents.cooperative:main", "options": {"particles": 20, **options}},
     }
-    return Cell({"seed": seed}, Scenario.model_validate(data), 1.0)
+    return study_cell({"seed": seed}, Scenario.model_validate(data), 1.0)
 
 
 def test_a_finished_cell_is_not_run_again_and_a_changed_one_is(
@@ -52,7 +53,7 @@ def test_a_cell_comes_out_the_same_whichever_process_runs_it(tmp_path: Path) -> 
 def test_a_live_cell_whose_program_cannot_be_imported_is_refused_before_it_starts() -> None:
     scenario = tiny_cell(1).scenario.model_copy(deep=True)
     program = scenario.program.model_copy(update={"entry": "nothing:main"})
-    cell = Cell({"seed": 1}, scenario.model_copy(update={"program": program}), 1.0)
+    cell = study_cell({"seed": 1}, scenario.model_copy(update={"program": program}), 1.0)
     with pytest.raises(VnetError, match=r"cell .*\}: program.entry = 'nothing:main': cannot import"):
         compute(cell, live=True)
 
@@ -69,7 +70,7 @@ def test_divergence_is_ten_metres_for_five_seconds_on_end(tmp_path: Path) -> Non
     def lasting(duration_s: float) -> Cell:
         cell = tiny_cell(1, **stuck)
         run = cell.scenario.run.model_copy(update={"duration_s": duration_s})
-        return Cell(cell.labels, cell.scenario.model_copy(update={"run": run}))
+        return study_cell(cell.labels, cell.scenario.model_copy(update={"run": run}))
 
     assert run_cells([lasting(5.0), lasting(4.9)], tmp_path)[0]["divergent"] == 4
     assert run_cells([lasting(4.9)], tmp_path)[0]["divergent"] == 0

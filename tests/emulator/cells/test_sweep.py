@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 import emulator
 from emulator.cells import sweep as subject
-from emulator.cells.cells import Cell, compute
-from emulator.cells.measure import WALL_CLOCK, judged_figures
+from emulator.cells.cells import WALL_CLOCK, Cell, compute, judged_figures
 from emulator.cells.sweep import SweepPlan, parse_shard
 from emulator.cli.studies import sweep as command
 from emulator.report.sweep_page import Mean, figures_of, heading, mean_of, sweep_page

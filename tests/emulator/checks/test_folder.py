@@ -127,7 +127,7 @@ def without_manifest(folder: Path) -> None:
 def of_format(number: int) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         path = folder / "verdict.json"
-        path.write_text(path.read_text().replace('"format": 3', f'"format": {number}', 1))
+        path.write_text(path.read_text().replace('"format": 4', f'"format": {number}', 1))
 
     return apply
 

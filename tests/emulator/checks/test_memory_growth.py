@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.checks.memory_growth import FLOOR_KIB, is_long_enough, steady_growth_kib_per_s
+from emulator.checks.run import FLOOR_KIB, is_long_enough, steady_growth_kib_per_s
 from emulator.drivers.usage import SAMPLES
 
 BASE_KB = 60_000

@@ -9,8 +9,8 @@ import pytest
 
 import emulator
 from emulator.checks.radio import check_medium
+from emulator.records.radio_metrics import unicast_figures
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.unicast_figures import unicast_figures
 from emulator.records.verdicts import CheckResult
 from vnet import Node
 

@@ -9,9 +9,8 @@ import pytest
 
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import MOST_NOTES, Emulation
-from emulator.records.node_logs import NodeLogs
+from emulator.records.node_files import NodeLogs
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.states import COMMON_VALUES
 from emulator.records.tables import STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
@@ -107,7 +106,7 @@ def test_a_flood_is_cut_and_counted() -> None:
 
 
 def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.records.node_logs.LARGEST_LOG_BYTES", 20)
+    monkeypatch.setattr("emulator.records.node_files.LARGEST_LOG_BYTES", 20)
     logs = NodeLogs(tmp_path)
     for number in range(5):
         logs.write("v01", f"line {number:03}")
@@ -146,7 +145,7 @@ def test_names_of_columns_and_names_with_a_dot_are_taken(node: Node) -> None:
 
 
 def test_vnets_own_columns_are_those_that_no_value_can_have() -> None:
-    assert frozenset(STATES.columns) - COMMON_VALUES.keys() - {"estimate_m", "covariance_m2"} == RESERVED_NAMES
+    assert frozenset(STATES.columns) - {"estimate_m", "covariance_m2", "common_error_m"} == RESERVED_NAMES
 
 
 def test_numbers_and_texts_by_one_name_are_refused(node: Node) -> None:

@@ -8,7 +8,6 @@ import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
@@ -23,7 +22,7 @@ ODD: dict[str, dict[str, Any]] = {
 }
 
 
-def run(folder: Path, data: dict[str, Any]) -> list[PeriodFigures]:
+def run(folder: Path, data: dict[str, Any]) -> list[Any]:
     scenario = Scenario.model_validate({"run": {"duration_s": 2.0}, "network": {"vehicles": 4}, **data})
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     simulate(emulation)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.cells.measure import judged_figures
+from emulator.cells.cells import judged_figures
 from emulator.drivers.conclude import conclude
 from emulator.drivers.simulate import simulate
 from emulator.records.costs import read_cost

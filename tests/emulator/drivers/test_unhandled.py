@@ -16,8 +16,7 @@ from emulator.checks.judge import judge
 from emulator.checks.run import check_no_exceptions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import MOST_EXCEPTIONS, Emulation
-from emulator.records.events import Event
-from emulator.records.failures import kinds_of
+from emulator.records.events import Event, kinds_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Verdict
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of

@@ -16,9 +16,8 @@ from typer.testing import CliRunner
 
 from emulator.cli.commands import app
 from emulator.export.mcap_file import SCHEMAS, write_mcap
-from emulator.export.measured_links import measured_links
 from emulator.export.pcapng import write_pcapng
-from emulator.export.tables import write_csv
+from emulator.export.tables import measured_links, write_csv
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
 from emulator.world.radio_inputs import read_link_table

@@ -22,7 +22,7 @@ def test_kinds_are_named_by_their_values() -> None:
 
 def test_a_kind_of_another_version_is_a_note() -> None:
     event = Event(0, "teleported", "v01", {})
-    assert event.level is Level.NOTE and not event.has(ENDS_PROGRAM) and event.words == "teleported"
+    assert event.level is Level.NOTE and not event.has(ENDS_PROGRAM) and event.what == "teleported"
 
 
 @pytest.mark.parametrize(
@@ -66,3 +66,31 @@ def test_a_kind_is_added_in_the_enumeration_alone(tmp_path: Path) -> None:
         "rerun": "WARN",
         "reference": True,
     }
+
+
+def _own(**details: object) -> Event:
+    return Event(0, "event", "v02", {"name": "suspect", "details": details})
+
+
+@pytest.mark.parametrize(
+    ("event", "said"),
+    [
+        (Event(0, "started", None, {"start_up_s": 0.0}), "started"),
+        (Event(0, "restarted", "v01", {"incarnation": 2}), "v01 restarted: incarnation 2"),
+        (Event(0, "fault_ended", None, {"fault": "loss-3"}), "loss-3 ended"),
+        (Event(0, "fault_started", None, {"fault": "loss-3", "nodes": []}), "loss-3 started"),
+        (Event(0, "refused", "v01", {"key": "k", "reason": "not its own"}), "v01 refused: not its own"),
+        (Event(0, "transport_gap", None, {"count": 3}), "transport gap: count 3"),
+        (Event(0, "crashed", "v01", {"error": "a\nb", "where": "line 1"}), "v01 crashed: a\nb"),
+        (Event(0, "observer_ended", "recorder", {"how": "SIGTERM"}), "recorder observer ended: SIGTERM"),
+        (Event(0, "interrupted", None, {}), "interrupted"),
+        (Event(0, "fault_started", None, {"fault": "loss-3", "nodes": ["v01", "v02"]}), "loss-3 started: v01, v02"),
+        (Event(0, "exception", "v01", {"error": "E: x", "place": "a.py:3", "where": "…"}), "v01: E: x, a.py:3"),
+        (Event(0, "log", "v01", {"level": "warning", "text": "late"}), "v01: late"),
+        (_own(member="v01", late_s=0.5, heard=["v02"]), "v02 suspect: member v01, late_s 0.5, heard v02"),
+        (_own(), "v02 suspect"),
+        (_own(error="a: b", nodes=2), "v02 suspect: error a: b, nodes 2"),
+    ],
+)
+def test_events_in_words(event: Event, said: str) -> None:
+    assert event.text == said

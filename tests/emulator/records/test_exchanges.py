@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from emulator.records.unicast_figures import unicast_figures
+from emulator.records.radio_metrics import unicast_figures
 from tests.support.exchange_programs import COPYING, exchange_run
 
 

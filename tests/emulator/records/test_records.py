@@ -17,8 +17,11 @@ from emulator.radio.trace import sha256_of_table
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
+from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
+
+COOPERATIVE = Program(entry="agents.cooperative:main")
 
 
 def beacons(folder: Path, **radio: float) -> RecordedRun:

@@ -17,15 +17,16 @@ from emulator.records.reported import (
     reported_figures,
     value_columns,
 )
+from emulator.scenario.program import Program
 from emulator.world.world import Instant
 from vnet.reports import Report, Value
 
 NODES = ["a", "b"]
 
 
-def states(*periods: dict[str, dict[str, Value]]) -> pa.Table:
+def states(*periods: dict[str, dict[str, Value]], program: str = "agents.beacon:main") -> pa.Table:
     """States of two vehicles; each period has the values of those who report in it."""
-    kept = Metrics(NODES, np.zeros(2, np.intp), 100)
+    kept = Metrics(NODES, np.zeros(2, np.intp), 100, Program(entry=program))
     for period, values in enumerate(periods):
         nowhere = np.zeros((2, 2))
         instant = Instant(period, 100 * period, nowhere, np.zeros(2), np.zeros(2), nowhere, np.zeros(2))
@@ -54,8 +55,11 @@ def test_numbers_stay_numbers_whatever_else_vehicles_report_by_their_name() -> N
 
 
 def test_lists_and_names_of_vnets_own_have_no_column() -> None:
-    table = states({"a": {"many": [1.0, 2.0], "period": 3.0, "mean_m": 4.0}})
+    table = states(
+        {"a": {"many": [1.0, 2.0], "period": 3.0, "mean_m": [4.0, 5.0]}}, program="agents.cooperative:main"
+    )
     assert value_columns(table.schema) == []
+    assert table["mean_m"].to_pylist() == [[4.0, 5.0], None], "the program declares a column"
     assert dict(table["values"][0].as_py()) == {"many": [1.0, 2.0], "period": [3.0]}
 
 
@@ -66,8 +70,8 @@ def test_names_with_a_dot_are_figures_like_others() -> None:
     assert reported_figures(table)["weight.b"].mean == 0.5
 
 
-def test_weights_of_a_fusion_of_common_errors_have_no_column() -> None:
-    table = states({"a": {"common_error_m": [1.0, 2.0], "weight.b": 0.5, "rejected.old": 3.0}})
+def test_values_of_each_pair_have_no_column_where_the_program_declares_them() -> None:
+    table = states({"a": {"weight.b": 0.5, "rejected.old": 3.0}}, program="agents.cooperative:main")
     assert value_columns(table.schema) == ["rejected.old"]
     assert dict(table["values"][0].as_py()) == {"weight.b": [0.5]}
 

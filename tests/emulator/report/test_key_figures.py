@@ -1,63 +1,148 @@
-"""A key figure is declared once: summary, report, comparison, list of runs and sweep then have it."""
+"""A program declares a figure in one place: all that shows a run has it, as it has vnet's own."""
 
 import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
 from rich.console import Console
 
 from emulator.api import simulate_into
-from emulator.records.key_figures import KEY_FIGURES, KeyFigure
-from emulator.report.compare_page import comparison_page
-from emulator.report.comparison import Comparison
+from emulator.checks.judge import check_run
+from emulator.drivers.session import Session
+from emulator.drivers.status import Course
+from emulator.records.period_figures import program_figures
+from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.index import index_page
 from emulator.report.source import Source
 from emulator.report.sweep_page import heading
 from emulator.report.write import report_page
+from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
+from emulator.stream.playback import messages
 from emulator.terminal import summary
+from emulator.terminal.dashboard import Dashboard
+from emulator.viewer.recorder import Recorder
+from emulator.viewer.sinks import Sinks
+from tests.support.recordings import read_back
+from vnet.errors import ScenarioError
 from vnet.node import Node
 
-ADDED = KeyFigure("bias_m", "error of the mean", ("bias", "Error of the mean", "‖x̄ − c‖ (m)"), "mean's error (m)")
+DECLARES = __name__
+FIGURES = f"{__name__}:Figures"
 
 
-def printed(verdict: dict[str, Any]) -> str:
+@dataclass(frozen=True)
+class Figures:
+    """Figures of vehicles that report where they think that the middle of all is."""
+
+    COLUMNS: ClassVar = {"middle_m": ("middle_m", 2, "where it thinks that the middle is")}
+    KEY_FIGURES: ClassVar = (
+        {
+            "name": "middle_rmse_m",
+            "title": "middle, RMSE",
+            "column": "error of the middle (m)",
+            "chart": ("middle", "Middle", "RMSE of the middle (m)"),
+            "live": ("the middle", "RMSE"),
+        },
+    )
+    CHARTS: ClassVar = (
+        {
+            "id": "middle",
+            "title": "The middle of all",
+            "axis": "middle (m)",
+            "lines": {"RMSE": "middle_rmse_m"},
+            "text": "How far off.",
+        },
+    )
+
+    middle_rmse_m: float | None
+
+    @staticmethod
+    def compute(periods: Any) -> dict[str, list[float | None]]:
+        """Return the figures of K periods."""
+        return {"middle_rmse_m": periods.rms(periods["middle_m"] - periods.mean(periods["position_m"]))}
+
+
+async def guess(node: Node) -> None:
+    """Take the origin for the middle of all vehicles."""
+    async for fix in node.gnss:
+        node.report(fix.position_m, fix.covariance_m2, middle_m=[0.0, 0.0])
+
+
+SCENARIO = {
+    "run": {"duration_s": 2.0, "settle_s": 0.0},
+    "network": {"vehicles": 3},
+    "program": {"entry": f"{__name__}:guess"},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate_into(Scenario.model_validate(SCENARIO), tmp_path_factory.mktemp("runs") / "run")
+
+
+def test_a_figure_is_declared_in_one_place(run: Path) -> None:
+    verdict = json.loads((run / "verdict.json").read_text())
     console = Console(file=io.StringIO(), width=120)
     console.print(summary._figures(verdict))
-    return console.file.getvalue()  # type: ignore[attr-defined]
-
-
-async def say_nought(node: Node) -> None:
-    """Report nought for the common error."""
-    async for fix in node.gnss:
-        node.report(fix.position_m, fix.covariance_m2, common_error_m=[0.0, 0.0])
-
-
-def test_a_figure_is_added_in_one_place(tmp_path: Path) -> None:
-    data = {
-        "run": {"duration_s": 1.0, "settle_s": 0.0},
-        "network": {"vehicles": 3},
-        "program": {"entry": f"{__name__}:say_nought"},
+    key = program_figures(Program(entry=f"{__name__}:guess")).key
+    shown = {
+        "report": report_page(Source(run)),
+        "comparison": comparison_page(Comparison.of(run, run)),
+        "sweep": heading("middle_rmse_m", key),
+        "summary": console.file.getvalue(),  # type: ignore[attr-defined]
     }
-    run = simulate_into(Scenario.model_validate(data), tmp_path / "run")
+    assert not [page for page, text in shown.items() if "middle, RMSE" not in text]
+    assert "The middle of all" in shown["report"]
+    assert "error of the middle (m)" in index_page(run.parent)
 
-    verdict = json.loads((run / "verdict.json").read_text())
 
-    def shown() -> dict[str, str]:
-        comparison = Comparison.of(run, run)
-        return {
-            "report": report_page(Source(run)),
-            "comparison": comparison_page(comparison),
-            "list of runs": index_page(tmp_path),
-            "sweep": heading("bias_m"),
-            "summary": printed(verdict),
-        }
+def test_a_declared_figure_is_what_its_function_gives(run: Path) -> None:
+    states, metrics = (pq.read_table(run / f"{name}.parquet") for name in ("states", "metrics"))
+    position_m = np.array(states["position_m"].to_pylist()[:3])
+    wanted = float(np.hypot(*position_m.mean(axis=0)))
+    assert metrics["middle_rmse_m"].to_pylist()[0] == pytest.approx(wanted)
+    assert states["middle_m"].to_pylist()[0] == [0.0, 0.0]
+    assert {check.name: check.verdict.value for check in check_run(run).checks}["metrics"] == "valid"
 
-    titles = {"list of runs": "mean&#39;s error (m)"}
-    assert not [page for page, text in shown().items() if titles.get(page, "error of the mean") in text]
-    KEY_FIGURES.append(ADDED)
-    try:
-        assert not [page for page, text in shown().items() if titles.get(page, "error of the mean") not in text]
-    finally:
-        KEY_FIGURES.remove(ADDED)
+
+def test_a_recording_and_the_live_picture_have_a_declared_figure(run: Path, tmp_path: Path) -> None:
+    with Recorder(Sinks(save=tmp_path / "run.rrd"), "run") as recorder:
+        for stream, message in messages(run):
+            recorder.take(stream, message)
+    curve = read_back(tmp_path / "run.rrd")["/figures/middle"]
+    assert list(curve.static["SeriesLines:names"]) == ["RMSE"]
+    session = Session(Scenario.model_validate(SCENARIO), tmp_path / "again")
+    course = Course(session.emulation)
+    session.open().run()
+    console = Console(file=io.StringIO(), width=100, height=20)
+    console.print(Dashboard(course.snapshot()))
+    assert "the middle" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+class Wrong:
+    """No figures: not even a dataclass."""
+
+
+@dataclass(frozen=True)
+class OfTexts:
+    """A figure that is no number."""
+
+    name: str
+
+    @staticmethod
+    def compute(periods: Any) -> dict[str, str]:
+        """Return nothing."""
+        return {}
+
+
+@pytest.mark.parametrize("kind", [Wrong, OfTexts])
+def test_a_declaration_that_cannot_be_is_refused(kind: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:{kind.__name__}")
+    with pytest.raises(ScenarioError, match=f"DECLARES: '{__name__}:{kind.__name__}' declares no figures"):
+        program_figures(Program(entry=f"{__name__}:guess"))

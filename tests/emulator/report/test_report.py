@@ -18,8 +18,7 @@ from emulator.cli import report as report_cli
 from emulator.cli.commands import app
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
-from emulator.report.compare_page import _delivered, comparison_page
-from emulator.report.comparison import Comparison
+from emulator.report.comparison import Comparison, _delivered, comparison_page
 from emulator.report.index import write_index
 from emulator.report.write import key_figures, write_report
 from tests.support.paths import ROOT

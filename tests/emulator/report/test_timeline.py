@@ -94,8 +94,8 @@ def test_every_reception_is_there_once_with_its_outcome_and_time(run: Source) ->
 def test_marks_bars_and_times_down_are_those_of_the_events(run: Source) -> None:
     found, data = shown(run)
     marks = [(time, data["nodes"][node], kind, text) for time, node, kind, text in data["marks"]]
-    assert (300_000, "v01", "warning", "warning: low") in marks
-    assert (400_000, "v04", "event", "event turned: left True") in marks
+    assert (300_000, "v01", "warning", "low") in marks
+    assert (400_000, "v04", "event", "turned: left True") in marks
     (crashed,) = [text for *where, text in marks if where == [600_000, "v03", "failure"]]
     assert crashed.startswith("crashed: AssertionError: worn out, ")
     assert any(kind == "process" and node == "v02" and time == 550_000 for time, node, kind, _ in marks)

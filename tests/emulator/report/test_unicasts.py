@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 
 import emulator
-from emulator.cells.measure import judged_figures
+from emulator.cells.cells import judged_figures
 from emulator.radio.outcomes import Outcome
-from emulator.records.radio_metrics import radio_metrics
+from emulator.records.radio_metrics import radio_metrics, unicast_figures
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.unicast_figures import unicast_figures
 from emulator.report import radio_figures
-from emulator.report.compare_page import _delivered
-from emulator.report.comparison import Comparison
+from emulator.report.comparison import Comparison, _delivered
 from emulator.report.index import index_page
 from emulator.report.network_figures import links
-from emulator.report.radio import radio_section
+from emulator.report.radio_figures import radio_section
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from vnet import Node

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.stream.pace import play, schedule
-from emulator.stream.playback import Message
+from emulator.stream.playback import Message, play, schedule
 
 PERIOD_NS = 100_000_000
 

@@ -15,9 +15,9 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
-from emulator.records.busy import mean_busy
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
+from emulator.records.tables import mean_busy
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import LATENCY_BIN_NS, LATENCY_BINS, unpack, unpack_pairs
 from emulator.stream.playback import messages
@@ -144,8 +144,8 @@ def test_what_was_told_is_worth_comparing(watched: Watched) -> None:
     assert outcomes >= {"delivered", "lost", "peer_cap", "fault", "receiver_down"}
     assert {len(message["faults"]) for message in told} >= {0, 1, 3}
     assert {bytes(message["up"]).count(0) for message in told} == {0, 1, 2}
-    assert any(message["clouds"] for message in told)
-    assert any(message["weights"] for message in told)
+    assert any(message["lists"].get("cloud_m") for message in told)
+    assert any(message["peers"].get("weight") for message in told)
     assert any(message["events"] for message in told)
     assert np.isnan(unpack(told[16]["fix_m"], 2)).any()
     late = [np.frombuffer(message["latency_counts"], "<i4")[-1] for message in told]

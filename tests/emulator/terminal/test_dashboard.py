@@ -9,9 +9,9 @@ from typing import Any, Literal
 import pytest
 from rich.console import Console
 
-from emulator.drivers.status import BINS, FIGURES, FaultState, Snapshot
+from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.records.events import Event
-from emulator.terminal.dashboard import Dashboard, describe, sparkline
+from emulator.terminal.dashboard import Dashboard, sparkline
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
 FAULTS = (
@@ -24,6 +24,13 @@ EVENTS = (
     Event(4_000_000_000, "fault_started", None, {"fault": "kill-0", "nodes": ["v02"]}),
     Event(9_200_000_000, "died", "v04", {"how": "SIGKILL", "log_tail": "a page\nof text"}),
 )
+
+FIGURES: dict[str, float | None] = {
+    "common_error_rmse_m": 0.21,
+    "deviation_m": 0.05,
+    "position_rmse_m": 0.43,
+    "fix_rmse_m": 6.31,
+}
 
 
 def make(**changes: Any) -> Snapshot:
@@ -44,11 +51,9 @@ def make(**changes: Any) -> Snapshot:
         remaining_s=4.0,
         idle_s=0.0,
         wall_s=4.0,
-        common_error_rmse_m=0.21,
-        deviation_m=0.05,
-        position_rmse_m=0.43,
-        fix_rmse_m=6.31,
+        figures=dict(FIGURES),
         over_time=dict.fromkeys(FIGURES, falling),
+        lines={"common_error_rmse_m": ("common error", "RMSE"), "deviation_m": ("deviation", "between vehicles")},
         frames_by_outcome={"delivered": 900, "lost": 100, "out_of_range": 77},
         frames_per_s={"delivered": 60.0, "lost": 30.0, "receiver_down": 10.0, "out_of_range": 7.0},
         faults=FAULTS,
@@ -93,14 +98,17 @@ def row(shot: Snapshot, label: str, width: int = 100, height: int = 30) -> str:
 
 MANY = tuple(FaultState(f"loss-{n}", "ended", n, n + 1.0, ()) for n in range(8))
 MANY += (FAULTS[1], *(FaultState(f"delay-{n}", "to come", 12.0 + n, 14.0 + n, ()) for n in range(5)))
-UNREPORTED = {"over_time": dict.fromkeys(FIGURES, (None,)), "common_error_rmse_m": None, "deviation_m": None}
+UNREPORTED = {
+    "over_time": dict.fromkeys(FIGURES, (None,)),
+    "figures": dict.fromkeys(FIGURES) | {"fix_rmse_m": 6.31},
+}
 LEGEND = {"frames_per_s": {"delivered": 800.0, "lost": 100.0, "peer_cap": 30.0, "fault": 70.0}}
 VEHICLES = tuple(f"n{n}" for n in range(460))
 PICTURES: dict[str, tuple[dict[str, Any], list[tuple[int, int]]]] = {
     "running": ({}, [(100, 30), (60, 12), (60, 5)]),
     "joining": ({"phase": "joining", "missing": ("v02", "v11"), "down": (), "wall_s": 12.0}, [(100, 30)]),
     "faults that act, then the next": ({"faults": MANY}, [(100, 18)]),
-    "nobody reports": ({**UNREPORTED, "position_rmse_m": None}, [(100, 18)]),
+    "nobody reports": (UNREPORTED, [(100, 18)]),
     "nobody has reported yet": ({**UNREPORTED, "emulated_s": 0.5}, [(100, 18)]),
     "a legend": (LEGEND, [(120, 12), (80, 12), (40, 12)]),
     "one of many is down": ({"node_ids": VEHICLES, "down": VEHICLES[-1:]}, [(100, 12)]),
@@ -133,7 +141,7 @@ def test_pictures_are_those_that_were_looked_at(tmp_path: Path) -> None:
         {"faults": (), "events": (), "frames_per_s": {}},
         {"faults": FAULTS * 20, "events": EVENTS * 3, "run": "r" * 64},
         {"events": (Event(10**14, "crashed", "v01", {"error": "x\n\x1b[2J\r\ttab" + "漢字" * 200}),)},
-        {"common_error_rmse_m": math.inf, "deviation_m": 1e300, "real_time_factor": None, "remaining_s": None},
+        {"figures": FIGURES | {"deviation_m": 1e300, "fix_rmse_m": math.inf}, "remaining_s": None},
         {"emulator_memory_mb": None, "idle_s": 86_400.0},
     ],
 )
@@ -219,21 +227,3 @@ def test_a_sparkline_of_odd_values() -> None:
     assert sparkline((None,) * 60 + (1.0,) * 60, 4) == "  ▄▄"
     assert sparkline((1.0,) * 60 + (math.inf,) * 60, 4) == "▄▄▇▇"
     assert sparkline((0.0,) * 60 + (1.0,) * 60, 4) == "▁▁▇▇"
-
-
-@pytest.mark.parametrize(
-    ("event", "said"),
-    [
-        (Event(0, "started", None, {"start_up_s": 0.0}), "started"),
-        (Event(0, "restarted", "v01", {"incarnation": 2}), "v01 restarted: incarnation 2"),
-        (Event(0, "fault_ended", None, {"fault": "loss-3"}), "loss-3 ended"),
-        (Event(0, "fault_started", None, {"fault": "loss-3", "nodes": []}), "loss-3 started"),
-        (Event(0, "refused", "v01", {"key": "k", "reason": "not its own"}), "v01 refused: not its own"),
-        (Event(0, "transport_gap", None, {"count": 3}), "transport gap: count 3"),
-        (Event(0, "crashed", "v01", {"error": "a\nb", "where": "line 1"}), "v01 crashed: a\\nb"),
-        (Event(0, "observer_ended", "recorder", {"how": "SIGTERM"}), "recorder observer ended: SIGTERM"),
-        (Event(0, "interrupted", None, {}), "interrupted"),
-    ],
-)
-def test_events_in_words(event: Event, said: str) -> None:
-    assert describe(event) == said

@@ -150,7 +150,7 @@ def test_lines_of_json_hold_the_figures_of_the_run(tmp_path: Path, monkeypatch: 
     assert last["frames_by_outcome"] == {n: count for n, count in verdict["frames_by_outcome"].items() if count}
     assert (last["vehicles"], last["seed"], last["duration_s"]) == (6, 1, 4.0)
     assert last["position_rmse_m"] > 0
-    assert last["common_error_rmse_m"] is None
+    assert last["fix_rmse_m"] > 0
     assert lines[-1] == {
         "kind": "ended",
         "wall_s": walls[-1],

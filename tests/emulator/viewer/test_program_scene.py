@@ -85,6 +85,13 @@ def test_no_view_is_laid_out_for_what_the_program_does_not_do(path: Path) -> Non
     assert {"program/curve/delay_ms", "program/curve/warned", "program/texts", "map", "radio/frames"} <= set(
         origins
     )
-    estimates = {"common", "position", "weights", "figures/common", "figures/position", "figures/consensus"}
+    estimates = {
+        "common",
+        "position",
+        "peers/weight",
+        "figures/common-error",
+        "figures/position",
+        "figures/consensus",
+    }
     assert not estimates & set(origins)
     assert not {"vehicle/position", "vehicle/common", "vehicle/errors", "radio/busy"} & set(origins)

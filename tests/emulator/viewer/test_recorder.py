@@ -8,15 +8,13 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from agents.cooperative.paper_values import paper_rmse
+from agents.cooperative.declared import paper_rmse
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
-from emulator.records.events import Event
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import event_message, unpack
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
     Canvas,
@@ -27,7 +25,6 @@ from emulator.viewer.drawing import (
     link_states,
     nice_length,
 )
-from emulator.viewer.overview_scene import in_words
 from emulator.viewer.radio_scene import STROKES, delivery_by_distance
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
@@ -147,16 +144,16 @@ def test_there_is_no_time_but_the_emulated(path: Path) -> None:
         ("/map/estimate", "estimate_m", None),
         ("/position/fix", "fix_m", "position_m"),
         ("/position/estimate", "estimate_m", "position_m"),
-        ("/common/estimates", "common_error_estimate_m", "common_error_m"),
+        ("/common/estimate", "common_error_estimate_m", "common_error_m"),
     ],
 )
 def test_points_are_where_the_messages_say_with_north_up(
     told: Told, entities: dict[str, Entity], entity: str, name: str, relative_to: str | None
 ) -> None:
     for period in periods(told):
-        wanted = unpack(period.message[name], 2)
+        wanted = period.points(name)
         if relative_to is not None:
-            wanted = wanted - unpack(period.message[relative_to], 2)
+            wanted = wanted - period.points(relative_to)
         drawn = entities[entity].array("Points2D:positions", period.time_s)
         np.testing.assert_allclose(drawn, wanted * [1, -1], rtol=1e-6, atol=1e-4)
 
@@ -164,7 +161,7 @@ def test_points_are_where_the_messages_say_with_north_up(
 @pytest.mark.parametrize(
     ("entity", "figures"),
     [
-        ("/figures/common", ["common_error_rmse_m", "deviation_m"]),
+        ("/figures/common-error", ["common_error_rmse_m", "deviation_m"]),
         ("/figures/consensus", ["consensus_error_m", "bias_m"]),
         ("/figures/position", ["position_rmse_m", "fix_rmse_m"]),
     ],
@@ -183,7 +180,7 @@ def test_lines_have_the_figures_of_the_messages(
 
 
 def test_the_limit_is_drawn_and_beats_raw_fixes_by_far(told: Told, entities: dict[str, Entity]) -> None:
-    common = entities["/figures/common"]
+    common = entities["/figures/common-error"]
     assert common.static["SeriesLines:names"][2] == "bound: a Kalman filter that hears every fix of its component"
     late = [common.array("Scalars:scalars", period.time_s)[2] for period in periods(told)][-5:]
     assert 0 < np.mean(late) < np.mean([period.figure("fix_rmse_m") for period in periods(told)])
@@ -270,21 +267,21 @@ def test_events_are_told_at_their_time_and_those_after_the_last_period_too(
     events = [event for _, message in told for event in message.get("events", [])]
     logged = entities["/events"].at["TextLog:text"]
     assert {event["time_ns"] / 1e9 for event in events} == set(logged)
-    assert logged[1.2] == ["fault started: fault partition-1, nodes v01, v02, v03, v04, v05, v06"]
+    assert logged[1.2] == ["partition-1 started: v01, v02, v03, v04, v05, v06"]
 
 
 def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str, Entity]) -> None:
     number = {node: row for row, node in enumerate(told[0][1]["node_ids"])}
     matrix = np.full((6, 6), np.nan)
-    drawn = entities["/weights"].at["Tensor:data"]
+    drawn = entities["/peers/weight"].at["Tensor:data"]
     compared = 0
     for period in periods(told):
-        for node, row in period.weights().items():
+        for node, row in period.peers().get("weight", {}).items():
             matrix[number[node]] = row
         matrix[~period.up] = np.nan
         if period.time_s in drawn:
             tensor = drawn[period.time_s][0]
-            assert tensor["names"] == ["fuses", "is weighed"]
+            assert tensor["names"] == ["reports", "of"]
             np.testing.assert_allclose(_numbers(tensor).reshape(6, 6), matrix, rtol=1e-6)
             compared += 1
     assert compared >= 2
@@ -355,11 +352,11 @@ def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dic
 def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, Entity]) -> None:
     period = next(period for period in periods(told) if period.time_s == LATE_S)
     position, estimate = (period.points(f"{name}_m")[2] for name in ("position", "estimate"))
-    common = period.points("common_error_estimate_m")[2] - period.truth_m
+    common = (period.points("common_error_estimate_m") - period.points("common_error_m"))[2]
     drawn = entities["/vehicle/errors"].array("Scalars:scalars", LATE_S)
     wanted = [np.hypot(*(estimate - position)), np.hypot(*common)]
     np.testing.assert_allclose(drawn, wanted, rtol=1e-5)
-    assert all(clouds <= {"Points2D:positions"} for clouds in [set(entities["/vehicle/common/particles"].at)])
+    assert all(clouds <= {"Points2D:positions"} for clouds in [set(entities["/vehicle/common/cloud"].at)])
     table = list(entities["/vehicle/table"].at["TextDocument:text"].values())[-1][0]
     assert table.splitlines()[0] == "| hears | frames in 5 s | delivered | weight |"
     assert "| v03 (itself) |" in table
@@ -379,7 +376,7 @@ def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path)
     assert max(table) == pytest.approx(1.5)
     assert table[max(table)] == ["v03 is not in the network: it has not entered yet, or has left."]
     assert max(found["/vehicle/errors"].at["Scalars:scalars"]) < 1.5
-    for name in ("position/estimate", "common/particles", "hears/neighbours"):
+    for name in ("position/estimate", "common/cloud", "hears/neighbours"):
         last = found[f"/vehicle/{name}"].at["Points2D:positions"]
         assert max(last) == pytest.approx(1.5) and len(last[max(last)]) == 0, name
 
@@ -428,27 +425,6 @@ def test_ellipses_hold_95_percent() -> None:
 def test_what_the_font_cannot_draw_is_not_drawn() -> None:
     assert drawable("müde – 3 ≤ 4\n\tja") == "müde – 3 ≤ 4 ja"
     assert drawable("a🟩b\x00c漢") == "a?b?c?"
-
-
-def test_events_in_words() -> None:
-    event = {"node": "v03", "kind": "fault_started", "details": {"nodes": '["v01", "v02"]', "log": "x" * 99}}
-    assert in_words(event) == f"v03 fault started: nodes v01, v02, log {'x' * 59}…"
-    assert in_words({"node": None, "kind": "interrupted", "details": {}}) == "interrupted"
-
-
-@pytest.mark.parametrize(
-    ("details", "words"),
-    [
-        ({"member": "v01", "late_s": 0.5, "heard": ["v02"]}, "v02 suspect: member v01, late_s 0.5, heard v02"),
-        ({}, "v02 suspect"),
-        ({"why": "a: b"}, "v02 suspect: why a: b"),
-    ],
-)
-def test_events_of_programs_in_words(details: dict[str, object], words: str) -> None:
-    event = Event(0, "event", "v02", {"name": "suspect", "details": details})
-    assert in_words(event_message(event)) == words
-    long = Event(0, "event", "v02", {"name": "suspect", "details": {"text": "x" * 9999}})
-    assert in_words(event_message(long)).startswith("v02 suspect: text: xxx")
 
 
 def test_lengths() -> None:

@@ -12,7 +12,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import pack, unpack
-from emulator.viewer.reference import DrawnReference
+from emulator.viewer.overview_scene import DrawnReference
 from emulator.world.world import build_world
 from vnet.node import Node
 

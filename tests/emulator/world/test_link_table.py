@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.checks.judge import judge
-from emulator.export.measured_links import measured_links
+from emulator.export.tables import measured_links
 from emulator.radio.engine import Engine
 from emulator.radio.topology import Measured, connectivity_of
 from emulator.records.recorded_run import RecordedRun

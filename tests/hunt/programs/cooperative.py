@@ -10,9 +10,8 @@ from __future__ import annotations
 import asyncio
 
 from agents.cooperative.estimator import Estimator
-from agents.cooperative.gnss_clock import GnssClock
 from agents.cooperative.options import Options
-from agents.cooperative.program import SENDING_SHARE, _broadcast, _report, listening_share
+from agents.cooperative.program import SENDING_SHARE, GnssClock, _broadcast, _report, listening_share
 from agents.cooperative.program import main as repaired
 from vnet import Fix, Node
 

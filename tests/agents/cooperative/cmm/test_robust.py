@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.cooperative.cmm.rbpf import Observation, Rbpf, RbpfConfig
-from agents.cooperative.cmm.robust import median, near_the_median
+from agents.cooperative.estimator import median, near_the_median
 from vnet.roads.lanes import LaneMap
 
 HONEST = np.array([[0.0, 0.1], [0.1, 0.0], [-0.1, 0.0], [0.0, -0.1]])

@@ -12,8 +12,7 @@ from scipy.stats import chi2
 
 from agents.cooperative.cmm.information import Information
 from agents.cooperative.cmm.kalman_bound import LaneModel
-from agents.cooperative.cmm.own_rbpf import OwnRbpf
-from agents.cooperative.cmm.sample_size import CELL_M, DISTANCE, ELLIPSE_SIGMAS, sample_size
+from agents.cooperative.cmm.own_rbpf import CELL_M, DISTANCE, ELLIPSE_SIGMAS, OwnRbpf, sample_size
 
 TOLD = Information.of(np.array([1.0, -2.0]), 0.1**2 * np.eye(2))
 """Belief about c after what others say in a period."""

@@ -19,10 +19,9 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
-from emulator.records.background_table import positions_by_time
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
-from emulator.records.tables import BACKGROUND, DRIVEN
+from emulator.records.tables import BACKGROUND, DRIVEN, positions_by_time
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import map_charts

@@ -1,18 +1,35 @@
-"""Figures of estimates beyond their errors: coverage, consistency in batches, lane-level success, convergence."""
+"""Figures of a cell of the paper's experiments: errors, consistency, coverage, lane-level success, convergence."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
+from emulator.cells.cells import Cell
+from emulator.drivers.emulation import Emulation
 from emulator.records.distributions import chi2_quantiles
-from emulator.records.divergence import DIVERGENT_SIGMAS, first_divergences
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.recorded_world import RecordedWorld
+from emulator.records.reference import reference_series
+from emulator.records.reported import reported_figures
+from emulator.records.run import first_lasting
+from vnet.errors import VnetError
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
+DIVERGENT_M = 10.0
+"""Common error above which a vehicle is on its way to divergence, in metres."""
+DIVERGENT_S = 5.0
+"""Time for which the error has to stay above it, in seconds."""
+
+
+DIVERGENT_SIGMAS = 5.0
+"""Stated deviations of the common error above which a vehicle is, by another definition, on its way there."""
 COVERED = 0.95
 """Probability of the ellipses whose coverage is counted."""
 BATCH_S = 10.0
@@ -23,6 +40,117 @@ CONVERGED_FACTOR = 1.5
 """A network has converged once its RMSE is at most so many times that of the settled run …"""
 CONVERGED_S = 5.0
 """… for so long on end."""
+REFERENCE = "reference_"
+"""Prefix of the figures of a run's reference, and of the columns of a cell's metrics with those of each period."""
+
+
+def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Table]:
+    """Figures of a run from `from_s` on: roots of mean squares over the periods, in metres.
+
+    Of the common error at the end of the period (`rmse_m`, `deviation_m`, by component), right after stacking
+    (`stacked_…`), of positions; means of the consistency figures; `divergent` vehicles (MODEL 6); bytes a period;
+    what `consistency_figures`, `others_figures` and, as `reference_…`, the run's reference have. Returned beside is
+    the table of metrics, with the reference's figures of each period as further columns.
+    """
+    rows = [row for row in emulation.metrics.rows if row.time_ns >= from_s * 1e9]
+
+    def rms(name: str) -> float | None:
+        values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
+        return float(np.sqrt(np.mean(np.square(values)))) if values else None
+
+    def mean(name: str) -> float | None:
+        values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
+        return float(np.mean(values)) if values else None
+
+    states = emulation.metrics.states_table()
+    recorded = _recorded(emulation, states)
+    reference, metrics = _reference(recorded), emulation.metrics.metrics_table()
+    figures = {
+        "rmse_m": rms("common_error_rmse_m"),
+        "deviation_m": rms("deviation_m"),
+        "bias_m": rms("bias_m"),
+        "stacked_rmse_m": rms("stacked_rmse_m"),
+        "stacked_deviation_m": rms("stacked_deviation_m"),
+        "component_rmse_m": _rms_columns([row.component_rmse_m for row in rows]),
+        "position_rmse_m": rms("position_rmse_m"),
+        "fix_rmse_m": rms("fix_rmse_m"),
+        "consensus_error_m": rms("consensus_error_m"),
+        "common_error_anees": mean("common_error_anees"),
+        "position_anees": mean("position_anees"),
+        "divergent": _divergent(states, len(emulation.world.node_ids), emulation.world.period_ns),
+        "bytes": _mean_value(states, "bytes"),
+        "not_finite": sum(row.not_finite for row in rows),
+        "metrics_sha256": emulation.metrics.sha256(),
+        **consistency_figures(recorded, from_s),
+        **others_figures(recorded, from_s),
+    }
+    settled = after(reference, math.ceil(from_s * NS_PER_S / emulation.world.period_ns))
+    figures |= {REFERENCE + name: value for name, value in settled.items()}
+    for name, series in reference.items():
+        if series.ndim == 1:
+            metrics = metrics.append_column(REFERENCE + name, pa.array(series, from_pandas=True))
+    return figures, metrics
+
+
+def _recorded(emulation: Emulation, states: pa.Table) -> RecordedRun:
+    """Return the states of a run as those of its folder."""
+    nothing, world = pa.table({}), RecordedWorld.of(emulation.world)
+    return RecordedRun(emulation.scenario, nothing, states, nothing, (), world=world)
+
+
+def _reference(recorded: RecordedRun) -> dict[str, Array]:
+    """Return the figures of a run's reference in each period; none if it has no reference."""
+    try:
+        return reference_series(recorded)
+    except VnetError:
+        return {}
+
+
+def _rms_columns(rows: list[list[float | None]]) -> list[float]:
+    """Root mean square of each column; none where vehicles move and the number of components changes."""
+    if len({len(row) for row in rows}) > 1:
+        return []
+    table = np.array([[np.nan if value is None else value for value in row] for row in rows], dtype=float)
+    return [float(value) for value in np.sqrt(np.mean(table**2, axis=0))]
+
+
+def _points(states: pa.Table, name: str) -> Array:
+    return np.array([(np.nan, np.nan) if p is None else p for p in states[name].to_pylist()], dtype=float)
+
+
+def _divergent(states: pa.Table, vehicles: int, period_ns: int) -> int:
+    """The number of vehicles that diverged at any time."""
+    error_m = np.hypot(*(_points(states, "common_error_estimate_m") - _points(states, "common_error_m")).T)
+    return len(first_divergences(error_m.reshape(-1, vehicles), period_ns))
+
+
+def _mean_value(states: pa.Table, name: str) -> float | None:
+    figure = reported_figures(states).get(name)
+    return None if figure is None else figure.mean
+
+
+study_cell = partial(Cell, measure=measure)
+"""A cell whose figures are those of `measure`."""
+
+
+def after(series: Mapping[str, Array], first: int) -> dict[str, float | list[float | None] | None]:
+    """Return each figure from period `first` on: the root of the mean square of one in metres, of others the mean.
+
+    None of nothing.
+    """
+    return {
+        name: _settled(name, values[first:])
+        if values.ndim == 1
+        else [_settled(name, column[first:]) for column in values.T]
+        for name, values in series.items()
+    }
+
+
+def _settled(name: str, values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return None
+    return math.sqrt((known**2).mean()) if name.endswith("_m") else float(known.mean())
 
 
 def consistency_figures(recorded: RecordedRun, from_s: float) -> dict[str, Any]:
@@ -131,3 +259,12 @@ def converged_s(error_m: Array, first: int, period_ns: int) -> float | None:
     run = np.convolve(good, np.ones(length), mode="valid")
     found = np.flatnonzero(run >= length)
     return float(found[0] * period_ns / NS_PER_S) if len(found) else None
+
+
+def first_divergences(error_m: Array, period_ns: int, limit: float = DIVERGENT_M) -> dict[int, int]:
+    """Return the period in which each divergent vehicle first met the definition, by vehicle, in order of time.
+
+    `error_m` (periods, N) are the common errors, in metres as the `limit` is, or both in stated deviations. NaN,
+    where nobody knows or nobody judges, interrupts a divergence.
+    """
+    return first_lasting(error_m > limit, period_ns, DIVERGENT_S)
