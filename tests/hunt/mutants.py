@@ -138,8 +138,7 @@ def main() -> None:
         for mutant in (each for name in names for each in MUTANTS if each.name == name):
             (tree / mutant.file).write_text(texts[mutant.name], encoding="utf-8")
             began = time.monotonic()
-            package = next(paths for of, paths in TESTS.items() if mutant.file.startswith(of))
-            found = found_by(tree, package)
+            found = found_by(tree, next(paths for of, paths in TESTS.items() if mutant.file.startswith(of)))
             shutil.copy(ROOT / mutant.file, tree / mutant.file)
             missed += found.startswith("NOT FOUND")
             print(f"{mutant.name:14} {time.monotonic() - began:4.0f} s  {found}", flush=True)

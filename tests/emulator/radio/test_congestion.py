@@ -90,6 +90,14 @@ def test_senders_measure_each_on_its_own_clock() -> None:
     assert set(np.round(seen, 3)) == {round(part / 10, 3) for part in range(11)}
 
 
+def test_limeric_takes_the_mean_of_two_windows() -> None:
+    steady, by_turns = (LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1)) for _ in range(2))
+    for first in range(2000):
+        windows(steady, 0.5, first=first)
+        windows(by_turns, float(first % 2), first=first)
+    assert by_turns.share[0] == pytest.approx(steady.share[0], rel=1e-4)
+
+
 def test_limeric_settles_where_its_equation_does() -> None:
     """K senders of airtime a: share* = β (target - K share) / α, as the busy ratio is the sum of all shares."""
     control = LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1))

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.radio.engine import Delivery, Engine
+from emulator.radio.in_flight import INITIAL_CAPACITY
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.scenario.scenario import Radio
@@ -240,6 +241,14 @@ def test_arrivals_at_one_time_are_ordered_and_are_shown_in_that_order(seed: int,
     keys = [tuple(row[names.index(name)] for name in ("arrival_ns", "sender", "seq", "receiver")) for row in table]
     assert keys == sorted(keys)
     assert len(packets) > 10 or subject.counts[Outcome.delivered] == len(packets)
+
+
+def test_more_frames_may_be_in_flight_than_there_is_room_for_at_first() -> None:
+    subject = engine(np.zeros((40, 2)), latency_ms=1000.0, max_peers=40)
+    for time_ns in range(3):
+        for node in range(40):
+            subject.transmit(time_ns, node, [b"x"])
+    assert len(subject.advance(10**12)) == 3 * 40 * 39 > INITIAL_CAPACITY
 
 
 def test_the_room_of_a_trace_takes_memory_only_as_it_is_written() -> None:
