@@ -1,6 +1,6 @@
 """Figures of the cooperative program's periods, and what of its reports they are made of.
 
-The declaration of docs/how-to/own-figures.md.
+The declaration of docs/how-to/results.md.
 """
 
 from __future__ import annotations

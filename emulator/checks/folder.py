@@ -7,6 +7,7 @@ something there, the run is *unknown* and not *invalid*.
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
@@ -174,7 +175,7 @@ def _wrong_commands(recorded: OpenedRun) -> Iterator[dict[str, Any]]:
     yield {"figure": "order", "kept": told, "computed": due}
     scenario, kept = shlex.quote(str(recorded.folder.absolute() / SCENARIO_FILE)), recorded.record.reproduce
     commands = [f"vnet {command} {scenario}" for command in ("simulate", "run")]
-    if kept.removesuffix(" --program MODULE:FUNCTION") not in commands:
+    if re.sub(r" --program MODULE:FUNCTION| --check-determinism(=portable)?", "", kept) not in commands:
         yield {"figure": "reproduce", "kept": kept, "computed": commands[0]}
 
 

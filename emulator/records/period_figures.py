@@ -113,7 +113,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class ProgramFigures:
-    """Figures that a run's program declares, with vnet's own: docs/how-to/own-figures.md."""
+    """Figures that a run's program declares, with vnet's own: docs/how-to/results.md."""
 
     row: type = PeriodFigures
     """The class of a row of the metrics."""

@@ -109,7 +109,7 @@ TRUTH = ("period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "com
 # fmt: off
 METRICS = Table(
     "metrics", "a row for each period", _figures(PeriodFigures), which=": errors", fields_of=PeriodFigures,
-    further="Then the figures that the program declares: [own figures](../how-to/own-figures.md).",
+    further="Then the figures that the program [declares](../how-to/results.md#declare-figures-of-periods).",
 )
 STATES = Table(
     "states", "a row for each vehicle and period",

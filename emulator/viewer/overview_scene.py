@@ -172,7 +172,7 @@ class OverviewScene:
             if is_time:
                 canvas.strips(f"{each.name}/ellipses", ellipses(off_m, period.covariances(each.covariance)))
                 if clouds:
-                    canvas.points(f"{each.name}/cloud", np.concatenate([*clouds.values()]))
+                    canvas.points(f"{each.name}/cloud", np.concatenate([clouds[node] for node in sorted(clouds)]))
 
     def _figures(self, period: Period) -> None:
         found = {} if self._reference is None else self._reference.step(period.message)

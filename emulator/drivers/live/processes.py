@@ -23,7 +23,7 @@ from emulator.drivers.join import Membership, split_into_processes
 from emulator.drivers.launch import Exit, Launcher
 from emulator.drivers.live.fleet import Fleet
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ChangeSignal, ProcessState, Supervisor
-from emulator.drivers.processes import Heard, Processes, ProtocolError, Stalled, check_ownership
+from emulator.drivers.processes import Heard, Processes, ProtocolError, Stalled, check_ownership, check_yield
 from emulator.drivers.realtime import RealTime, take_what_comes
 from emulator.drivers.router import ROUTER
 from emulator.records.events import KINDS, EventKind
@@ -116,6 +116,7 @@ class LiveProcesses(Processes):
         self._heard: deque[Heard] = deque()
         self._granted: dict[str, int] = {}
         """Processes that owe a yield, and the instant that each has come to, as far as it has said."""
+        self._windows: dict[str, wire.Grant] = {}
         self._incomplete: dict[str, wire.Yield] = {}
         """Yields that refer to messages of the backbone that have not come."""
         self._sent: Contents[SentMessage] = Contents()
@@ -348,6 +349,7 @@ class LiveProcesses(Processes):
         """Give a process a window, with its mail, or a batch."""
         if isinstance(message, wire.Grant):
             self._granted[process_id] = message.time_ns
+            self._windows[process_id] = replace(message, packets=(), fixes=())
             message = message if mail is None else mail.within(message)
         self.say(process_id, message)
 
@@ -387,6 +389,10 @@ class LiveProcesses(Processes):
         """Take a yield, once the messages of the backbone have come to which it refers."""
         if process_id not in self._granted:
             raise ProtocolError(f"yield {message.seq} of {process_id}: none is owed")
+        window = self._windows[process_id]  # the barrier would refuse it only when all others have yielded
+        if message.seq != window.seq:
+            raise ProtocolError(f"yield {message.seq} of {process_id}: expected {window.seq}")
+        check_yield(self.members.nodes_with(process_id), message, window.time_ns, window.end_ns)
         self._incomplete.pop(process_id, None)
         if refs := refs_of(message):
             self._check_refs(process_id, refs)

@@ -297,8 +297,7 @@ def test_who_is_not_there_is_neither_dead_nor_heard(recorded: RecordedRun) -> No
     silent = recorded.states.to_pydict()
     for row, (period, node) in enumerate(zip(silent["period"], silent["node"], strict=True)):
         if node == "v3" and period >= 25:
-            silent["estimate_m"][row] = None
-            for name in recorded.value_names:
+            for name in recorded.reported_names:
                 silent[name][row] = None
     states = pa.Table.from_pydict(silent, schema=recorded.states.schema)
     assert verdict(replace(recorded, states=states), "liveness") is Verdict.INVALID
