@@ -26,7 +26,13 @@ class Figures:
 
     COLUMNS: ClassVar = {"middle_m": ("middle_m", 2, "what it takes for the middle of all vehicles")}
     KEY_FIGURES: ClassVar = (
-        {"name": "middle_rmse_m", "title": "middle, RMSE", "column": "middle (m)", "live": ("middle", "RMSE")},
+        {
+            "name": "middle_rmse_m",
+            "title": "middle, RMSE",
+            "column": "middle (m)",
+            "chart": ("middle", "Middle", "RMSE of the middle (m)"),
+            "live": ("middle", "RMSE"),
+        },
     )
     CHARTS: ClassVar = (
         {

@@ -12,6 +12,7 @@ import io
 import math
 import os
 import pickle
+import select
 import signal
 import sys
 import threading
@@ -69,6 +70,7 @@ class ForkedPrograms:
         folder: RunFolder,
         others: Sequence[ForkedPrograms],
         detach: Callable[[], None],
+        stall_limit_s: float,
         prints: bool = True,
     ) -> None:
         self._prints = prints
@@ -76,6 +78,7 @@ class ForkedPrograms:
         self.pid = 0
         """Its process id."""
         self._running = RunningNode()
+        self._patience = Patience(self._running, stall_limit_s)
         self.owes = False
         """True while it has been given a turn that it has not answered."""
         self._is_gone = False
@@ -95,6 +98,8 @@ class ForkedPrograms:
             running_node.running = self._running
             _be(its, welcomes, programs, folder, detach)
         its.close()
+        self._answer = select.poll()  # as `Connection.poll`, which makes one at each call
+        self._answer.register(self._connection.fileno(), select.POLLIN)
 
     def give(self, calls: Sequence[Call], grant: wire.Grant | None) -> None:
         """Give it a window, with what is to be called before; without one the run is over.
@@ -107,14 +112,13 @@ class ForkedPrograms:
         with suppress(OSError):  # it has ended, which `take` tells, or the error that it has raised before
             self._connection.send_bytes(pickle.dumps(told))
 
-    def take(self, stall_limit_s: float) -> Any:
+    def take(self) -> Any:
         """Wait for its answer: a yield, or `Ended`. Raises ProcessDiedError, and what it has raised.
 
         Raises StalledError if one of its nodes runs for `stall_limit_s` without a pause.
         """
-        patience = Patience(self._running, stall_limit_s)
-        while not self._connection.poll(LOOK_S):
-            if patience.is_over(self.pid):
+        while not self._answer.poll(LOOK_S * 1000):
+            if self._patience.is_over(self.pid):
                 raise StalledError(self._running.read())
         try:
             said: _Said = pickle.loads(self._connection.recv_bytes())
@@ -190,7 +194,7 @@ class Pipes(LocalProcesses):
     def _take(self, process_id: str) -> Any:
         """Return the answer of a process; None if it has ended before its time."""
         try:
-            return self._processes[process_id].take(self._limit_s)
+            return self._processes[process_id].take()
         except ProcessDiedError as death:
             self._died[process_id] = {"how": str(death)}
             return None
@@ -211,6 +215,7 @@ class Pipes(LocalProcesses):
                     self._emulation.folder,
                     others=list(processes.values()),
                     detach=self._emulation.driving.detach,
+                    stall_limit_s=self._limit_s,
                     prints=self._prints,
                 )
                 self.pids[process_id] = processes[process_id].pid
@@ -233,7 +238,7 @@ class Pipes(LocalProcesses):
             self._processes[process_id].give((), None)
         for process_id in asked:
             try:
-                self.endings.append(self._processes[process_id].take(self._limit_s))
+                self.endings.append(self._processes[process_id].take())
             except ProcessDiedError as death:
                 self._died[process_id] = {"how": str(death)}
             except StalledError as stalled:

@@ -349,7 +349,7 @@ class LiveProcesses(Processes):
         """Give a process a window, with its mail, or a batch."""
         if isinstance(message, wire.Grant):
             self._granted[process_id] = message.time_ns
-            self._windows[process_id] = replace(message, packets=(), fixes=())
+            self._windows[process_id] = message
             message = message if mail is None else mail.within(message)
         self.say(process_id, message)
 

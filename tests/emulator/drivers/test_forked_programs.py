@@ -174,12 +174,12 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(pipes, "HostedPrograms", has_no_room)
     emulation = emulate(tmp_path / "run")
     welcomes = [emulation.welcome("v01", b"")]
-    process = ForkedPrograms(welcomes, {}, emulation.folder, [], lambda: None)
+    process = ForkedPrograms(welcomes, {}, emulation.folder, [], lambda: None, 30.0)
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     try:
         process.give((), None)
         with pytest.raises(VnetError, match="no room for programs"):
-            process.take(30.0)
+            process.take()
     finally:
         process.close()
 

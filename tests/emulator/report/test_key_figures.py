@@ -4,7 +4,7 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -33,39 +33,8 @@ from vnet.errors import ScenarioError
 from vnet.node import Node
 
 DECLARES = __name__
-FIGURES = f"{__name__}:Figures"
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Figures of vehicles that report where they think that the middle of all is."""
-
-    COLUMNS: ClassVar = {"middle_m": ("middle_m", 2, "where it thinks that the middle is")}
-    KEY_FIGURES: ClassVar = (
-        {
-            "name": "middle_rmse_m",
-            "title": "middle, RMSE",
-            "column": "error of the middle (m)",
-            "chart": ("middle", "Middle", "RMSE of the middle (m)"),
-            "live": ("the middle", "RMSE"),
-        },
-    )
-    CHARTS: ClassVar = (
-        {
-            "id": "middle",
-            "title": "The middle of all",
-            "axis": "middle (m)",
-            "lines": {"RMSE": "middle_rmse_m"},
-            "text": "How far off.",
-        },
-    )
-
-    middle_rmse_m: float | None
-
-    @staticmethod
-    def compute(periods: Any) -> dict[str, list[float | None]]:
-        """Return the figures of K periods."""
-        return {"middle_rmse_m": periods.rms(periods["middle_m"] - periods.mean(periods["position_m"]))}
+FIGURES = "docs.examples.middle:Figures"
+"""The example of the page on figures, for a program that takes the origin for the middle."""
 
 
 async def guess(node: Node) -> None:
@@ -98,8 +67,8 @@ def test_a_figure_is_declared_in_one_place(run: Path) -> None:
         "summary": console.file.getvalue(),  # type: ignore[attr-defined]
     }
     assert not [page for page, text in shown.items() if "middle, RMSE" not in text]
-    assert "The middle of all" in shown["report"]
-    assert "error of the middle (m)" in index_page(run.parent)
+    assert "Middle of all vehicles" in shown["report"]
+    assert "middle (m)" in index_page(run.parent)
 
 
 def test_a_declared_figure_is_what_its_function_gives(run: Path) -> None:
@@ -122,7 +91,7 @@ def test_a_recording_and_the_live_picture_have_a_declared_figure(run: Path, tmp_
     session.open().run()
     console = Console(file=io.StringIO(), width=100, height=20)
     console.print(Dashboard(course.snapshot()))
-    assert "the middle" in console.file.getvalue()  # type: ignore[attr-defined]
+    assert "middle" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 class Wrong:

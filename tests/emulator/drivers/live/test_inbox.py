@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from emulator.drivers.processes import Heard, ProtocolError
+from emulator.drivers.processes import Heard
 from tests.emulator.drivers.live.fakes import Stage, hello
 from vnet.transport import wire
 
@@ -97,17 +97,17 @@ def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: bytes, re
     asyncio.run(run())
 
 
-def test_a_second_yield_is_refused_unless_the_loop_has_refused_the_first() -> None:
+def test_a_yield_of_another_window_is_refused_as_it_comes_and_so_is_a_second_one() -> None:
     async def run() -> None:
         post = Post()
-        post.hear("v01", yield_of(7))
-        post.hear("v01", yield_of(0))
-        await post.settle()
-        assert await post.came() == [("v01", 7)] and len(post.refused) == 1
-        post.live.refuse("v01", ProtocolError("yield 7 of v01: expected 0"))
-        post.hear("v01", yield_of(0))
+        for seq in (7, 0, 0):
+            post.hear("v01", yield_of(seq))
         await post.settle()
         assert await post.came() == [("v01", 0)]
+        assert [reason for _, reason in post.refused] == ["yield 7 of v01: expected 0"]  # the first of each key
+        post.live.write_refused()
+        (total,) = [e.details["count"] for e in post.stage.emulation.folder.events if e.kind == "refused_total"]
+        assert total == 2
 
     asyncio.run(run())
 
