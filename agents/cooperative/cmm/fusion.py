@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.cmm.common_error import systematic
-from agents.cooperative.cmm.information import Information, transport
 from agents.cooperative.cmm.rbpf import Rbpf
 from agents.cooperative.cmm.weights import largest_remainder
 from vnet.types import Array
@@ -61,23 +60,6 @@ class Conditioned:
     map_log_likelihood: Array
 
 
-# Estimates.
-
-
-def transport_cloud(rbpf: Rbpf, pooled: Information) -> None:
-    """Move the filter's cloud to the moments of `pooled`, and what goes with it along the regression on c."""
-    slopes = regression_on_common_error(rbpf)
-    particles, tracks = rbpf.particles, rbpf.tracks
-    mean_m, covariance_m2 = pooled.moments()
-    spread_m = particles.common_m - particles.estimate_m[:, None]
-    moves = transport(particles.covariance_m2 + MIN_VARIANCE_M2 * np.eye(2), covariance_m2) @ spread_m
-    by_m = mean_m[:, None] + moves - particles.common_m
-    particles.common_m = particles.common_m + by_m
-    particles.past_m += slopes.past @ by_m
-    tracks.mean += slopes.mean @ by_m
-    tracks.map_log_likelihood += slopes.map_log_likelihood @ by_m
-
-
 def regression_on_common_error(rbpf: Rbpf) -> Slopes:
     """Return the filter's regression on c.
 
@@ -93,9 +75,6 @@ def regression_on_common_error(rbpf: Rbpf) -> Slopes:
     spread_m = particles.common_m - particles.estimate_m[:, None]
     project = (spread_m * particles.weight).T @ np.linalg.inv(covariance)
     return Slopes(tracks.mean @ project, particles.past_m @ project, tracks.map_log_likelihood @ project)
-
-
-# Particles.
 
 
 def fuse(rbpf: Rbpf, clouds: Sequence[Cloud], weights: Array, rng: np.random.Generator) -> tuple[Array, int]:
