@@ -7,7 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -108,7 +109,7 @@ def play(
         scheduled = schedule(played, speed, round(start * NS_PER_S), None if end is None else round(end * NS_PER_S))
         place = place_to_serve(rerun_bind, rerun_port)
         sinks = Sinks(serve=place, spawn=has_display() and not serve, vehicle=rerun_vehicle)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        sleep = _sleep_until_interrupted()
         with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
             recorder.take(stream, scene)
             print(f"playing {run} at {speed:g}× real time\n{place.announcement()}", flush=True)
@@ -119,10 +120,33 @@ def play(
                 if apart_s >= SEEN_APART_S:
                     recorder.draw()
 
-            if play_scheduled(scheduled, show) == 0:
+            if play_scheduled(scheduled, show, sleep=sleep) == 0:
                 raise VnetError(f"{run}: there is nothing to play from {start:g} s on")
             print("played; it can be looked at until Ctrl-C", flush=True)
-            signal.pause()
+            while True:
+                sleep(1.0)
+
+
+def _sleep_until_interrupted() -> Callable[[float], None]:
+    """Have SIGINT and SIGTERM raise KeyboardInterrupt; return a `time.sleep` that raises it after either, too.
+
+    An exception that is raised within a callback of the viewer's library is lost.
+    """
+    told: list[int] = []
+
+    def interrupt(number: int, frame: object) -> None:
+        told.append(number)
+        raise KeyboardInterrupt
+
+    def sleep(seconds: float) -> None:
+        if told:
+            raise KeyboardInterrupt
+        time.sleep(seconds)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as of a job in a shell's background
+            signal.signal(number, interrupt)
+    return sleep
 
 
 def _recorder(sinks: Sinks, name: str) -> Recorder:

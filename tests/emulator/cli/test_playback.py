@@ -1,5 +1,6 @@
 """`vnet render` and `vnet play`, as one types them: what they make, what they refuse, and how they end."""
 
+import contextlib
 import shutil
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
+from emulator.cli import viewing
 from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.recorder import Recorder
@@ -153,6 +155,20 @@ def test_playing_can_be_ended_at_any_time(watched: Watched, end: signal.Signals)
         until(process, "playing")
         process.send_signal(end)
         assert process.wait(30) == 0
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_a_library_has_lost_ends_playing(end: signal.Signals) -> None:
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        sleep = viewing._sleep_until_interrupted()
+        with contextlib.suppress(KeyboardInterrupt):  # as the viewer's library does within its callbacks
+            signal.raise_signal(end)
+        with pytest.raises(KeyboardInterrupt):
+            sleep(3600.0)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_nothing_asks_to_render_a_run_that_was_killed(watched: Watched, tmp_path: Path) -> None:
