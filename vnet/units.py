@@ -3,6 +3,10 @@
 Times are integer nanoseconds from the start of a run, except in files and texts for people.
 """
 
+from typing import NamedTuple, TypeVar
+
+from vnet.types import IntArray
+
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 BYTES_PER_MB = 1_000_000
@@ -41,6 +45,22 @@ UNITS = {
     "s": "s",
 }
 """Units by the end of a name after an underscore; of two that fit the longer one counts."""
+
+Times = TypeVar("Times", int, IntArray)
+
+
+class Grid(NamedTuple):
+    """The instants `phase_ns`, `phase_ns` + `step_ns`, …; all instants if the step is 0."""
+
+    step_ns: int = 0
+    phase_ns: int = 0
+
+    def at_or_after(self, time_ns: Times) -> Times:
+        """Return for each time the first instant that is not before it."""
+        return time_ns + (self.phase_ns - time_ns) % self.step_ns if self.step_ns else time_ns
+
+
+ANY_TIME = Grid()
 
 
 def unit_of(name: str) -> str:

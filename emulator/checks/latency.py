@@ -14,6 +14,7 @@ from emulator.radio.own_rules import LONGEST_DELAY_S, MOST_COPIES
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result
 from emulator.scenario.faults import Custom, DelayFault, Duplicate, Throttle
+from emulator.scenario.scenario import Scenario
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS, NS_PER_S
@@ -44,9 +45,14 @@ def bounds(recorded: RecordedRun, without: PlannedFault | None = None) -> Bounds
     start_ns, end_ns, airtime_ns, alone = _queue(recorded, plan)
     latency_ns = radio.latency_ms * NS_PER_MS
     sooner_ns, later_ns = _delays(recorded, plan)
-    most_ns = latency_ns + radio.jitter_ms * NS_PER_MS + radio.delivery_tick_us * 1_000
+    most_ns = latency_ns + radio.jitter_ms * NS_PER_MS + _rounding_us(recorded.scenario) * 1_000
     earliest_ns = start_ns + airtime_ns + max(latency_ns, 1_000) + sooner_ns - ROUNDING_NS
     return Bounds(earliest_ns, end_ns + most_ns + later_ns + ROUNDING_NS, airtime_ns, alone & (later_ns == 0))
+
+
+def _rounding_us(scenario: Scenario) -> int:
+    """The most by which arrivals are rounded up."""
+    return scenario.radio.delivery_tick_us + scenario.run.order_slack_us
 
 
 def _queue(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array, Array, Mask]:
@@ -194,7 +200,7 @@ def _mean_latency(recorded: RecordedRun, allowed: Bounds, timed: Mask) -> dict[s
     access_ms = 0.0 if recorded.shares_air else radio.access_jitter_ms
     mean_ns = float(np.mean((recorded.due_ns - from_ns)[rows] - allowed.airtime_ns[rows]))
     receivers: IntArray = np.unique(recorded.emission[rows], return_counts=True)[1]
-    tick_ms = radio.delivery_tick_us / 1_000
+    tick_ms = _rounding_us(recorded.scenario) / 1_000
     expected_ms = radio.latency_ms + (access_ms + radio.jitter_ms + tick_ms) / 2
     # The access delay is one draw for all receivers of a frame, the jitter one for each of them.
     variance = access_ms**2 / 12 * float(np.sum(receivers.astype(float) ** 2)) / count**2

@@ -250,7 +250,12 @@ def _decided_again(recorded: RecordedRun) -> Engine:
     """Return an engine that has been given the frames of the trace, and all that happened besides."""
     scenario, places = recorded.scenario, recorded.places
     engine = Engine(
-        recorded.node_ids, scenario.radio, scenario.run.seed, places.position_m(0), recorded.radio_inputs
+        recorded.node_ids,
+        scenario.radio,
+        scenario.run.seed,
+        places.position_m(0),
+        recorded.radio_inputs,
+        arrivals=scenario.run.order_grid,
     )
     sender, seq, sent_ns, size = _originals(recorded)
     changes_ns = _changes_ns(recorded)

@@ -370,7 +370,13 @@ class Emulation:
         self._rules.on_failure = self._rule_failed
         world.own_sensors.on_failure = self._sensor_failed
         self.engine = Engine(
-            world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.radio_inputs, self._rules
+            world.node_ids,
+            scenario.radio,
+            scenario.run.seed,
+            start.position_m,
+            world.radio_inputs,
+            self._rules,
+            scenario.run.order_grid,
         )
         self.payloads = PayloadRecorder(world.node_ids) if scenario.run.keep_payloads else None
         if self.payloads is not None:

@@ -23,8 +23,8 @@ class Orders:
         run = scenario.run
         self._run = run
         self.tape: Sequence[TapeEntry] = _tape_of(run.tape)
-        self.explores = run.order != "fifo" or run.tape is not None
-        """True if another order than FIFO is possible."""
+        self.explores = run.order != "fifo" or run.tape is not None or run.order_slack_us > 0
+        """True if another order than FIFO is possible, or compared with what is possible."""
         self._at_medium = {entry.time_ns: entry.medium for entry in self.tape if isinstance(entry, MediumOrder)}
         self.made: list[TapeEntry] = []
         self.steps: Mapping[str, int] = {}
@@ -35,12 +35,13 @@ class Orders:
         run = self._run
         if not self.explores:
             return None
+        slack_ns, phase_ns = run.order_grid
         if run.order == "fifo":
             tape = [each for each in self.tape if isinstance(each, Deviation)]
-            return Order(
-                "tape", tape=[each for each in tape if (each.node, each.incarnation) == (node, incarnation)]
-            )
-        return Order(run.order, self._seed(f"{node}/{incarnation}"), run.order_depth, run.order_steps or 0)
+            tape = [each for each in tape if (each.node, each.incarnation) == (node, incarnation)]
+            return Order("tape", tape=tape, slack_ns=slack_ns, phase_ns=phase_ns)
+        seed = self._seed(f"{node}/{incarnation}")
+        return Order(run.order, seed, run.order_depth, run.order_steps or 0, (), slack_ns, phase_ns)
 
     def _seed(self, of: str) -> int:
         """Return a seed that says nothing about the scenario's."""

@@ -39,7 +39,16 @@ from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
 from emulator.radio.propagation import transmit_powers_dbm
 from emulator.radio.reception import Reception, Signals
-from emulator.radio.stages import Latency, Loss, change_by_faults, in_range, lose_by_faults, peer_cap, sender_side
+from emulator.radio.stages import (
+    Latency,
+    Loss,
+    RoundedUp,
+    change_by_faults,
+    in_range,
+    lose_by_faults,
+    peer_cap,
+    sender_side,
+)
 from emulator.radio.topology import Topology, connectivity_of
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
 from emulator.radio.unicast import Unicasts
@@ -48,6 +57,7 @@ from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
 from vnet.radio import SendOptions
 from vnet.types import IntArray
+from vnet.units import ANY_TIME, Grid
 
 NO_OPTIONS: Mapping[int, SendOptions] = {}
 
@@ -64,7 +74,7 @@ class Engine:
     """The state of the emulated radio. Nodes have the numbers 0 … N-1 in the order of `node_ids`.
 
     `position_m` (N, 2) are positions in metres. `inputs` are those that a scenario reads from files; `rules` are
-    those of the user's own.
+    those of the user's own. `arrivals` are rounded up to instants of a grid.
     """
 
     def __init__(
@@ -75,6 +85,7 @@ class Engine:
         position_m: NDArray[np.float64],
         inputs: RadioInputs | None = None,
         rules: OwnRules | None = None,
+        arrivals: Grid = ANY_TIME,
     ) -> None:
         self._node_ids = tuple(node_ids)
         self._radio = radio
@@ -107,6 +118,8 @@ class Engine:
         """Stages that decide which receptions succeed."""
         self.timing: list[Stage] = [Latency(seed, radio), change_by_faults]
         """Stages after them, which say when and how often those arrive, and with which bytes."""
+        if arrivals.step_ns:
+            self.timing.append(RoundedUp(arrivals))
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
         self._number = {node: number for number, node in enumerate(node_ids)}

@@ -18,7 +18,7 @@ from emulator.radio.reception import latency_draws
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import MIN_LATENCY_NS, Radio
 from vnet.types import Array
-from vnet.units import NS_PER_MS
+from vnet.units import NS_PER_MS, Grid
 
 
 def frame_draws(draws: Draws, transmissions: Sequence[Transmission], receptions: Receptions) -> Array:
@@ -108,3 +108,14 @@ class Latency:
         return latency_draws(
             np.array([zeros if s.signal is None else s.signal.random_draws for s in transmissions])
         )
+
+
+class RoundedUp:
+    """Arrivals at the instants of a grid, whatever has delayed them; duplicates keep their distance."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+
+    def __call__(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
+        """Set the arrival time of each reception."""
+        receptions.arrival_ns = self._grid.at_or_after(receptions.arrival_ns)

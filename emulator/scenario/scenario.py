@@ -17,7 +17,7 @@ from emulator.scenario.radio import RATES_MBPS, Buildings, Congestion, Fading, M
 from emulator.scenario.sections import DAY_S, FAR_M, Section
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
 from vnet.errors import shown
-from vnet.units import NS_PER_MS, NS_PER_S
+from vnet.units import NS_PER_MS, NS_PER_S, Grid
 
 MANY = 1_000_000_000
 
@@ -53,6 +53,9 @@ class Run(Section):
     """`pct`: how many events, in the right order, show the bugs that are sought."""
     order_steps: int | None = Field(None, ge=1, le=MANY)
     """`pct`: decisions of a vehicle in a run; counted in a run in FIFO order if left out."""
+    order_slack_us: int = Field(0, ge=0, le=MANY)
+    """Lockstep: a vehicle's packets and timers are late by less than this, at one of four phases (`order_seed`
+    modulo 4), so that an order also swaps what is nearly simultaneous. It divides the period of fixes."""
     tape: Path | tuple[str, ...] | None = None
     """Deviations from FIFO to follow, as far as they fit: the `tape.jsonl` of another run, relative to the scenario
     file, or a list of its lines. With `order = "fifo"`."""
@@ -78,9 +81,16 @@ class Run(Section):
             raise ValueError(
                 f'order = "{self.order}" goes with pacing = "lockstep": in real time nobody decides it'
             )
+        if self.order_slack_us and self.pacing != "lockstep":
+            raise ValueError('order_slack_us goes with pacing = "lockstep": in real time nobody decides the order')
         if self.tape is not None and (self.order != "fifo" or self.pacing != "lockstep"):
             raise ValueError('tape goes with order = "fifo" and pacing = "lockstep"')
         return self
+
+    @property
+    def order_grid(self) -> Grid:
+        """The instants at which vehicles are shown packets and timers, if there is a slack."""
+        return Grid(self.order_slack_us * 1_000, self.order_seed % 4 * self.order_slack_us * 250)
 
 
 class Radio(Section):
@@ -198,6 +208,15 @@ class Scenario(Section):
                     f"fault.{number}.at_s = {fault.at_s:g}: must be less than {self.healed_s:g}, which is "
                     "run.duration_s - run.settle_s"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _slack_divides_the_period(self) -> Scenario:
+        slack_us = self.run.order_slack_us
+        if slack_us and self.period_ns % (slack_us * 1_000):
+            raise ValueError(
+                f"run.order_slack_us = {slack_us}: must divide the period of fixes, {self.period_ns / 1_000:g} µs"
+            )
         return self
 
     @model_validator(mode="after")

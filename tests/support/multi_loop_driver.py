@@ -48,7 +48,7 @@ class Over(Exception):
     """The emulator has said that the run is over."""
 
 
-def scenario_of(faults: Sequence[dict[str, Any]], program: str, vehicles: int = 4, **sections: Any) -> Scenario:
+def scenario_of(faults: Sequence[dict[str, Any]], program: str, /, vehicles: int = 4, **sections: Any) -> Scenario:
     """A small scenario: some seconds at 5 Hz, all in range."""
     data: dict[str, Any] = {
         "run": {"duration_s": 3.0, "settle_s": 0.5},

@@ -173,3 +173,17 @@ async def cancels_timers(node: Node) -> None:
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(given_up())
         tasks.create_task(ticks())
+
+
+async def races(node: Node) -> None:
+    """Broadcast with each fix and fail if a packet and a timer of `after_s` come in the other order.
+
+    Packets arrive 2 ms after the fixes, at 6 Mbit/s some µs later.
+    """
+    after_s = float(node.options["after_s"])
+    while True:
+        await node.gnss.receive()
+        await node.radio.broadcast(b"here")
+        timer = asyncio.create_task(asyncio.sleep(after_s))
+        await node.radio.receive()
+        assert timer.done() == (after_s < 0.002)

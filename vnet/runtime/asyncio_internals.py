@@ -196,23 +196,23 @@ class NodeHandle(asyncio.Handle):
 
 
 class NumberedTimer(asyncio.TimerHandle):
-    """A timer with a number: timers of one instant fire in the order in which they were set.
+    """A timer with a place among those of one instant: they fire in that order.
 
     asyncio leaves that order to the shape of its heap, and so to how many other nodes share the loop. Where other
     orders are tried, `setter` has the name of what has set the timer, and its callback. `node` is whose it is.
     """
 
-    __slots__ = ("_number", "node", "setter")
+    __slots__ = ("_place", "node", "setter")
     node: object
     setter: tuple[str, object]
 
-    def __init__(self, number: int, *rest: Any) -> None:
+    def __init__(self, place: Any, *rest: Any) -> None:
         super().__init__(*rest)
-        self._number = number
+        self._place = place
 
     def __lt__(self, other: asyncio.TimerHandle) -> bool:
         assert isinstance(other, NumberedTimer)
-        return (self.when(), self._number) < (other.when(), other._number)
+        return (self.when(), self._place) < (other.when(), other._place)
 
 
 def _private(owner: object) -> Any:

@@ -43,7 +43,7 @@ from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 from vnet.transport.wire import Deviation, Order, SentMessage, arrived_in_full
-from vnet.units import NS_PER_S
+from vnet.units import NS_PER_S, Grid
 
 if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
@@ -208,8 +208,10 @@ class Host:
 
     def order_events(self, loop: VirtualTimeLoop) -> None:
         """Have events of one instant come in the order that the welcomes ask for; before the first grant."""
-        if any(order is not None for order in self._orders.values()):
-            self.mail.ordered = loop.order(self._chooser_of, self._deviated)
+        order = next((order for order in self._orders.values() if order is not None), None)
+        if order is not None:
+            grid = Grid(order.slack_ns, order.phase_ns)
+            self.mail.ordered = loop.order(self._chooser_of, self._deviated, grid)
 
     def start(self, loop: SkewedLoop, programs: Programs) -> None:
         """Schedule every node's program on `loop`."""

@@ -34,7 +34,7 @@ from vnet.runtime.outside_loop import collected_by_schedule, collector
 from vnet.runtime.own_asyncio import Future, Task, current_node, present_node
 from vnet.runtime.ready_queue import Chooser, CpuMeter, OrderedQueue, ReadyQueue
 from vnet.transport.wire import ClockError, Deviation
-from vnet.units import NS_PER_S
+from vnet.units import ANY_TIME, NS_PER_S, Grid
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -229,6 +229,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._timers = count()
         self._meter: CpuMeter | None = None
         self._ordered: OrderedQueue | None = None
+        self._timer_grid = ANY_TIME
         self._thread: int | None = None
         self._collect_every_ns: int | None = None
         self._collections_ns: dict[int, int] = {}
@@ -255,13 +256,18 @@ class VirtualTimeLoop(SkewedLoop):
         self._meter = meter
 
     def order(
-        self, chooser_of: Callable[[Node], Chooser], on_deviation: Callable[[Node, Deviation], None]
+        self,
+        chooser_of: Callable[[Node], Chooser],
+        on_deviation: Callable[[Node, Deviation], None],
+        timer_grid: Grid = ANY_TIME,
     ) -> OrderedQueue:
         """Have `chooser_of` a node decide in which order it is shown what happens at one instant.
 
         Returns the queue in which events of this instant are put. `on_deviation` is told of choices that are not
-        FIFO's. To be called before anything runs.
+        FIFO's. Timers are due at the instants of `timer_grid`; in FIFO order those of one instant fire by their asked
+        times. To be called before anything runs.
         """
+        self._timer_grid = timer_grid
         ready = self._queue
         self._queue = self._ordered = OrderedQueue(ready, chooser_of, lambda: self._now_ns, on_deviation)
         self._ordered.on_taken = ready.on_taken
@@ -287,9 +293,15 @@ class VirtualTimeLoop(SkewedLoop):
         asyncio_internals.check_not_closed(self)
         self._check_thread()
         when = self._own_when(when)
+        number = next(self._timers)
+        place: tuple[int, ...] = (number,)
         if when < LATEST_S:
-            when = round(when * NS_PER_S) / NS_PER_S
-        timer = NumberedTimer(next(self._timers), when, callback, args, self, context)
+            when_ns = round(when * NS_PER_S)
+            if self._timer_grid.step_ns:
+                place = (when_ns, number)
+                when_ns = self._timer_grid.at_or_after(when_ns)
+            when = when_ns / NS_PER_S
+        timer = NumberedTimer(place, when, callback, args, self, context)
         timer.node = self._node_of(timer, callback)
         self.check_owner(timer.node)
         if self._ordered is not None:

@@ -46,7 +46,8 @@ class Deviation(msgspec.Struct, frozen=True, array_like=True):
 class Order(msgspec.Struct, frozen=True, array_like=True):
     """In which order a node is shown what happens at one instant (lockstep), if not FIFO.
 
-    `depth` and `steps` are those of `pct`; `tape` has the deviations from FIFO of a `tape`.
+    `depth` and `steps` are those of `pct`; `tape` has the deviations from FIFO of a `tape`. Timers are due at
+    multiples of `slack_ns`, if it is not 0, plus `phase_ns`.
     """
 
     kind: Literal["shuffle", "pct", "tape"]
@@ -54,6 +55,8 @@ class Order(msgspec.Struct, frozen=True, array_like=True):
     depth: Count = 1
     steps: Count = 0
     tape: Sequence[Deviation] = ()
+    slack_ns: Count = 0
+    phase_ns: Count = 0
 
 
 class WireSendResult(msgspec.Struct, frozen=True, array_like=True):

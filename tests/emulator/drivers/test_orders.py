@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.drivers.emulation import Emulation
+from emulator.drivers.emulation import Emulation, NodeState
 from emulator.drivers.session import with_order_steps
 from emulator.records.tape import MediumOrder, TapeEntry, dump_tape, first_left, read_tape
 from emulator.scenario.scenario import Scenario
@@ -35,11 +35,17 @@ def taped(scenario: Scenario, run: Emulation, folder: Path) -> Scenario:
 
 @pytest.mark.slow
 @settings(max_examples=8, deadline=None)
-@given(scenario=scenarios(), kind=st.sampled_from(["shuffle", "pct"]), seed=st.integers(0, 1000))
+@given(
+    scenario=scenarios(),
+    kind=st.sampled_from(["shuffle", "pct"]),
+    seed=st.integers(0, 1000),
+    slack_us=st.sampled_from([0, 100, 2000, 20_000]),
+)
 def test_an_order_is_the_same_in_any_division_into_processes_and_from_its_tape(
-    scenario: Scenario, kind: str, seed: int, tmp_path_factory: pytest.TempPathFactory
+    scenario: Scenario, kind: str, seed: int, slack_us: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    explored = ordered(scenario, order=kind, order_seed=seed, order_steps=500)
+    scenario = ordered(scenario, order_slack_us=slack_us, order_seed=seed)
+    explored = ordered(scenario, order=kind, order_steps=500)
     reference = run_together(explored)
     apart = run_apart(explored)
     assert same(fingerprint(apart)[:3], fingerprint(reference)[:3])
@@ -94,6 +100,23 @@ def test_the_order_changes_no_other_draw() -> None:
     assert run_together(ordered(scenario, order="shuffle")).engine.counts == fifo.engine.counts
 
 
+@pytest.mark.parametrize("after_s", [0.0015, 0.0025, 0.0055])
+def test_a_slack_swaps_a_timer_and_a_packet_that_are_nearly_simultaneous(after_s: float) -> None:
+    sections = {
+        "run": {"duration_s": 1.0, "settle_s": 0.0},
+        "radio": {"jitter_ms": 0.0, "access_jitter_ms": 0.0, "loss": 0.0},
+        "program": {"options": {"after_s": after_s}},
+    }
+    scenario = scenario_of([], "tests.support.window_programs:races", 2, **sections)
+
+    def failures(**order: Any) -> int:
+        runs = [run_together(ordered(scenario, order_seed=seed, **order)) for seed in range(8)]
+        return sum(1 for run in runs for node in run.up if run.presence.state(node) is NodeState.ENDED)
+
+    assert failures(order="shuffle") == 0
+    assert (failures(order="shuffle", order_slack_us=1000) > 0) == (abs(after_s - 0.002) < 0.001)
+
+
 def test_decisions_are_counted_in_fifo_order_where_pct_needs_their_number() -> None:
     run, radio = {"duration_s": 1.0, "settle_s": 0.0}, {"jitter_ms": 0.0, "access_jitter_ms": 0.0, "loss": 0.0}
     scenario = ordered(scenario_of([], IMPROVISES, 4, run=run, radio=radio), order="pct")
@@ -134,6 +157,8 @@ def test_a_run_says_where_it_left_a_tape_that_does_not_fit() -> None:
     [
         ('order = "shuffle"\npacing = "realtime"', 'order = "shuffle" goes with pacing = "lockstep"'),
         ('order = "pct"\ntape = "x"', 'tape goes with order = "fifo"'),
+        ('order_slack_us = 1\npacing = "realtime"', 'order_slack_us goes with pacing = "lockstep"'),
+        ("order_slack_us = 300", "must divide the period of fixes, 100000 µs"),
     ],
 )
 def test_orders_that_cannot_be_are_refused(run: str, text: str) -> None:
