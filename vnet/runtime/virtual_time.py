@@ -264,8 +264,8 @@ class VirtualTimeLoop(SkewedLoop):
         """Have `chooser_of` a node decide in which order it is shown what happens at one instant.
 
         Returns the queue in which events of this instant are put. `on_deviation` is told of choices that are not
-        FIFO's. Timers are due at the instants of `timer_grid`; in FIFO order those of one instant fire by their asked
-        times. To be called before anything runs.
+        FIFO's. Timers are due at the instants of `timer_grid`; in FIFO order those of one instant fire in the order
+        of their times. To be called before anything runs.
         """
         self._timer_grid = timer_grid
         ready = self._queue
