@@ -92,5 +92,9 @@ class VirtualTimeError(VnetError):
     """An operation that a program may not use in lockstep, because it waits for the real world."""
 
 
+class DeadlockError(VnetError):
+    """A program whose tasks all wait for what nothing is left to bring: no timer, packet, fix, job or thread."""
+
+
 class ProgramError(VnetError):
     """A vehicle program that cannot be imported, or whose entry is not a coroutine function of one node."""

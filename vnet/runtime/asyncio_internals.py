@@ -31,7 +31,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
-from types import CoroutineType
+from types import CoroutineType, FrameType
 from typing import Any, cast
 
 MOST_CLOSINGS = 10
@@ -54,10 +54,15 @@ def push_timer(loop: asyncio.AbstractEventLoop, timer: asyncio.TimerHandle) -> N
     _private(timer)._scheduled = True
 
 
+def timers(loop: asyncio.AbstractEventLoop) -> list[asyncio.TimerHandle]:
+    """Return the loop's heap of timers, cancelled ones among them."""
+    return cast("list[asyncio.TimerHandle]", _private(loop)._scheduled)
+
+
 def next_timer(loop: asyncio.AbstractEventLoop) -> asyncio.TimerHandle | None:
     """Return the head of the loop's heap of timers; while the loop waits, this timer is not cancelled."""
-    timers: list[asyncio.TimerHandle] = _private(loop)._scheduled
-    return timers[0] if timers else None
+    heap = timers(loop)
+    return heap[0] if heap else None
 
 
 def set_clock_resolution(loop: asyncio.AbstractEventLoop, seconds: float) -> None:
@@ -220,11 +225,11 @@ def _private(owner: object) -> Any:
     return owner
 
 
-def suspended_at(task: asyncio.Task[Any]) -> Iterator[str]:
-    """Yield the lines at which a suspended task waits, from its outermost coroutine inwards."""
+def suspended_in(task: asyncio.Task[Any]) -> Iterator[FrameType]:
+    """Yield the frames in which a suspended task waits, from its outermost coroutine inwards."""
     coroutine: Any = task.get_coro()
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
-        yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
+        yield frame
         coroutine = coroutine.cr_await
 
 
@@ -233,7 +238,8 @@ def stacks_of(tasks: Sequence[asyncio.Task[Any]]) -> str:
     lines = []
     for task in tasks:
         lines.append(f"task {task.get_name()}:")
-        lines += [f"  {place}" for place in suspended_at(task)]
+        for frame in suspended_in(task):
+            lines.append(f"  {frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}")
     return "\n".join(lines)
 
 

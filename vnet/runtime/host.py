@@ -27,19 +27,20 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from msgspec.structs import replace
 
 from vnet.driving import Action
+from vnet.errors import DeadlockError
 from vnet.mailbox import Mailbox
 from vnet.node import Fix, Node
 from vnet.radio import RadioAbilities, SendOptions
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
-from vnet.runtime import asyncio_internals
+from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, NodeClocks, Window
 from vnet.runtime.own_asyncio import Task, current_node, present_node
 from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
 from vnet.runtime.ready_queue import Chooser, chooser_of, node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap
-from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, own_line
+from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, line_of_task, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 from vnet.transport.wire import Deviation, Order, SentMessage, arrived_in_full
@@ -80,6 +81,8 @@ class Host:
         self._lines = NodeLines(on_line)
         self._log_handler = NodeLogHandler(self._log)
         self._window = Window()
+        self._mains: dict[str, asyncio.Task[None]] = {}
+        """Held here: of a program in a deadlock nothing else refers to them, and they would be collected."""
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
         self._thread: int | None = None  # of the loop, in lockstep
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
@@ -233,7 +236,8 @@ class Host:
     def _start(self, node: Node) -> None:
         context = contextvars.copy_context()
         context.run(current_node.set, node)
-        self._loop.create_task(self._main(node, self._programs[node.id]), name=f"{node.id} main", context=context)
+        main = self._main(node, self._programs[node.id])
+        self._mains[node.id] = self._loop.create_task(main, name=f"{node.id} main", context=context)
 
     def _chooser_of(self, node: Node) -> Chooser:
         order = self._orders[node.id]
@@ -255,6 +259,7 @@ class Host:
     def stop(self, node: str, killed: bool, time_ns: int) -> None:
         """A node's process is gone (simulated): its program is cancelled, unheard; if killed it goes no further."""
         gone = self.nodes[node]
+        goes_on = self._runs(gone)
         gone.disconnect()
         self._active[node] = False
         self._late = [entry for entry in self._late if entry[0] != node]
@@ -266,6 +271,7 @@ class Host:
             self._hold()
         else:
             self._stopped_ns[gone] = time_ns
+            self._tell_deadlocks([gone] if goes_on else [])
             for task in self._tasks_of(gone):
                 task.cancel()
 
@@ -485,6 +491,19 @@ class Host:
             task.cancel()
         return tasks
 
+    def _tell_deadlocks(self, nodes: Iterable[Node]) -> None:
+        """Tell of those of the nodes, whose programs go on, that nothing could wake however long the run lasted."""
+        assert isinstance(self._loop, VirtualTimeLoop)
+        woken = {node_of(handle) for handle in self._loop.pending()}
+        for node in nodes:
+            if node in woken or _awaits_emulator(node) or outside_loop.has_threads(node):
+                continue
+            if tasks := self._tasks_of(node):
+                places = ", ".join(sorted({line_of_task(task) for task in tasks}))
+                error = DeadlockError("nothing is left to wake the program; if it is over, let it return")
+                error.add_note(self.stacks(node.id))
+                self._unhandled.add(node, error, f"in {'a task' if len(tasks) == 1 else 'all tasks'} ({places})")
+
     def forget_interrupt(self) -> None:
         """Take note of the interrupt that has ended a task, of which asyncio would print a traceback otherwise."""
         for task in list(self._tasks):
@@ -494,9 +513,10 @@ class Host:
     def close(self, loop: VirtualTimeLoop) -> None:
         """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep).
 
-        `take_traffic` then returns the exceptions that nobody has handled.
+        `take_traffic` then returns the exceptions that nobody has handled, and programs in a deadlock.
         """
         self._closing = True
+        self._tell_deadlocks([node for node in self.nodes.values() if self._runs(node)])
         tasks = self._cancel_all()
         with contextlib.suppress(LoopAbandonedError, SpinError):
             while True:
@@ -676,3 +696,10 @@ _NAMES = (
 def level_name(number: int) -> str:
     """Return the level that `Node.log` has for one of `logging`."""
     return next((name for least, name in _NAMES if number >= least), "debug")
+
+
+def _awaits_emulator(node: Node) -> bool:
+    """Return whether a task waits for a packet, a fix, a message or the result of a send."""
+    inboxes: list[Mailbox[Any]] = [node.radio.inbox, node.gnss.inbox]
+    inboxes += [node.backbone.inbox] if node.backbone is not None else []
+    return node.radio.is_sending or any(inbox.waiting for inbox in inboxes)

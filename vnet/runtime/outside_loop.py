@@ -155,6 +155,11 @@ def _start_new_noted(function: Callable[..., object], *arguments: Any) -> int:
     return _start_new_thread(run, *arguments)
 
 
+def has_threads(node: Node) -> bool:
+    """Return whether a thread that `node` has started goes on."""
+    return any(owner is node and thread.is_alive() for thread, owner in list(_started_by.items()))
+
+
 class Job(Future[Any]):
     """A job that a program has given to an executor itself; `is_awaited` once anybody asks for its end."""
 

@@ -74,6 +74,11 @@ class ReadyQueue(deque[asyncio.Handle]):
             self.on_taken(handle)
         return handle
 
+    @property
+    def all(self) -> list[asyncio.Handle]:
+        """The callbacks that wait, with those that are held."""
+        return [*self, *self._held]
+
     def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[NumberedTimer]:
         """Hold what `holds` says, and release the rest in the order in which it came; returns its timers."""
         waiting, held = list(self), self._held

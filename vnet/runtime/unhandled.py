@@ -271,6 +271,11 @@ def line_of_caller() -> str:
     return _own_of([(frame.f_code.co_filename, number) for frame, number in frames][::-1])
 
 
+def line_of_task(task: asyncio.Task[Any]) -> str:
+    """Return file and line of the innermost frame in which a suspended task waits that is the program's own."""
+    return _own_of([(frame.f_code.co_filename, frame.f_lineno) for frame in asyncio_internals.suspended_in(task)])
+
+
 def _own_of(lines: Sequence[tuple[str, int]]) -> str:
     own = [line for line in lines if not line[0].startswith(NOT_THE_PROGRAM)] or lines
     return f"{Path(own[-1][0]).name}:{own[-1][1]}" if own else ""

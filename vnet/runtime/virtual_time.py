@@ -282,6 +282,11 @@ class VirtualTimeLoop(SkewedLoop):
         for timer in self._queue.release(held):
             asyncio_internals.push_timer(self, timer)
 
+    def pending(self) -> list[asyncio.Handle]:
+        """Return all callbacks and timers that will run sooner or later."""
+        handles = [*self._queue.all, *asyncio_internals.timers(self)]
+        return [handle for handle in handles if not handle.cancelled()]
+
     def own_time(self) -> float:
         """The granted time in seconds, as asyncio counts."""
         return self._now_ns / NS_PER_S

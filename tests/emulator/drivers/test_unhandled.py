@@ -1,11 +1,13 @@
 """Exceptions that nobody handles make a run invalid; whatever asyncio takes for handled does not."""
 
 import asyncio
+import contextlib
 import gc
 import json
 import logging
 import signal
 import sys
+import threading
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -137,6 +139,33 @@ async def a_task_fails_at_the_end(node: Node) -> None:
     await asyncio.sleep(99)
 
 
+async def waits_for_itself(node: Node) -> None:
+    lock = asyncio.Lock()
+    async with lock, lock:
+        pass
+
+
+async def waits_crosswise(node: Node) -> None:
+    locks = asyncio.Lock(), asyncio.Lock()
+
+    async def takes(first: asyncio.Lock, second: asyncio.Lock) -> None:
+        async with first:
+            await asyncio.sleep(0.5)
+            async with second:
+                pass
+
+    await asyncio.gather(takes(*locks), takes(*locks[::-1]))
+
+
+async def consumes_for_ever(node: Node) -> None:
+    queue: asyncio.Queue[bytes] = asyncio.Queue()
+    await queue.put(b"")
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(node.gnss.receive(), 0.01)
+    while True:
+        await queue.get()
+
+
 UNHANDLED: dict[Callable[[Node], Awaitable[None]], tuple[str, float]] = {
     forgets_a_task: ("in a task", 0.5),
     holds_a_task: ("in a task", 0.5),
@@ -153,6 +182,9 @@ UNHANDLED: dict[Callable[[Node], Awaitable[None]], tuple[str, float]] = {
     fails_a_future: ("in a future", 0.5),
     fails_at_the_end: ("in main", 3.0),
     a_task_fails_at_the_end: ("in a task", 3.0),
+    waits_for_itself: ("in a task", 3.0),
+    waits_crosswise: ("in all tasks", 3.0),
+    consumes_for_ever: ("in a task", 3.0),
 }
 
 
@@ -221,6 +253,30 @@ async def awaits_a_job(node: Node) -> None:
     await sends(node)
 
 
+async def sleeps_for_ever(node: Node) -> None:
+    await asyncio.sleep(1e18)
+
+
+async def listens_to_nobody(node: Node) -> None:
+    done = asyncio.Event()
+    listener = asyncio.create_task(node.radio.receive())
+    listener.add_done_callback(lambda _: done.set())
+    while True:
+        await done.wait()
+        done.clear()
+        listener = asyncio.create_task(node.radio.receive())
+        listener.add_done_callback(lambda _: done.set())
+
+
+async def waits_for_a_thread(node: Node) -> None:
+    never = threading.Event()
+    threading.Thread(target=never.wait, daemon=True).start()
+    try:
+        await asyncio.Event().wait()
+    finally:
+        never.set()
+
+
 async def has_a_handler(node: Node) -> None:
     asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
     await forgets_a_task(node)
@@ -250,6 +306,9 @@ HANDLED = [
     awaits_late,
     awaits_at_the_end,
     awaits_a_job,
+    sleeps_for_ever,
+    listens_to_nobody,
+    waits_for_a_thread,
     has_a_handler,
 ]
 
