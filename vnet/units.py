@@ -3,9 +3,7 @@
 Times are integer nanoseconds from the start of a run, except in files and texts for people.
 """
 
-from typing import NamedTuple, TypeVar
-
-from vnet.types import IntArray
+from typing import Any, NamedTuple, TypeVar
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
@@ -46,7 +44,7 @@ UNITS = {
 }
 """Units by the end of a name after an underscore; of two that fit the longer one counts."""
 
-Times = TypeVar("Times", int, IntArray)
+Times = TypeVar("Times", int, Any)  # an array of int64, whose type is another module's
 
 
 class Grid(NamedTuple):
