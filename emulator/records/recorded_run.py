@@ -451,6 +451,11 @@ class RecordedRun:
         """Instant at which each period starts."""
         return np.arange(self.periods, dtype=np.int64) * self.scenario.period_ns
 
+    @property
+    def times_s(self) -> Array:
+        """Start of each period in s."""
+        return self.period_starts_ns() / NS_PER_S
+
     # Events, and who was up when.
 
     def event(self, *kinds: str) -> list[Event]:
