@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
+from emulator.records.run_tables import open_table
 from emulator.records.verdicts import Verdict
 from emulator.scenario.sections import first_problem
 from vnet.bounded import read_bounded
@@ -67,9 +67,10 @@ def read_sweep(folder: Path) -> SweepRecord:
     """Read the sweep.parquet of a folder. Raises VnetError where it is not what vnet writes."""
     path = folder / SWEEP_TABLE
     try:
-        names = pq.read_schema(path).names
+        file = open_table(path, ["verdict"])
+        names = file.schema_arrow.names
         varied = names[: names.index("seed")]
-        verdicts = pq.read_table(path.absolute(), columns=["verdict"])["verdict"].to_pylist()
+        verdicts = file.read(["verdict"])["verdict"].to_pylist()
     except OSError as error:
         raise VnetError(f"{path}: cannot be read: {error.strerror or printable(str(error), 200)}") from None
     except (ValueError, KeyError, pa.ArrowException) as error:
