@@ -23,14 +23,16 @@ from emulator.cells.cells import Cell, has_result, read_result, run_cells
 from emulator.cells.programs import checked_function, entry_of, require_importable, with_folder_of
 from emulator.records.atomic import atomically, write_atomically
 from emulator.records.run_folder import RUNS
-from emulator.report.sweep_page import sweep_page
+from emulator.records.studies import SWEEP_PAGE, SWEEP_TABLE
+from emulator.report.index import write_index
+from emulator.report.sweep_page import PROGRAM, sweep_page
 from emulator.scenario.loading import Source, hinting, scenario_of
+from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError, VnetError, shown
 from vnet.runtime.programs import Program
 
 MOST_CELLS = 1_000_000
-TABLE, PAGE = "sweep.parquet", "sweep.html"
 SEED, NETWORK_SEED = "seed", "network.seed"
 FIXED = ("run.seed", "run.pacing")
 """Keys that a sweep sets itself."""
@@ -62,7 +64,7 @@ class SweepPlan:
         for combination in product(*values.values()):
             labels = dict(zip(values, combination, strict=True))
             try:
-                one = scenario_of(plain, labels)
+                one = scenario_of(plain, {key: _given_here(key, value) for key, value in labels.items()})
             except ScenarioError as error:
                 raise ScenarioError(f"sweep, {_words(labels)}: {str(error).removeprefix('scenario: ')}") from None
             draws = not keeps_network and one.network.kind == "generated"
@@ -123,13 +125,19 @@ def missing_cells(plan: SweepPlan, folder: Path) -> int:
 
 
 def write_sweep(plan: SweepPlan, folder: Path) -> pa.Table:
-    """Write the table of a sweep whose cells are all there, and its page; returns the table. Raises VnetError."""
+    """Write the table of a sweep whose cells are all there, its page, and the list of runs that it is in.
+
+    Returns the table. Raises VnetError.
+    """
     rows = [read_result(cell, folder) for cell in plan.cells]
     table = _table(rows)
-    with atomically(folder / TABLE) as part:
+    with atomically(folder / SWEEP_TABLE) as part:
         pq.write_table(table, part, compression="zstd")
-    page = sweep_page(plan.scenario, rows, plan.varied)
-    write_atomically(folder / PAGE, page)
+    programs = {cell.scenario.program.entry: cell.scenario.program for cell in plan.cells}
+    page = sweep_page(plan.scenario.run, list(programs.values()), rows, plan.varied)
+    write_atomically(folder / SWEEP_PAGE, page)
+    if folder.resolve().parent.name == RUNS.name:
+        write_index(folder.resolve().parent)
     return table
 
 
@@ -158,6 +166,11 @@ def _values(key: str, given: Any) -> list[Any]:
         raise ScenarioError(f"vary {key}: at least one value is needed")
     _refuse_repeated(f"vary {key}", values)
     return values
+
+
+def _given_here(key: str, value: Any) -> Any:
+    """Return the value of a key; a program's file that is there is meant from the current folder."""
+    return from_here(value) if key == PROGRAM and isinstance(value, str) else value
 
 
 def _seeds(given: Any) -> list[int]:

@@ -41,7 +41,14 @@ def sweep(
         typer.Option(metavar="KEY=VALUES", help="Values of a key: radio.loss=0,0.1,0.3. May be repeated."),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 … N of each combination.")] = 1,
-    program: ProgramOption = None,
+    program: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PROGRAM[,…]",
+            help="Program of every vehicle: hello.py, hello.py:main or package.hello:main. Several as a.py,b.py: "
+            "each is run, and compared with the first on the same seeds.",
+        ),
+    ] = None,
     duration: DurationOption = None,
     overrides: SetOption = None,
     option: ProgramOptionsOption = None,
@@ -70,21 +77,25 @@ def sweep(
     from emulator.cells.executors import open_executor
     from emulator.cells.sweep import (
         NETWORK_SEED,
-        PAGE,
-        TABLE,
         SweepPlan,
         default_folder,
         missing_cells,
         parse_shard,
         write_sweep,
     )
+    from emulator.records.studies import SWEEP_PAGE, SWEEP_TABLE
+    from emulator.report.sweep_page import PROGRAM, too_few
 
     with one_line_errors():
+        if program is not None and "," in program:
+            vary, program = [f"{PROGRAM}={program}", *(vary or ())], None
         plain = load(scenario, overrides, program, Pacing.LOCKSTEP, None, duration, option, checks)
         keeps_network = any(each.partition("=")[0].strip() == NETWORK_SEED for each in overrides or ())
         plan = SweepPlan.of(plain, _all_varied(vary or ()), range(1, seeds + 1), keeps_network)
         cells = plan.cells if shard is None else plan.shard(*parse_shard(shard))
         folder = out or default_folder(plan)
+        if note := too_few(seeds):
+            tell(note)
         try:
             with open_executor(executor) as pool:
                 run_cells(cells, folder, title="sweep", executor=pool, jobs=jobs)
@@ -99,8 +110,8 @@ def sweep(
         verdicts = table["verdict"].to_pylist()
         counts = ", ".join(f"{verdicts.count(name)} {name}" for name in sorted(set(verdicts)))
         SafeConsole().print(f"{len(table)} runs: {counts}", highlight=False)
-        print(folder / TABLE)
-        print(folder / PAGE)
+        print(folder / SWEEP_TABLE)
+        print(folder / SWEEP_PAGE)
 
 
 def _all_varied(texts: Sequence[str]) -> dict[str, list[object]]:

@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 
 from emulator.faults.plan import FaultPlan, Nodes, PlannedFault, swizzle_times_ns
 from emulator.radio.dot11p import airtimes_ns
-from emulator.radio.outcomes import Stage, decided_at
+from emulator.radio.outcomes import Outcome, Stage, decided_at
 from emulator.radio.topology import connectivity_of
 from emulator.radio.trace import ACKNOWLEDGED, LATE
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events
-from emulator.records.metrics import rows_of
 from emulator.records.period_figures import ProgramFigures, figures_if_here
 from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
@@ -42,7 +41,7 @@ from emulator.records.run_folder import (
     is_run_folder,
     not_finished,
 )
-from emulator.records.run_tables import VALUES_AS_LIST, StatesReader, TableFile, TraceReader, open_table
+from emulator.records.run_tables import VALUES_AS_LIST, open_table
 from emulator.records.tables import (
     BUSY,
     METRICS,
@@ -311,6 +310,15 @@ class RecordedRun:
         return np.asarray(self.trace["payload_digest"].to_numpy(), dtype=np.uint64)
 
     @cached_property
+    def outcome(self) -> IntArray:
+        """Number of each row's outcome. Raises VnetError for one that there is not."""
+        code, known = self._outcome
+        number = {each.name: each.value for each in Outcome}
+        if strange := [name for name in known[:-1] if name not in number]:
+            raise VnetError(f"outcome {strange[0]!r} in the trace: there is no such outcome")
+        return np.array([*(number[str(name)] for name in known[:-1]), Outcome.pending], dtype=np.int64)[code]
+
+    @cached_property
     def arrived(self) -> Mask:
         """Mask of the rows whose frame came as far as its receiver."""
         return self.outcome_is(*ARRIVED)
@@ -371,7 +379,8 @@ class RecordedRun:
     # The states, as arrays over (period, node).
 
     @cached_property
-    def _place(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def place(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Period and number of the node of each row of the states."""
         period = np.asarray(self.states["period"].to_numpy(), dtype=np.intp)
         if len(period) and not 0 <= period.min() <= period.max() < len(period):
             raise VnetError(f"states: periods {period.min()} to {period.max()} in {len(period)} rows")
@@ -383,7 +392,7 @@ class RecordedRun:
     @cached_property
     def periods(self) -> int:
         """Number of periods that were kept."""
-        return int(self._place[0].max(initial=-1)) + 1
+        return int(self.place[0].max(initial=-1)) + 1
 
     def vectors(self, name: str) -> Array:
         """A column of points of the states (periods, N, 2); NaN where there is none."""
@@ -396,7 +405,7 @@ class RecordedRun:
     def _spread(self, column: pa.Array, size: int) -> Array:
         spread = np.full((self.periods, len(self.node_ids), size), np.nan)
         there = np.asarray(column.is_valid())
-        period, node = self._place
+        period, node = self.place
         flat = np.asarray(column.drop_null().flatten().to_numpy(zero_copy_only=False), dtype=float)
         spread[period[there], node[there]] = flat.reshape(-1, size)
         return spread
@@ -411,7 +420,7 @@ class RecordedRun:
     def scalars(self, name: str) -> Array:
         """A column of numbers of the states (periods, N); NaN where there is none."""
         spread = np.full((self.periods, len(self.node_ids)), np.nan)
-        spread[self._place] = numbers_of(self.states[name])
+        spread[self.place] = numbers_of(self.states[name])
         return spread
 
     @property
@@ -444,12 +453,17 @@ class RecordedRun:
         for name in self.reported_names:
             something |= np.asarray(self.states[name].combine_chunks().is_valid())
         reported = np.zeros((self.periods, len(self.node_ids)), dtype=bool)
-        reported[self._place] = something
+        reported[self.place] = something
         return reported
 
     def period_starts_ns(self) -> IntArray:
         """Instant at which each period starts."""
         return np.arange(self.periods, dtype=np.int64) * self.scenario.period_ns
+
+    @property
+    def times_s(self) -> Array:
+        """Start of each period in s."""
+        return self.period_starts_ns() / NS_PER_S
 
     # Events, and who was up when.
 
@@ -738,25 +752,6 @@ class OpenedRun(RecordedRun):
         """Payloads of frames; None where the run has kept none."""
         table = self.table(PAYLOADS)
         return None if table is None else KeptPayloads(table)
-
-    # Tables a piece at a time.
-
-    def trace_reader(self, number: Mapping[str, int]) -> TraceReader:
-        """The trace forward in time; `number` gives each node's."""
-        return TraceReader(self.folder / TRACE.file, number)
-
-    def states_reader(self, number: Mapping[str, int]) -> StatesReader:
-        """The states period by period; `number` gives each node's."""
-        return StatesReader(self.folder / STATES.file, number, self.scenario.period_ns, self.declared)
-
-    def figures(self) -> list[Any]:
-        """The rows of the metrics. Raises VnetError unless there is one for each period in turn."""
-        file = TableFile(self.folder / METRICS.file, list(METRICS.columns))
-        file.want([name for name in file.schema.names if name not in METRICS.columns])
-        figures = [row for piece in file.pieces() for row in rows_of(piece)]
-        if [row.period for row in figures] != list(range(len(figures))):
-            raise file.error("its rows are not those of one period after the other")
-        return figures
 
     # What lies in the folder.
 

@@ -177,7 +177,7 @@ class Run:
     @property
     def times_s(self) -> Array:
         """Starts (periods,) in s of the periods that the run completed."""
-        return self._recorded.period_starts_ns() / NS_PER_S
+        return self._recorded.times_s
 
     @property
     def last_fault_s(self) -> float:

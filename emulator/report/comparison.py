@@ -306,7 +306,7 @@ def _spans(comparison: Comparison) -> tuple[list[Span], str]:
 
 def _own_names(comparison: Comparison) -> list[str]:
     """The names of numbers that programs of either run report."""
-    names = dict.fromkeys(name for source in (comparison.first, comparison.second) for name in source.value_names)
+    names = dict.fromkeys(name for source in (comparison.first, comparison.second) for name in source.drawn_names)
     both = comparison.first, comparison.second
     return [name for name in names if any(is_number(source, name) for source in both)][:MOST_CHARTS]
 

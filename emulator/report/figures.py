@@ -105,8 +105,8 @@ _COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 
 def speeds(source: Source) -> Drawing:
     """Draw the true speeds of driven vehicles against time, with the instants of collisions."""
-    table, units = source.recorded.table(DRIVEN), source.recorded.scenario.roadside
-    nodes = source.recorded.node_ids[: len(source.recorded.node_ids) - len(units)]
+    table, units = source.table(DRIVEN), source.scenario.roadside
+    nodes = source.node_ids[: len(source.node_ids) - len(units)]
     if table is None or not len(table) or not nodes:
         raise NothingToShow("no program drives")
     time_s, speed = of_vehicles(table, "speed_m_s", len(nodes))
@@ -114,7 +114,7 @@ def speeds(source: Source) -> Drawing:
     styles = [(_COLOURS[i % len(_COLOURS)], DASHES[i // len(_COLOURS) % len(DASHES)]) for i in range(len(shown))]
     lines = [Line(nodes[n], time_s, speed[:, n], *style) for n, style in zip(shown, styles, strict=True)]
     made = time_figure(lines, "speed (m/s)", source.end_s, source.spans, linear=True)
-    collisions = source.recorded.event(EventKind.collision)
+    collisions = source.event(EventKind.collision)
     for event in collisions:
         made.axes.axvline(event.time_ns / 1e9, color=GREY, linewidth=0.8, zorder=0.8)
     some = f"{len(shown)} of {len(nodes)} vehicles" if len(shown) < len(nodes) else "All vehicles"

@@ -1,4 +1,4 @@
-"""`runs/index.html`: all runs of a folder, the newest first, unfinished and broken ones included."""
+"""`runs/index.html`: all runs of a folder, the newest first, unfinished and broken ones included; its studies."""
 
 from __future__ import annotations
 
@@ -13,9 +13,16 @@ from typing import Any
 from urllib.parse import quote
 
 from emulator.pages.page import put_page, render
-from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE, is_run_folder
+from emulator.records.studies import (
+    CAMPAIGN_FILE,
+    CAMPAIGN_PAGE,
+    SWEEP_PAGE,
+    SWEEP_TABLE,
+    read_campaign,
+    read_sweep,
+)
 from emulator.records.verdicts import Record
 from vnet.errors import VnetError, first_names
 
@@ -68,26 +75,57 @@ def index_page(folder: Path) -> str:
         name=folder.resolve().name,
         columns=titles | {column.title: column.kind for column in numbers} | {"files": "less"},
         entries=[_row(entry, entry.folder.resolve() == latest, numbers) for entry in entries],
-        campaigns=sorted(_campaigns(folder), key=lambda campaign: campaign["when"], reverse=True),
+        studies={
+            ("Campaigns", "campaign", "failed", "faults"): _studies(
+                folder, CAMPAIGN_FILE, CAMPAIGN_PAGE, _campaign
+            ),
+            ("Sweeps", "sweep", "not valid", "varied"): _studies(folder, SWEEP_TABLE, SWEEP_PAGE, _sweep),
+        },
     )
 
 
-def _campaigns(folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the campaigns in a folder."""
-    for path in sorted(each.parent for each in folder.glob(f"*/{CAMPAIGN_FILE}")):
-        row: dict[str, Any] = {"name": path.name, "problem": "", "runs": "–", "failed": "", "kinds": ""}
+@dataclass(frozen=True)
+class Study:
+    """A campaign or a sweep in a folder: a row of the list."""
+
+    name: str
+    link: str
+    when: datetime
+    runs: str = "–"
+    failed: int | str = ""
+    content: str = ""
+    """Kinds of faults, or varied keys."""
+    problem: str = ""
+
+
+def _campaign(folder: Path) -> dict[str, Any]:
+    record = read_campaign(folder)
+    done = len(record.results)
+    runs = str(done) if done == record.runs else f"{done} of {record.runs}"
+    return {"runs": runs, "failed": record.failed, "content": first_names(record.kinds, 4, with_total=True)}
+
+
+def _sweep(folder: Path) -> dict[str, Any]:
+    record = read_sweep(folder)
+    content = first_names(record.varied, 4, with_total=True)
+    return {"runs": str(record.runs), "failed": record.not_valid, "content": content}
+
+
+def _studies(folder: Path, file: str, page: str, read: Callable[[Path], dict[str, Any]]) -> list[Study]:
+    """Return the studies in a folder that have this file, the newest first."""
+    found = []
+    for path in (each.parent for each in folder.glob(f"*/{file}")):
         try:
-            row["when"] = datetime.fromtimestamp((path / CAMPAIGN_FILE).stat().st_mtime).astimezone()
-            record = read_campaign(path)
-            done = len(record.results)
-            row["runs"] = str(done) if done == record.runs else f"{done} of {record.runs}"
-            row["failed"] = record.failed
-            row["kinds"] = first_names(record.kinds, 4, with_total=True) or "none"
-        except VnetError as error:
-            row["problem"] = str(error).removeprefix(f"{path}/")
+            when = datetime.fromtimestamp((path / file).stat().st_mtime).astimezone()
         except OSError:
             continue  # it has just been removed
-        yield row | {"link": _link(path, CAMPAIGN_PAGE if (path / CAMPAIGN_PAGE).is_file() else "")}
+        try:
+            values = read(path)
+        except VnetError as error:
+            values = {"problem": str(error).removeprefix(f"{path}/")}
+        link = _link(path, page if (path / page).is_file() else "")
+        found.append(Study(path.name, link, when, **values))
+    return sorted(found, key=lambda study: (study.when, study.name), reverse=True)
 
 
 def _entries(folder: Path) -> Iterator[Entry]:

@@ -58,7 +58,7 @@ KILOMETRES_FROM_M = 3000.0
 def map_charts(source: Source) -> Drawers:
     """Return title and drawing of the map, and of a map for each value that programs report, by id."""
     drawers: Drawers = {"map": ("Map", partial(_network, source))}
-    names = [name for name in source.value_names if not is_text(source.recorded.states.schema.field(name).type)]
+    names = [name for name in source.drawn_names if not is_text(source.states.schema.field(name).type)]
     for number, name in enumerate(names[:MOST_COLOURED]):
         drawers[f"map-{number}"] = (f"Map: {title_of(name)}", partial(_coloured, source, name))
     return drawers
@@ -68,7 +68,7 @@ def _network(source: Source) -> Drawing:
     """Draw roads, vehicles, and trajectories where vehicles drive, else the links that delivered frames."""
     made, scale = _frame(source, 0)
     position_m = _last_positions(source)
-    if source.recorded.moves:
+    if source.moves:
         shown = _draw_trajectories(made, source, scale)
         text = f"{_ground(source)} Lines: the ways of {shown}; points: where they were last."
     else:
@@ -82,13 +82,13 @@ def _network(source: Source) -> Drawing:
         made.axes.plot(*(position_m[-len(units) :] * scale).T, **UNIT)
         text += " Squares: roadside units."
     if len(position_m) <= MOST_NAMED:
-        text += _draw_names(made, source.recorded.node_ids, position_m * scale)
+        text += _draw_names(made, source.node_ids, position_m * scale)
     return Drawing(made, text)
 
 
 def _coloured(source: Source, name: str) -> Drawing:
     """Draw each vehicle by the last value that it reported."""
-    last = _last_values(source.values_of(name))
+    last = _last_values(source.value(name))
     known = np.isfinite(last)
     if len(set(last[known].tolist())) == 1:
         raise NothingToShow("all vehicles ended with the same value")
@@ -139,7 +139,7 @@ def classes(value: Array, is_boolean: bool = False) -> tuple[NDArray[np.intp], l
 
 def _frame(source: Source, legend_rows: int) -> tuple[Canvas, float]:
     """Make axes of equal scale around all vehicles, with the roads; returns also the axes' units a metre."""
-    world = source.recorded.world
+    world = source.world
     low, high = world.area_m
     centre, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.08, 25.0)
     height_px = float(np.clip(INNER_PX * half[1] / half[0], LEAST_PX, MOST_PX))
@@ -188,7 +188,7 @@ def _draw_buildings(made: Canvas, buildings: Buildings, scale: float) -> None:
 
 def _ground(source: Source) -> str:
     """Return what the grey of a map is, in words."""
-    buildings = source.recorded.world.buildings
+    buildings = source.world.buildings
     return "Grey lines: roads; grey areas: buildings." if buildings is not None else "Grey: roads."
 
 
@@ -229,15 +229,14 @@ def _draw_names(made: Canvas, node_ids: Sequence[str], position: Array) -> str:
 
 def _draw_links(made: Canvas, source: Source, scale: float) -> str:
     """Draw the links on which frames were delivered; returns what is drawn, in words."""
-    recorded = source.recorded
-    if not len(recorded.trace):
+    if not len(source.trace):
         return "no link delivered a frame"
-    count = len(recorded.node_ids)
-    good = recorded.outcome_is("delivered")
-    one, other = recorded.sender[good], recorded.receiver[good]
+    count = len(source.node_ids)
+    good = source.outcome_is("delivered")
+    one, other = source.sender[good], source.receiver[good]
     pair = np.unique(np.minimum(one, other) * count + np.maximum(one, other))
     shown = pair[:: max(1, -(-len(pair) // MOST_LINKS))]
-    position_m = recorded.places.position_m(0)
+    position_m = source.places.position_m(0)
     ends = np.stack([position_m[shown // count], position_m[shown % count]], axis=1)
     _draw_lines(made, ends * scale, SKY, float(np.clip(30 / max(len(shown), 1), 0.12, 0.8)), 1.0)
     part = f"{len(shown):,} of the " if len(shown) < len(pair) else "the "
@@ -246,7 +245,7 @@ def _draw_links(made: Canvas, source: Source, scale: float) -> str:
 
 def _draw_trajectories(made: Canvas, source: Source, scale: float) -> str:
     """Draw the ways of the vehicles; returns what is drawn, in words."""
-    course_m = source.recorded.vectors("position_m")
+    course_m = source.vectors("position_m")
     periods, count, _ = course_m.shape
     chosen = np.linspace(0, periods - 1, min(periods, POINTS_A_TRAJECTORY)).astype(int)
     vehicles = np.arange(count)[:: max(1, -(-count // MOST_TRAJECTORIES))]
@@ -260,16 +259,16 @@ def _draw_trajectories(made: Canvas, source: Source, scale: float) -> str:
 
 def _last_positions(source: Source) -> Array:
     """Return where each vehicle was last (N, 2); NaN of one that never was there."""
-    if not source.recorded.moves:
-        return source.recorded.places.position_m(0)
-    return np.stack([_last_values(source.recorded.vectors("position_m")[..., axis]) for axis in (0, 1)], axis=1)
+    if not source.moves:
+        return source.places.position_m(0)
+    return np.stack([_last_values(source.vectors("position_m")[..., axis]) for axis in (0, 1)], axis=1)
 
 
 def _background_m(source: Source) -> Array:
     """Return where vehicles without programs were in the run's last period (k, 2)."""
-    period_ns = source.recorded.scenario.period_ns
-    last_ns = (source.recorded.closed_ns - 1) // period_ns * period_ns
-    positions_m = positions_by_time(source.recorded.table(BACKGROUND))
+    period_ns = source.scenario.period_ns
+    last_ns = (source.closed_ns - 1) // period_ns * period_ns
+    positions_m = positions_by_time(source.table(BACKGROUND))
     ends_ns = [time_ns for time_ns in positions_m if time_ns >= last_ns]
     return positions_m[ends_ns[-1]] if ends_ns else np.zeros((0, 2))
 

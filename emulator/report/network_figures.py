@@ -38,22 +38,21 @@ _NAMED_VALUES = pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()
 
 def links(source: Source) -> Drawing:
     """Draw the packet delivery ratio of the links against their length: that of broadcasts."""
-    recorded = source.recorded
-    count = len(recorded.node_ids)
-    cast = np.flatnonzero(recorded.attempt == 0)
+    count = len(source.node_ids)
+    cast = np.flatnonzero(source.attempt == 0)
     if not len(cast):
         raise NothingToShow("no broadcast was sent to anybody in range")
-    sender, receiver = recorded.sender[cast], recorded.receiver[cast]
+    sender, receiver = source.sender[cast], source.receiver[cast]
     link = sender * count + receiver
     rows = np.bincount(link, minlength=count * count)
     used = np.flatnonzero(rows)
-    delivered = np.bincount(link, weights=recorded.outcome_is("delivered")[cast], minlength=count * count)
+    delivered = np.bincount(link, weights=source.outcome_is("delivered")[cast], minlength=count * count)
     share = 100 * delivered[used] / rows[used]
-    apart_m = recorded.places.pair_distances_m(sender, receiver, recorded.sent_ns[cast])
+    apart_m = source.places.pair_distances_m(sender, receiver, source.sent_ns[cast])
     known = np.isfinite(apart_m)
     total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
     distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
-    physical, binned = source.scenario.radio.is_physical, recorded.moves or source.scenario.radio.is_physical
+    physical, binned = source.scenario.radio.is_physical, source.moves or source.scenario.radio.is_physical
     labels = 1 + (len(used) > MOST_LINKS) + (not physical) + binned
     made = canvas("distance (km)", "delivery ratio (%)", legend_rows=int(np.ceil(labels / 3)))
     if len(used) <= MOST_LINKS:
@@ -63,7 +62,7 @@ def links(source: Source) -> Drawing:
         _draw_bins(made, distance_km, share)
     each = f"each of {len(used):,} links" if len(used) > 1 else "the one link"
     text = f"Packet delivery ratio of {each}, from one vehicle to another."
-    if len(cast) < len(recorded.trace):
+    if len(cast) < len(source.trace):
         text += " Frames to one vehicle are not counted."
     lowest = float(share.min())
     if not physical:
@@ -119,17 +118,16 @@ def _draw_frames(made: Canvas, bins: pa.Table) -> tuple[float, float]:
 def _why_less(source: Source) -> str:
     """The outcomes besides `lost` that lower a link's delivery ratio."""
     others = (outcome.name for outcome in DRAWN if outcome not in (Outcome.delivered, Outcome.lost))
-    cast = source.recorded.attempt == 0
-    names = [name for name in others if (source.recorded.outcome_is(name) & cast).any()]
+    cast = source.attempt == 0
+    names = [name for name in others if (source.outcome_is(name) & cast).any()]
     return f" Links below it had outcomes {', '.join(names)} as well." if names else ""
 
 
 def degrees(source: Source) -> Drawing:
     """Draw the distribution of the vehicles' degrees: how many others each has in range."""
-    recorded = source.recorded
-    if not recorded.node_ids:
+    if not source.node_ids:
         raise VnetError("no period was completed, and no position is known")
-    degree = recorded.places.mean_senders_in_range()
+    degree = source.places.mean_senders_in_range()
     step = int(np.ceil((degree.max() + 1) / 40))
     edges = np.arange(0, degree.max() + step + 1, step) - 0.5
     counts, _ = np.histogram(degree, edges)
@@ -147,15 +145,15 @@ def degrees(source: Source) -> Drawing:
     how = f"within {radio.range_m / 1000:g} km" if radio.links is None else "by the scenario's links"
     if radio.path_loss is not None:
         how = f"with {radio.path_loss.floor_dbm:g} dBm or more on average"
-    if recorded.moves:
+    if source.moves:
         return Drawing(
             made,
             f"Number of vehicles that each can hear, {how}; mean over its time in the network.",
         )
-    start_m = recorded.places.position_m(0)
-    links = component_links(source.scenario, recorded.radio_inputs, start_m)
+    start_m = source.places.position_m(0)
+    links = component_links(source.scenario, source.radio_inputs, start_m)
     parts = int(components(start_m, radio.range_m, links).max()) + 1
-    if recorded.topology_changes:
+    if source.topology_changes:
         how += ", in the mean over the run"
     network = "one component" if parts == 1 else f"{parts} components out of range of each other"
     return Drawing(made, f"Number of vehicles that each can hear, {how}: {network}.")
@@ -163,7 +161,7 @@ def degrees(source: Source) -> Drawing:
 
 def peers(name: str, source: Source) -> Drawing:
     """Draw the matrix of the mean value, between 0 and 1, that vehicles report for each other by this name."""
-    ids = source.recorded.node_ids
+    ids = source.node_ids
     matrix = mean_of_peers(f"{name}.", source)
     if len(ids) > MOST_IN_MATRIX:
         raise VnetError(f"a matrix of {len(ids)} vehicles would not be readable")
@@ -202,18 +200,17 @@ def mean_of_peers(prefix: str, source: Source) -> Array:
 
     Raises VnetError if nobody reported any.
     """
-    recorded = source.recorded
-    count = len(recorded.node_ids)
-    lists = recorded.states["values"].combine_chunks().cast(pa.list_(_NAMED_VALUES))
+    count = len(source.node_ids)
+    lists = source.states["values"].combine_chunks().cast(pa.list_(_NAMED_VALUES))
     row, pair = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
     key, value = pair.field("key"), pair.field("value")
     single = pc.and_(pc.starts_with(key, prefix), pc.equal(pc.list_value_length(value), 1))
     chosen = np.flatnonzero(pc.fill_null(single, False).to_numpy(zero_copy_only=False))
     names = key.take(pa.array(chosen)).dictionary_encode()
-    numbers = [recorded.number.get(name.removeprefix(prefix), -1) for name in names.dictionary.to_pylist()]
+    numbers = [source.number.get(name.removeprefix(prefix), -1) for name in names.dictionary.to_pylist()]
     of = np.array(numbers, dtype=np.intp)[names.indices.to_numpy()]
     weight = pc.list_flatten(value.take(pa.array(chosen))).to_numpy(zero_copy_only=False)
-    node = np.array([recorded.number[node] for node in recorded.states["node"].to_pylist()], dtype=np.intp)
+    node = np.array([source.number[node] for node in source.states["node"].to_pylist()], dtype=np.intp)
     at, fits = node[row[chosen]], (of >= 0) & np.isfinite(weight)
     if not fits.any():
         raise NothingToShow("no program reported any")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+import pyarrow as pa
 from matplotlib.axes import Axes
 
 from emulator.pages.canvas import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, canvas, legend
@@ -27,8 +28,8 @@ Drawers = dict[str, tuple[str, Callable[[], Drawing]]]
 def program_charts(source: Source) -> Drawers:
     """Return title and drawing of each value's chart, by id."""
     drawers: Drawers = {}
-    for number, name in enumerate(source.value_names[:MOST_CHARTS]):
-        kind = source.recorded.states.schema.field(name).type
+    for number, name in enumerate(source.drawn_names[:MOST_CHARTS]):
+        kind = source.states.schema.field(name).type
         draw = partial(_texts if is_text(kind) else _numbers, source, name)
         drawers[f"own-{number}"] = (title_of(name), draw)
     return drawers
@@ -42,8 +43,8 @@ def label_of(name: str) -> str:
 
 def _numbers(source: Source, name: str) -> Drawing:
     """Draw mean and 5 to 95 % over the vehicles, and one vehicle; of a boolean the share that is true."""
-    value = source.values_of(name)
-    time_s = source.period_times_s(len(value))
+    value = source.value(name)
+    time_s = source.times_s
     if np.isfinite(value).any(axis=1).sum() < 2:
         raise NothingToShow("reported in one period only")
     curve = partial(points, time_s, usual=usual_periods(value))
@@ -54,7 +55,7 @@ def _numbers(source: Source, name: str) -> Drawing:
         text = "Share of the vehicles that report it that say true."
         return Drawing(made, text + faults_note(made, source))
     node = int(np.isfinite(value).sum(axis=0).argmax())
-    who = source.recorded.node_ids[node]
+    who = source.node_ids[node]
     several = value.shape[1] > 1
     lines = [Line("mean of the vehicles" if several else who, *curve(_mean(value)), BLUE)]
     if several:
@@ -95,10 +96,10 @@ def _fit(axes: Axes, value: Array) -> None:
 
 def _texts(source: Source, name: str) -> Drawing:
     """Draw the share of the vehicles that report each text."""
-    shares, texts = source.text_shares(name)
+    shares, texts = text_shares(source, name)
     if not texts:
         raise NothingToShow("nothing was reported")
-    time_s = source.period_times_s(len(shares))
+    time_s = source.times_s
     rows = (len(texts[:MOST_TEXTS]) + 2) // 3
     made = canvas(TIME, f"{title_of(name)} (% of vehicles)", rows, source.spans, source.end_s)
     for index, text in enumerate(texts[:MOST_TEXTS]):
@@ -109,16 +110,33 @@ def _texts(source: Source, name: str) -> Drawing:
     return Drawing(made, f"Share of the vehicles that report each text.{more}{faults_note(made, source)}")
 
 
+def text_shares(source: Source, name: str) -> tuple[Array, list[str]]:
+    """Return the shares (periods, texts) of the reporting vehicles that say each text, and the texts.
+
+    The most frequent text comes first.
+    """
+    column = source.states[name].cast(pa.string()).combine_chunks().dictionary_encode()
+    texts = column.dictionary.to_pylist()
+    code = column.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    period = source.states["period"].to_numpy()
+    said = np.zeros((int(period.max(initial=-1)) + 1, len(texts)))
+    np.add.at(said, (period[code >= 0], code[code >= 0]), 1)
+    order = np.argsort(-said.sum(axis=0), kind="stable")
+    total = said.sum(axis=1, keepdims=True)
+    shares = np.where(total > 0, said / np.maximum(total, 1), np.nan)[:, order]
+    return shares, [texts[index] for index in order.tolist()]
+
+
 def mean_over_time(source: Source, name: str) -> tuple[Array, Array]:
     """Return times (n,) in seconds and the mean over the vehicles, of a boolean in per cent, as `points` does."""
-    value = source.values_of(name)
+    value = source.value(name)
     mean = _mean(value) * (100 if source.is_boolean(name) else 1)
-    return points(source.period_times_s(len(value)), mean, usual_periods(value))
+    return points(source.times_s, mean, usual_periods(value))
 
 
 def is_number(source: Source, name: str) -> bool:
     """Return whether a run has numbers or booleans under this name."""
-    return name in source.value_names and not is_text(source.recorded.states.schema.field(name).type)
+    return name in source.drawn_names and not is_text(source.states.schema.field(name).type)
 
 
 def _mean(value: Array) -> Array:

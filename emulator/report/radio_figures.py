@@ -30,7 +30,7 @@ from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.records.radio_metrics import rows_of_pairs, unicast_figures
 from emulator.report.drawing import DASHES, TIME, WIDE_RANGE, Drawing, Line, faults_note, time_figure
-from emulator.report.source import Source
+from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError, printable
 from vnet.types import Array, IntArray
 from vnet.units import NS_PER_S
@@ -42,7 +42,7 @@ MOST_BARS = 10
 
 def in_range(source: Source) -> pa.Table:
     """Return the rows of the trace but those of frames to a vehicle out of range. Raises VnetError without any."""
-    trace = source.recorded.trace
+    trace = source.trace
     trace = trace.filter(pc.not_equal(trace["outcome"].cast(pa.string()), Outcome.out_of_range.name))
     if not len(trace):
         raise VnetError("no frame was sent to anybody in range")
@@ -51,10 +51,10 @@ def in_range(source: Source) -> pa.Table:
 
 def broadcasts(source: Source) -> pa.Table:
     """Return the rows of the trace that the packet delivery ratio counts. Raises VnetError without any."""
-    rows = rows_of_pairs(source.recorded)
+    rows = rows_of_pairs(source)
     if not len(rows):
         raise VnetError("no broadcast was sent to anybody in range")
-    return source.recorded.trace.take(rows)
+    return source.trace.take(rows)
 
 
 def decided(trace: pa.Table) -> tuple[list[str], NDArray[np.intp], IntArray]:
@@ -104,6 +104,10 @@ def outcomes(source: Source) -> Drawing:
 
 def busy(source: Source) -> Drawing:
     """Draw the channel busy ratio of the vehicles."""
+    if source.scenario.radio.mac is None:
+        raise NothingToShow("no MAC configured ([radio.mac])")
+    if not len(source.busy_ratio):
+        raise VnetError("the run was over within the first window")
     percent = 100 * source.busy_ratio
     end_s = np.arange(1, len(percent) + 1) * WINDOW_NS / 1e9
     lines = [
@@ -150,11 +154,10 @@ def _bars(trace: pa.Table) -> list[tuple[str, str, int]]:
 
 def latencies_ms(source: Source) -> Array:
     """Return the latency (k,) of each delivery in ms. Raises VnetError if there is none."""
-    recorded = source.recorded
-    delivered = recorded.outcome_is("delivered")
+    delivered = source.outcome_is("delivered")
     if not delivered.any():
         raise VnetError("nothing was delivered")
-    return np.asarray((recorded.arrival_ns[delivered] - recorded.sent_ns[delivered]) / 1e6)
+    return np.asarray((source.arrival_ns[delivered] - source.sent_ns[delivered]) / 1e6)
 
 
 def latency(source: Source) -> Drawing:
@@ -253,7 +256,7 @@ def radio_section(source: Source) -> RadioSection | str:
         metrics = source.radio
     except VnetError as error:
         return str(error)
-    unicast = unicast_figures(source.recorded)
+    unicast = unicast_figures(source)
     if not metrics.totals["pairs"] and unicast is None:
         return "No frame was sent to anybody in range."
     totals = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
@@ -13,14 +12,12 @@ import pyarrow as pa
 
 from emulator.pages.canvas import Span
 from emulator.records.events import CUTS_RUN, Event, EventKind
-from emulator.records.period_figures import SAME, ProgramFigures, figures_if_here
+from emulator.records.period_figures import SAME, ProgramFigures
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import Reference, reference_of, reference_series
 from emulator.records.reported import reported_figures
 from emulator.records.tables import STATES, TRACE
-from emulator.records.verdicts import Record
-from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError, printable
 from vnet.types import Array
 
@@ -36,62 +33,22 @@ class NothingToShow(VnetError):
     """A run has no data for a figure, as its program or its radio has nothing of the kind: pages say nothing."""
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(OpenedRun):
     """A run as the pages show it. Properties raise VnetError where a file is not there or not vnet's."""
 
-    folder: Path
+    def __init__(self, folder: Path) -> None:
+        """Read the columns that reports need."""
+        super().__init__(folder, TABLES)
 
     @cached_property
-    def recorded(self) -> OpenedRun:
-        """The run, with the columns that reports need."""
-        return RecordedRun.open(self.folder, TABLES)
-
-    @property
     def declared(self) -> ProgramFigures:
-        """The figures that the program declares."""
-        scenario = maybe(lambda: self.scenario)
-        return ProgramFigures() if scenario is None else figures_if_here(scenario.program)
-
-    @property
-    def scenario_text(self) -> str:
-        """The text of scenario.toml."""
-        return self.recorded.scenario_text
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario."""
-        return self.recorded.scenario
-
-    @property
-    def record(self) -> Record:
-        """The contents of verdict.json."""
-        return self.recorded.record
-
-    @property
-    def events(self) -> list[Event]:
-        """The events."""
-        return self.recorded.events
-
-    @property
-    def metrics(self) -> pa.Table:
-        """The metrics."""
-        return self.recorded.metrics
-
-    @cached_property
-    def busy_ratio(self) -> Array:
-        """(windows, N), how busy each vehicle found the medium. Raises VnetError if there is no MAC."""
-        if self.scenario.radio.mac is None:
-            raise NothingToShow("no MAC configured ([radio.mac])")
-        if not len(self.recorded.busy_ratio):
-            raise VnetError("the run was over within the first window")
-        return self.recorded.busy_ratio
+        """The figures that the program declares; none where the scenario cannot be read."""
+        return maybe(lambda: super(Source, self).declared) or ProgramFigures()
 
     @cached_property
     def radio(self) -> RadioMetrics:
         """The radio in figures, without the channel busy ratio where its table cannot be read."""
-        has_busy = maybe(lambda: self.recorded.busy_ratio) is not None
-        return radio_metrics(self.recorded, has_busy=has_busy)
+        return radio_metrics(self, has_busy=maybe(lambda: self.busy_ratio) is not None)
 
     @property
     def reference(self) -> type[Reference]:
@@ -107,38 +64,14 @@ class Source:
     # What programs report by names of their own.
 
     @cached_property
-    def value_names(self) -> list[str]:
+    def drawn_names(self) -> list[str]:
         """Names of the values with a report that can be drawn; none where the states cannot be read."""
-        states = maybe(lambda: self.recorded.states)
+        states = maybe(lambda: self.states)
         return [] if states is None else list(reported_figures(states))
-
-    def values_of(self, name: str) -> Array:
-        """Return a value (periods, N), true as 1; NaN where it was not reported."""
-        return self.recorded.value(name)
 
     def is_boolean(self, name: str) -> bool:
         """Return whether a value is a boolean."""
-        return bool(pa.types.is_boolean(self.recorded.states.schema.field(name).type))
-
-    def period_times_s(self, periods: int) -> Array:
-        """Return the starts of the first so many periods in seconds."""
-        return np.arange(periods) * self.scenario.period_ns / 1e9
-
-    def text_shares(self, name: str) -> tuple[Array, list[str]]:
-        """Return the shares (periods, texts) of the reporting vehicles that say each text, and the texts.
-
-        The most frequent text comes first.
-        """
-        column = self.recorded.states[name].cast(pa.string()).combine_chunks().dictionary_encode()
-        texts = column.dictionary.to_pylist()
-        code = column.indices.fill_null(-1).to_numpy(zero_copy_only=False)
-        period = self.recorded.states["period"].to_numpy()
-        said = np.zeros((int(period.max(initial=-1)) + 1, len(texts)))
-        np.add.at(said, (period[code >= 0], code[code >= 0]), 1)
-        order = np.argsort(-said.sum(axis=0), kind="stable")
-        total = said.sum(axis=1, keepdims=True)
-        shares = np.where(total > 0, said / np.maximum(total, 1), np.nan)[:, order]
-        return shares, [texts[index] for index in order.tolist()]
+        return bool(pa.types.is_boolean(self.states.schema.field(name).type))
 
     # Metrics, events and times, as the figures need them.
 

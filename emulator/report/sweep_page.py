@@ -1,7 +1,11 @@
-"""The page of a sweep: each figure against the varied keys, with 95 % confidence intervals of its mean."""
+"""The page of a sweep: each figure against the varied keys, with 95 % confidence intervals of its mean.
+
+Programs that are varied are compared in pairs: the same seed has drawn the same network, noise and losses for both.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,15 +19,23 @@ from emulator.pages.page import render, table
 from emulator.records.period_figures import KeyFigure, estimates_differ, figures_if_here
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import DASHES, Drawing, draw_charts
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.program import Program
+from emulator.scenario.scenario import Run
+from vnet.counted import counted
 from vnet.units import title_of, unit_of
 
 CONFIDENCE = 0.95
+FEWEST_SEEDS = 5
+"""Seeds from which on an interval says something: with 4 it is 1.6 standard deviations wide, with 2 nine."""
+PROGRAM = "program.entry"
+"""The varied key whose values are compared in pairs, on the same seeds."""
 COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, NAVY, GREY)
 """Colours of the curves; a ninth curve is not drawn."""
 MOST_CHARTS = 24
 ASIDE = 0.012
 """Step between the intervals of two curves, as a share of the axis."""
+PLAIN = (1e-9, 1e9)
+"""Halves of intervals that are written without an exponent."""
 NO_FIGURES = ("seed", "vehicles", "emulated_s", "wall_s", "real_time_factor")
 """Numbers of a row that are no results."""
 Rows = Sequence[Mapping[str, Any]]
@@ -38,7 +50,14 @@ class Mean:
     count: int
 
     def __str__(self) -> str:
-        return f"{self.value:.4g}" if self.half is None else f"{self.value:.4g} ± {self.half:.2g}"
+        """Two significant digits of the interval's half, and the mean to the same place."""
+        if self.half is None:
+            return f"{self.value:.4g}"
+        half = float(f"{self.half:.1e}")
+        if not PLAIN[0] <= half < PLAIN[1]:
+            return f"{self.value:.4g} ± {half:.2g}"
+        place = 1 - math.floor(math.log10(half))
+        return " ± ".join(f"{round(number, place) + 0.0:.{max(0, place)}f}" for number in (self.value, half))
 
 
 def mean_of(values: Sequence[float]) -> Mean:
@@ -52,9 +71,16 @@ def mean_of(values: Sequence[float]) -> Mean:
     return Mean(float(np.mean(values)), half, count)
 
 
-def sweep_page(scenario: Scenario, rows: Rows, varied: Sequence[str]) -> str:
-    """Return the page of the rows of a sweep over the keys `varied`."""
-    key = figures_if_here(scenario.program).key
+def too_few(seeds: int) -> str:
+    """Return what is to be said of so few seeds; "" for enough."""
+    if seeds >= FEWEST_SEEDS:
+        return ""
+    return f"{counted(seeds, 'seed')}: too few for a confidence interval; {FEWEST_SEEDS} or more are needed"
+
+
+def sweep_page(run: Run, programs: Sequence[Program], rows: Rows, varied: Sequence[str]) -> str:
+    """Return the page of the rows of a sweep of these programs over the keys `varied`."""
+    key = tuple(each for program in programs for each in figures_if_here(program).key)
     names = figures_of(rows, varied, key)
     shown = _changing(rows, names)
     titles = {name: heading(name, key) for name in (shown[:MOST_CHARTS] if varied else names)}
@@ -67,17 +93,19 @@ def sweep_page(scenario: Scenario, rows: Rows, varied: Sequence[str]) -> str:
     seeds = len({row["seed"] for row in rows})
     return render(
         "sweep.html.j2",
-        title=f"Sweep {scenario.run.name}",
+        title=f"Sweep {run.name}",
         facts=[
-            f"{len(rows)} run{'s' if len(rows) != 1 else ''} of {scenario.run.duration_s:g} s of emulated time",
-            f"{seeds} seed{'s' if seeds != 1 else ''} for each combination of values",
-            scenario.program.entry,
+            f"{counted(len(rows), 'run')} of {run.duration_s:g} s of emulated time",
+            f"{counted(seeds, 'seed')} for each combination of values",
+            ", ".join(program.entry for program in programs),
         ],
+        too_few=too_few(seeds),
         verdicts=[(Verdict(name), count) for name, count in sorted(counts.items())],
         charts=charts,
         missing=missing,
         left_out=len(shown) - len(charts) if varied else 0,
         means=table(_means(rows, varied, titles)),
+        differences=table(differences(rows, varied, titles)),
         failed=table(_failed(rows, varied)),
     )
 
@@ -131,6 +159,29 @@ def _means(rows: Rows, varied: Sequence[str], titles: Mapping[str, str]) -> list
         | {title: "–" if (mean := _mean(group, name)) is None else str(mean) for name, title in titles.items()}
         for values, group in _groups(rows, varied).items()
     ]
+
+
+def differences(rows: Rows, varied: Sequence[str], titles: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the mean differences of each program's figures from the first program's, over pairs of equal seeds."""
+    if PROGRAM not in varied:
+        return []
+    others = [key for key in varied if key != PROGRAM]
+    found = []
+    for values, group in _groups(rows, others).items():
+        ((first,), base), *later = _groups(group, [PROGRAM]).items()
+        of_seed = {row["seed"]: row for row in base}
+        for (program,), theirs in later:
+            pairs = [(row, of_seed[row["seed"]]) for row in theirs if row["seed"] in of_seed]
+            row = dict(zip(others, values, strict=True)) | {"programs": f"{program} − {first}", "pairs": len(pairs)}
+            found.append(row | {title: _difference(pairs, name) for name, title in titles.items()})
+    return found
+
+
+def _difference(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], name: str) -> str:
+    values = [
+        one[name] - two[name] for one, two in pairs if _is_number(one.get(name)) and _is_number(two.get(name))
+    ]
+    return str(mean_of(values)) if values else ""
 
 
 def _failed(rows: Rows, varied: Sequence[str]) -> list[dict[str, Any]]:

@@ -105,34 +105,33 @@ def timeline(source: Source, most: int = MOST_RECEPTIONS, at_us: int | None = No
 
     It begins at the first failure, else at `at_us`, else at the first fault.
     """
-    recorded = source.recorded
-    if maybe(lambda: recorded.trace) is None or maybe(lambda: recorded.node_ids) is None or not recorded.node_ids:
+    if maybe(lambda: source.trace) is None or maybe(lambda: source.node_ids) is None or not source.node_ids:
         return None
     events = maybe(lambda: source.events) or []
     end_us = round(source.end_s * 1e6)
-    all_marks = marks_of(events, recorded.number)
-    marks, bars = _first_marks(all_marks), bars_of(events, recorded.number, end_us)
+    all_marks = marks_of(events, source.number)
+    marks, bars = _first_marks(all_marks), bars_of(events, source.number, end_us)
     sent_us = _on_air_us(source)
-    frames, points = _frames(recorded), points_of(all_marks, bars)
+    frames, points = _frames(source), points_of(all_marks, bars)
     kept, how = choose(frames, sent_us[frames.first], points, most)
     rows = np.flatnonzero(kept[frames.of_row])
-    rows = rows[np.lexsort((recorded.receiver[rows], recorded.emission[rows], sent_us[rows]))]
-    view = first_view(_first_point(marks, bars, at_us), end_us, _usual_delay_us(recorded, sent_us))
+    rows = rows[np.lexsort((source.receiver[rows], source.emission[rows], sent_us[rows]))]
+    view = first_view(_first_point(marks, bars, at_us), end_us, _usual_delay_us(source, sent_us))
     data = {
         "end": end_us,
         "view": view,
         "lanes": MOST_LANES,
-        "nodes": [printable(node) for node in recorded.node_ids],
-        "first": _first_lanes(recorded, marks, bars),
+        "nodes": [printable(node) for node in source.node_ids],
+        "first": _first_lanes(source, marks, bars),
         "marks": [[mark.time_us, mark.node, mark.kind, mark.text] for mark in marks],
         "bars": [[bar.label, bar.start_us, bar.end_us, list(bar.nodes)] for bar in bars],
-        "down": _down(recorded, end_us),
-        **_packed(recorded, rows, sent_us),
+        "down": _down(source, end_us),
+        **_packed(source, rows, sent_us),
     }
-    note = _note(len(rows), len(recorded.trace), how, points)
+    note = _note(len(rows), len(source.trace), how, points)
     if len(marks) < len(all_marks):
         note += f" {len(marks):,} of {len(all_marks):,} marks are shown, failures first."
-    counts = Counter(recorded.trace["outcome"].cast(pa.string()).to_pylist())
+    counts = Counter(source.trace["outcome"].cast(pa.string()).to_pylist())
     of_kind = Counter(mark.kind for mark in marks)
     return Timeline(
         data=json.dumps(data, separators=(",", ":")),
@@ -261,7 +260,7 @@ def _distance_us(time_us: IntArray, points_us: IntArray) -> IntArray:
 
 def _on_air_us(source: Source) -> IntArray:
     """Return when each row's frame was sent: with a MAC when it was on the air, if it ever was."""
-    sent_ns = source.recorded.sent_ns
+    sent_ns = source.sent_ns
     if source.scenario.radio.mac is not None:
         on_air_ns = RecordedRun.open(source.folder, {TRACE: ("on_air_ns",)}).on_air_ns
         sent_ns = np.where(on_air_ns >= 0, on_air_ns, sent_ns)

@@ -47,7 +47,7 @@ def write_report(folder: Path) -> Path:
     Raises VnetError if `folder` is not a run's, is of a later format, or cannot be written.
     """
     source = Source(folder)
-    source.recorded.refuse_later_format()
+    source.refuse_later_format()
     known = [maybe(read) is not None for read in (lambda: source.scenario_text, lambda: source.record)]
     if not any(known):
         raise VnetError(f"{folder}: not a run's folder: neither scenario.toml nor verdict.json can be read")
@@ -96,7 +96,7 @@ def _facts(source: Source, record: Record | None) -> Iterator[str]:
         yield {"lockstep": "in lockstep", "realtime": "in real time"}[scenario.run.pacing]
         yield scenario.program.entry
         yield f"seed {scenario.run.seed}"
-    yield f"{source.recorded.when:%Y-%m-%d %H:%M}"
+    yield f"{source.when:%Y-%m-%d %H:%M}"
 
 
 def _note(source: Source, record: Record | None) -> str:
@@ -104,7 +104,7 @@ def _note(source: Source, record: Record | None) -> str:
     if record is not None:
         cut = source.cut
         return f"The run was {cut.kind} at {cut.time_ns / 1e9:.1f} s." if cut else ""
-    if source.recorded.has_record:  # the checks' section says why
+    if source.has_record:  # the checks' section says why
         return "The verdict of this run cannot be read. Its other files:"
     return "This run has no verdict: it is still going on, or it was ended from outside. Its other files:"
 

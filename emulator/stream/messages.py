@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from emulator.records.events import Event
 from emulator.records.period_figures import VECTORS, ProgramFigures
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import MOST_DOTTED, figures_among
-from emulator.records.run_tables import Beliefs
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
 from vnet.errors import printable
@@ -82,6 +82,21 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
         "duration_ns": scenario.duration_ns,
         "scenario": scenario_text,
     }
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """Reports of one period: arrays (n, size) of the states' columns by name, NaN where a node reported nothing.
+
+    By column and node, the numbers of `lists` of any length. By name and node, the values (n,) that it has for its
+    `peers`. By name, the figures (n,) of programs' own, true as 1, and texts (n), "" where a node reported none.
+    """
+
+    columns: Mapping[str, Array]
+    lists: Mapping[str, Mapping[str, ArrayLike]]
+    peers: Mapping[str, Mapping[str, Array]]
+    values: Mapping[str, Array]
+    texts: Mapping[str, list[str]]
 
 
 def beliefs_of(number: Mapping[str, int], reports: Iterable[Report], declared: ProgramFigures) -> Beliefs:

@@ -35,8 +35,8 @@ from rich.text import Text
 from emulator.checks.own import is_broken
 from emulator.pages.page import put_page, render, table
 from emulator.records.atomic import write_atomically
-from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
+from emulator.records.studies import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.verdicts import Verdict
 from emulator.report.index import write_index
 from emulator.report.source import Source, maybe

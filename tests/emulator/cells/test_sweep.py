@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
@@ -14,7 +15,8 @@ from emulator.cells import sweep as subject
 from emulator.cells.cells import WALL_CLOCK, Cell, compute, judged_figures
 from emulator.cells.sweep import SweepPlan, parse_shard
 from emulator.cli.studies import sweep as command
-from emulator.report.sweep_page import Mean, figures_of, heading, mean_of, sweep_page
+from emulator.report.index import write_index
+from emulator.report.sweep_page import Mean, differences, figures_of, heading, mean_of, sweep_page, too_few
 from emulator.scenario.loading import scenario_of
 from tests.support.cells import compute_here
 from tests.support.cli import command_app
@@ -153,7 +155,89 @@ def test_confidence_intervals_are_those_of_student() -> None:
     assert mean_of([2.0]) == Mean(2.0, None, 1)
     three = mean_of([1.0, 2.0, 3.0])
     assert three.value == 2.0 and three.half == pytest.approx(4.302653 / 3**0.5)
-    assert str(three) == "2 ± 2.5" and str(mean_of([2.0])) == "2"
+
+
+@pytest.mark.parametrize(
+    ("mean", "text"),
+    [
+        (Mean(2.0, None, 1), "2"),
+        (Mean(2.0, 2.4842, 3), "2.0 ± 2.5"),
+        (Mean(0.98765, 0.012345, 5), "0.988 ± 0.012"),
+        (Mean(0.98765, 0.0996, 5), "0.99 ± 0.10"),
+        (Mean(12345.6, 678.9, 5), "12350 ± 680"),
+        (Mean(-0.5, 13.0, 5), "0 ± 13"),
+        (Mean(3.0, 0.0, 5), "3 ± 0"),
+        (Mean(2.0, 1.24e-16, 5), "2 ± 1.2e-16"),
+        (Mean(float("nan"), float("nan"), 5), "nan ± nan"),
+    ],
+)
+def test_a_mean_is_rounded_by_its_interval(mean: Mean, text: str) -> None:
+    assert str(mean) == text
+
+
+def test_programs_are_compared_on_the_same_seeds(tmp_path: Path, in_this_process: list[Cell]) -> None:
+    (tmp_path / "tiny.toml").write_text("[run]\nname = 'tiny'\nduration_s = 0.4\n[network]\nvehicles = 3\n")
+    for name, share in {"a": 1, "b": 3}.items():
+        (tmp_path / f"{name}.py").write_text(
+            "async def main(node):\n    async for fix in node.gnss:\n"
+            f"        node.report(east_m={share} + fix.position_m[0])\n"
+        )
+    files = [str(tmp_path / name) for name in ("a.py", "b.py")]
+    given = [
+        str(tmp_path / "tiny.toml"),
+        "--program",
+        ",".join(files),
+        "--seeds",
+        "2",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    result = CliRunner().invoke(command_app(command), given)
+    assert result.exit_code == 0, result.output
+    assert "note: 2 seeds: too few for a confidence interval" in result.output
+    rows = pq.read_table(tmp_path / "o" / "sweep.parquet").to_pylist()
+    assert [(row["program.entry"], row["seed"]) for row in rows] == [(file, n) for file in files for n in (1, 2)]
+    assert len({cell.scenario.program.entry for cell in in_this_process}) == 2
+    told = differences(rows, ["program.entry"], {"east_m": "east"})
+    assert told == [{"programs": f"{files[1]} − {files[0]}", "pairs": 2, "east": told[0]["east"]}]
+    assert told[0]["east"].startswith("2 ±"), "receivers' noise is the same on both sides"
+    assert 'id="differences"' in (tmp_path / "o" / "sweep.html").read_text()
+
+
+def test_differences_are_of_pairs_in_each_combination() -> None:
+    rows = [
+        {"loss": loss, "program.entry": program, "seed": seed, "pdr": pdr}
+        for loss in (0, 1)
+        for program, of_seed in {"a": (1.0, 2.0, 3.0), "b": (1.5, 2.5 + loss, None), "c": (1.0, 2.0, 3.0)}.items()
+        for seed, pdr in enumerate(of_seed)
+    ]
+    del rows[-1]  # a pair of which one is missing
+    names = ["loss", "program.entry"]
+    assert differences(rows, names, {"pdr": "PDR"}) == [
+        {"loss": 0, "programs": "b − a", "pairs": 3, "PDR": "0.5 ± 0"},
+        {"loss": 0, "programs": "c − a", "pairs": 3, "PDR": "0 ± 0"},
+        {"loss": 1, "programs": "b − a", "pairs": 3, "PDR": "1.0 ± 6.4"},
+        {"loss": 1, "programs": "c − a", "pairs": 2, "PDR": "0 ± 0"},
+    ]
+    assert differences(rows, ["loss"], {"pdr": "PDR"}) == []
+
+
+def test_few_seeds_are_told() -> None:
+    assert too_few(1).startswith("1 seed: ") and too_few(4) and not too_few(5)
+
+
+def test_the_list_of_runs_has_the_sweeps(tmp_path: Path) -> None:
+    rows = [{"radio.loss": 0, "seed": n, "verdict": verdict} for n, verdict in enumerate(["valid", "invalid"])]
+    for name in ("sweep-one", "empty", "odd", "broken"):
+        (tmp_path / name).mkdir()
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "sweep-one" / "sweep.parquet")
+    pq.write_table(pa.Table.from_pylist([{"a": 1}]), tmp_path / "odd" / "sweep.parquet")
+    (tmp_path / "broken" / "sweep.parquet").write_text("none")
+    (tmp_path / "sweep-one" / "sweep.html").touch()
+    index = write_index(tmp_path).read_text()
+    assert '<a href="./sweep-one/sweep.html">sweep-one</a>' in index
+    assert '<td class="number">2</td><td class="number invalid">1</td>\n<td>radio.loss</td>' in index
+    assert index.count("sweep.parquet: not the table of a sweep") == 2
 
 
 def test_the_page_shows_own_figures_first_and_no_constants() -> None:
@@ -174,12 +258,13 @@ def test_the_page_shows_own_figures_first_and_no_constants() -> None:
     rows[0]["last.delay_ms"] = None
     assert figures_of(rows, ["kind", "radio.loss"]) == ["delay_ms", "last.delay_ms", "pdr", "same"]
     assert heading("last.delay_ms") == "delay (ms), at the end"
-    page = sweep_page(scenario_of(TINY, {}), rows, ["kind", "radio.loss"])
+    tiny = scenario_of(TINY, {})
+    page = sweep_page(tiny.run, [tiny.program], rows, ["kind", "radio.loss"])
     assert page.count("<figure") == 2, "neither what is constant nor the wall clock"
-    assert "1.167 ± 0.71" in page and "kind a" in page
-    by_name = sweep_page(scenario_of(TINY, {}), [row for row in rows if row["radio.loss"] == 0], ["kind"])
+    assert "1.17 ± 0.71" in page and "kind a" in page
+    by_name = sweep_page(tiny.run, [tiny.program], [row for row in rows if row["radio.loss"] == 0], ["kind"])
     assert by_name.count("<figure") == 2
-    assert "<figure" not in sweep_page(scenario_of(TINY, {}), rows[:2], [])
+    assert "<figure" not in sweep_page(tiny.run, [tiny.program], rows[:2], [])
 
 
 def test_columns_of_several_kinds_are_texts() -> None:

@@ -11,7 +11,7 @@ from emulator.pages.canvas import BLUE, canvas
 from emulator.records.run_folder import RunFolder
 from emulator.report.drawing import Line, draw_charts, time_figure
 from emulator.report.map_figures import _draw_names, classes, map_charts
-from emulator.report.program_figures import points, program_charts, usual_periods
+from emulator.report.program_figures import points, program_charts, text_shares, usual_periods
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
@@ -122,7 +122,7 @@ def test_values_are_classes_that_the_legend_explains(
 
 
 def test_shares_of_texts_are_those_of_the_vehicles_that_report(source: Source) -> None:
-    shares, texts = source.text_shares("state")
+    shares, texts = text_shares(source, "state")
     assert texts == ["idle", "busy"]
     assert shares.tolist() == [[1.0, 0.0]] * 6 + [[0.0, 1.0]] * 4
 

@@ -62,7 +62,7 @@ def shown(source: Source, most: int = 20_000) -> tuple[Timeline, dict[str, Any]]
 
 def test_every_reception_is_there_once_with_its_outcome_and_time(run: Source) -> None:
     found, data = shown(run)
-    trace = run.recorded.trace.to_pylist()
+    trace = run.trace.to_pylist()
     assert found.note == f"All {len(trace):,} attempted receptions are shown."
     sent, index, seen = 0, 0, []
     for i, heard in enumerate(data["heard"]):
@@ -111,14 +111,14 @@ def test_marks_bars_and_times_down_are_those_of_the_events(run: Source) -> None:
 
 def test_a_large_run_is_thinned_and_says_so(run: Source) -> None:
     found, data = shown(run, 30)
-    total = len(run.recorded.trace)
+    total = len(run.trace)
     assert 20 <= len(data["receiver"]) <= 30 < total
     assert found.note.startswith(
         f"{len(data['receiver'])} of {total} attempted receptions are shown: those of all "
     )
     assert " of a failure or " in found.note and " of the others." in found.note
     sent_us = np.cumsum(data["time"])
-    rows = [row for row in run.recorded.trace.to_pylist() if row["sent_ns"] == 600_000_000]
+    rows = [row for row in run.trace.to_pylist() if row["sent_ns"] == 600_000_000]
     assert sum(heard for heard, at in zip(data["heard"], sent_us, strict=True) if at == 600_000) == len(rows) > 0
 
 
@@ -177,7 +177,7 @@ def test_of_many_vehicles_those_with_failures_marks_and_faults_have_lanes_first(
     bars, failure, event = [Bar("loss-0", 0, 1, (0,))], Mark(1, 2, "failure", ""), Mark(1, 3, "event", "")
     for most, lanes in ((1, [2]), (2, [2, 3]), (3, [0, 2, 3]), (4, [0, 1, 2, 3])):
         monkeypatch.setattr(module, "MOST_LANES", most)
-        assert module._first_lanes(run.recorded, [event, failure], bars) == lanes
+        assert module._first_lanes(run, [event, failure], bars) == lanes
 
 
 def test_the_page_holds_all_of_the_data_as_text(run: Source) -> None:

@@ -51,8 +51,8 @@ def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> No
     whole = RecordedRun.open(run)
     assert (whole.attempt > 1).any() and whole.outcome_is("duplicate").any() and whole.outcome_is("delivered").any()
     source = Source(run)
-    assert source.recorded.attempt.tolist() == whole.attempt.tolist()
-    assert source.recorded.acked.tolist() == whole.acked.tolist()
+    assert source.attempt.tolist() == whole.attempt.tolist()
+    assert source.acked.tolist() == whole.acked.tolist()
     ratio = radio_metrics(whole).totals["delivery_ratio"]
     assert ratio is not None
     section = radio_section(source)
@@ -87,8 +87,8 @@ def test_a_run_without_broadcasts_has_its_frames_to_one_vehicle(tmp_path: Path) 
 def test_figures_count_receptions_in_range_and_links_broadcasts(run: Path) -> None:
     source = Source(run)
     assert "of the one link" in links(source).caption
-    attempted = int((~source.recorded.outcome_is("out_of_range")).sum())
-    assert attempted < len(source.recorded.trace)
+    attempted = int((~source.outcome_is("out_of_range")).sum())
+    assert attempted < len(source.trace)
     for drawing in (radio_figures.outcomes(source), radio_figures.totals(source)):
         assert f"{attempted:,} attempted receptions" in drawing.caption
 

@@ -271,16 +271,24 @@ def test_tables_that_do_not_fit_together(copied: Path, watched: Watched) -> None
     assert "more periods than the 20 of metrics.parquet" in spoil("metrics", metrics.slice(0, 20))
     assert "fewer periods than the 30" in spoil("states", states.slice(0, 20 * NODES))
     assert "not those of one period after the other" in spoil("metrics", metrics.slice(1))
-    assert "not those of one period after the other" in spoil("states", states.slice(NODES))
-    assert "middle of a period" in spoil("states", states.slice(0, 10 * NODES + 1))
+    assert "its first period is not of the vehicles of world.npz" in spoil("states", states.slice(NODES))
+    assert "not those of one period after the other" in spoil("states", states.slice(0, 10 * NODES + 1))
+    swapped = states.take(pa.array([1, 0, *range(2, len(states))]))
+    assert "first period is not" in spoil("states", swapped)
+    later = [*range(NODES), NODES + 1, NODES, *range(NODES + 2, len(states))]
+    assert "not those of one period after the other" in spoil("states", states.take(pa.array(later)))
     backwards = trace.take(pa.array(range(len(trace) - 1, -1, -1)))
     assert "not in the order in which frames were sent" in spoil("trace", backwards)
-    stranger = trace.set_column(1, "sender", pa.array(["v99"] * len(trace)))
+    stranger = trace.set_column(1, "sender", pa.array(["v99"] * len(trace)).dictionary_encode())
     assert "'v99'" in spoil("trace", stranger)
+    outcome = trace.set_column(
+        trace.column_names.index("outcome"), "outcome", pa.array(["eaten"] * len(trace)).dictionary_encode()
+    )
+    assert "'eaten'" in spoil("trace", outcome)
     world = RecordedRun.open(copied).world
     fewer = replace(world, node_ids=world.node_ids[:5], position_m=world.position_m[:5])
     fewer.write(copied / "world.npz")
-    assert "node 'v06' in trace or events: the states know only 5 others" in refused(copied)
+    assert "its first period is not of the vehicles of world.npz" in refused(copied)
 
 
 def test_a_run_without_a_period_has_a_scene_and_an_end(tmp_path: Path) -> None:
