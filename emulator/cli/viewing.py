@@ -161,11 +161,20 @@ def _recorder(sinks: Sinks, name: str) -> Recorder:
 def view(
     run: RunArgument = LATEST,
     serve: Annotated[bool, typer.Option("--serve", help="Serve it even where there is a display.")] = False,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a picture instead, which needs no display.")
+    ] = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
 ) -> None:
     """Look at a run: opens its recording, or serves it until Ctrl-C; says where one that is on can be watched."""
     with one_line_errors():
+        if png is not None:
+            from emulator.report.picture import write_picture  # slow to import
+
+            write_picture(run, png)
+            print(png)
+            return
         if _is_on(run):
             _tell_where(run)
             return
