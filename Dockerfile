@@ -5,5 +5,5 @@ COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY vnet vnet
 COPY agents agents
 COPY emulator emulator
-RUN pip install --no-cache-dir -c constraints.txt .
+RUN pip install --no-cache-dir -c constraints.txt '.[cooperative,maps,plots,rerun]'
 COPY scenarios scenarios

@@ -27,12 +27,13 @@ from emulator.records.tables import METRICS
 from emulator.scenario.scenario import Scenario, lookahead_ns
 from emulator.world.world import World, build_world, components
 from vnet.errors import ScenarioError, VnetError
+from vnet.extras import is_installed, needs
 from vnet.types import Array
 from vnet.units import NS_PER_MS
 
 Links = NDArray[np.bool_]
 FASTEST = "fastest-mixing"
-NO_CVXPY = "fastest-mixing weights left out: cvxpy is not installed (pip install 'vnet-emulator[sdp]')"
+NO_CVXPY = f"fastest-mixing weights left out: this {needs('cvxpy')}"
 
 
 def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
@@ -190,7 +191,7 @@ def _completed(linked: Links, weight: Array) -> Array:
 
 def has_cvxpy() -> bool:
     """Return True if fastest-mixing weights can be computed (cvxpy is installed)."""
-    return importlib.util.find_spec("cvxpy") is not None
+    return is_installed("cvxpy")
 
 
 def fastest_mixing_matrix(linked: Links) -> Array:

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from emulator.cells.cells import Cell
 from emulator.drivers.emulation import Emulation
-from emulator.records.distributions import chi2_quantiles
+from emulator.records.distributions import chi2_quantile
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reference import reference_series
@@ -170,12 +170,12 @@ def consistency_figures(recorded: RecordedRun, from_s: float) -> dict[str, Any]:
     position_m = recorded.vectors("estimate_m") - recorded.vectors("position_m")
     common_nees = normalized(common_m, recorded.matrices("common_error_covariance_m2"))
     position_nees = normalized(position_m, recorded.matrices("covariance_m2"))
-    inside = float(chi2_quantiles(COVERED, 2))
+    inside = chi2_quantile(COVERED, 2)
     away_m = np.linalg.norm(position_m[first:], axis=2)
     return {
         "median_error_m": _median(np.linalg.norm(common_m[first:], axis=2)),
         "median_position_error_m": _median(away_m),
-        "median_anees": _median(common_nees[first:] / float(chi2_quantiles(0.5, 2))),
+        "median_anees": _median(common_nees[first:] / chi2_quantile(0.5, 2)),
         "coverage_95": _share(common_nees[first:], inside),
         "position_coverage_95": _share(position_nees[first:], inside),
         "anees_batches": batch_means(common_nees[first:] / 2, max(1, round(BATCH_S * NS_PER_S / period_ns))),

@@ -9,6 +9,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from vnet.errors import ProgramError
+from vnet.extras import require
+
 if TYPE_CHECKING:
     from agents.cooperative.program import main as main
 
@@ -20,4 +23,5 @@ def __getattr__(name: str) -> Any:
     """Return the program."""
     if name != "main":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require("program.entry = 'agents.cooperative:main'", "scipy", "daqp", "osqp", error=ProgramError)
     return import_module("agents.cooperative.program").main

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from emulator.cells.worker import Place, Worker, WorkerDiedError, call_fitly, modules_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
+from vnet.extras import require
 
 R = TypeVar("R")
 T = TypeVar("T")
@@ -159,10 +160,9 @@ def open_executor(address: str | None) -> Iterator[Executor | None]:
     host = address.removeprefix(DASK)
     if not address.startswith(DASK) or not host.rpartition(":")[2].isdecimal():
         raise VnetError(f"--executor {address}: write it as dask://HOST:PORT, the address of a Dask scheduler")
-    try:
-        from distributed import Client  # slow to import, and an extra
-    except ImportError:
-        raise VnetError(f"--executor {address}: needs the extra dask: pip install 'vnet-emulator[dask]'") from None
+    require(f"--executor {address}", "distributed")
+    from distributed import Client  # slow to import, and an extra
+
     try:
         client = Client(f"tcp://{host}", timeout=f"{DASK_PATIENCE_S}s", set_as_default=False)
     except (OSError, TimeoutError) as error:

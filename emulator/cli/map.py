@@ -26,6 +26,7 @@ from emulator.world.trips.files import check_trips_name, write_trips
 from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
 from emulator.world.trips.motion import Motion, Rules
 from vnet.errors import ScenarioError, VnetError
+from vnet.extras import require
 from vnet.types import Array
 
 RATE_HZ = 10.0
@@ -60,6 +61,8 @@ def show(
 ) -> None:
     """Say how long a map's roads are and what is odd about it, and draw it."""
     with one_line_errors():
+        if out is not None:
+            require(f"--out {out}", "matplotlib")
         roads = read_roads(map_file, pair("--origin", origin))
         middle = pair("--at", at)
         if middle is not None:

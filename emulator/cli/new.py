@@ -1,4 +1,4 @@
-"""`vnet new`: a folder with a scenario, a program, a check and a test to begin with."""
+"""`vnet new`: a folder to begin with: a scenario, a program, a check and a test; or a copy of an example."""
 
 from __future__ import annotations
 
@@ -10,27 +10,75 @@ from typing import Annotated
 
 import typer
 
+from emulator.cli.docs import EXAMPLES
 from emulator.terminal.console import one_line_errors
-from vnet.errors import VnetError
+from vnet.errors import VnetError, did_you_mean, printable
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The new folder, and the program in it.")],
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME", help="The new folder, and the program in it; left out, that of the example."
+        ),
+    ] = None,
+    example: Annotated[
+        str | None, typer.Option(metavar="EXAMPLE", help="Copy this example of the documentation instead.")
+    ] = None,
 ) -> None:
     """Write a folder to begin with: a scenario, its program, a check of what it promises, and a test.
 
-    NAME becomes a module of Python's: letters, digits and _.
+    NAME becomes a module of Python's: letters, digits and _. With --example it is a copy of an example, which a
+    page of the documentation explains.
     """
     with one_line_errors():
-        folder = Path(name)
+        if name is None and example is None:
+            raise VnetError(f"name the new folder, or an example with --example: {', '.join(examples())}")
+        folder = Path(name or example or "")
+        if example is not None:
+            source = _example(example)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise VnetError(f"{folder}: exists and is not an empty folder")
-        _check_name(folder.name)
-        write_project(folder)
+        if example is not None:
+            copy_example(source, folder)
+        else:
+            _check_name(folder.name)
+            write_project(folder)
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-        print(f"next: cd {shlex.quote(str(folder))} && vnet simulate {folder.name}.toml")
+        (scenario,) = folder.glob("*.toml")
+        print(f"next: cd {shlex.quote(str(folder))} && vnet simulate {scenario.name}")
+
+
+def examples() -> list[str]:
+    """Return the names of the examples with a scenario."""
+    return sorted(path.parent.name for path in EXAMPLES.glob("*/*.toml"))
+
+
+def _example(name: str) -> Path:
+    if name not in (known := examples()):
+        meant = did_you_mean(name, known)
+        raise VnetError(f"--example {printable(name)}: no example{meant}; there are {', '.join(known)}")
+    return EXAMPLES / name
+
+
+def copy_example(source: Path, folder: Path) -> None:
+    """Copy the files of an example, which is a package of the documentation, into a folder of its own.
+
+    Raises:
+        VnetError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in source.iterdir():
+            if path.is_file() and path.name != "__init__.py":
+                text = path.read_text("utf-8")
+                for place in (f"docs.examples.{source.name}.", f"docs/examples/{source.name}/"):
+                    text = text.replace(place, "")
+                (folder / path.name).write_text(text, "utf-8")
+    except OSError as error:
+        raise VnetError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
 def write_project(folder: Path) -> None:

@@ -64,7 +64,7 @@ def compare(
 
 
 def _write_report(folder: Path) -> Path:
-    from emulator.report.write import write_report  # matplotlib is slow to import
+    from emulator.report.write import write_report  # slow to import
 
     return write_report(folder)
 

@@ -52,6 +52,7 @@ from emulator.terminal.console import LogFormat, one_line_errors, say_first
 from emulator.terminal.standard_output import result_only
 from emulator.viewer.sinks import choose_sinks
 from vnet.errors import ScenarioError, VnetError
+from vnet.extras import require
 from vnet.runtime.interrupts import ended_at_once
 
 
@@ -235,4 +236,6 @@ def demo(duration: DurationOption = None, out: OutOption = None) -> None:
 
     It is `vnet run quickstart --rerun save`.
     """
+    with one_line_errors():
+        require("vnet demo", "rerun", "scipy", "daqp", "osqp")
     run(find_scenario("quickstart"), duration=duration, out=out, rerun=["save"])

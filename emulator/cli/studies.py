@@ -28,6 +28,7 @@ from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import result_only
 from vnet.errors import VnetError, printable
+from vnet.extras import require
 
 INTERRUPTED = 130
 RUNS_ON_DASK = 64
@@ -138,10 +139,11 @@ def analyze(
     overrides: SetOption = None,
 ) -> None:
     """Analyze the network without a run: components, degrees, convergence of each rule of weights."""
-    from emulator.analyze import analysis_table
-    from emulator.analyze import analyze as analyze_scenario
-
     with one_line_errors():
+        require("vnet analyze", "scipy")
+        from emulator.analyze import analysis_table
+        from emulator.analyze import analyze as analyze_scenario
+
         SafeConsole().print(analysis_table(analyze_scenario(load(scenario, overrides), run)))
 
 

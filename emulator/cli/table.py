@@ -112,6 +112,7 @@ COMMANDS = (
         "record", Panel.FILES, "viewing", "record", "Watch a run from outside, and write a Rerun recording of it."
     ),
     Command("render", Panel.FILES, "viewing", "render", "Write a finished run's recording again from its files."),
+    Command("docs", Panel.FILES, "docs", "docs", "Read the documentation: list its pages, or print one."),
     Command("map", Panel.FILES, "map", "app", "Look at maps, and convert them."),
 )
 

@@ -41,6 +41,7 @@ from emulator.viewer.sinks import (
     viewer_command,
 )
 from vnet.errors import VnetError
+from vnet.extras import require
 from vnet.transport.credentials import Credentials
 from vnet.units import NS_PER_S
 
@@ -59,9 +60,10 @@ def render(
     rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Rebuild a run's recording (and its report, where the recording is the run's own) from its files alone."""
-    from emulator.report.write import write_report  # matplotlib is slow to import
+    from emulator.report.write import write_report  # slow to import
 
     with one_line_errors():
+        require("vnet render", "rerun")
         played = messages(run)
         recording = out or run / RECORDING
         if not recording.parent.is_dir():
@@ -102,6 +104,7 @@ def play(
             raise VnetError(f"--speed {speed:g}: more than 0 is needed")
         if end is not None and not end > start:
             raise VnetError(f"--to {end:g}: must come after --from {start:g}")
+        require("vnet play", "rerun")
         played = messages(run)
         stream, scene = next(played)
         if start >= (over_s := scene["duration_ns"] / NS_PER_S):
@@ -158,11 +161,20 @@ def _recorder(sinks: Sinks, name: str) -> Recorder:
 def view(
     run: RunArgument = LATEST,
     serve: Annotated[bool, typer.Option("--serve", help="Serve it even where there is a display.")] = False,
+    png: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a picture instead, which needs no display.")
+    ] = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
 ) -> None:
     """Look at a run: opens its recording, or serves it until Ctrl-C; says where one that is on can be watched."""
     with one_line_errors():
+        if png is not None:
+            from emulator.report.picture import write_picture  # slow to import
+
+            write_picture(run, png)
+            print(png)
+            return
         if _is_on(run):
             _tell_where(run)
             return
@@ -171,6 +183,7 @@ def view(
         if not recording.exists() or not recording.stat().st_size:
             check_is_finished(run)
             raise VnetError(f"{run}: has no {RECORDING}: make one of its files with vnet render {run}")
+        require("vnet view", "rerun")
         if not is_closed(recording):
             recording = repair(recording)
             print(f"the recording was not closed: what it has is in {recording}", flush=True)
@@ -214,9 +227,10 @@ def record(
     rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Watch a run from outside and write a Rerun recording of it."""
-    from emulator.viewer.watch import record_run  # Rerun is slow to import, and only this command needs it
-
     with one_line_errors():
+        require("vnet record", "rerun")
+        from emulator.viewer.watch import record_run  # Rerun is slow to import, and only this command needs it
+
         login = None if credentials is None else Credentials.load(credentials)
         sinks = choose_sinks(rerun or ["save"], rerun_bind, rerun_port, rerun_vehicle)
         if sinks is None:

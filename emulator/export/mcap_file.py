@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import SCENARIO_FILE
-from vnet.errors import VnetError
+from vnet.extras import require
 from vnet.units import NS_PER_S
 
 Message = tuple[int, str, dict[str, Any]]
@@ -81,10 +81,9 @@ _STATE_COLUMNS = ("position_m", "heading_rad", "fix_m")
 
 def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
     """Write a run; return the number of messages. Raise VnetError if the package mcap is missing."""
-    try:
-        from mcap.writer import Writer
-    except ImportError:
-        raise VnetError("MCAP needs the package mcap: pip install 'vnet-emulator[export]'") from None
+    require("MCAP", "mcap")
+    from mcap.writer import Writer
+
     writer = Writer(file)
     writer.start(profile="", library="vnet")
     channels = {}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from emulator.learning.episode import ENTRY, Act, Behaviour, Ends, Observe, Reward
 from emulator.scenario.loading import Source, hinting, scenario_of
 from vnet.errors import VnetError, shown
+from vnet.extras import require
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -44,14 +45,11 @@ def environment(
     episodes: `out/1`, `out/2`, …. Raises VnetError, in one line, for input that cannot be used, and if the extra
     `rl` is not installed.
     """
-    try:
-        from gymnasium import spaces
+    require("an environment", "pettingzoo", "gymnasium")
+    from gymnasium import spaces
 
-        from emulator.learning.vehicle_environment import VehicleEnvironment
-    except ModuleNotFoundError as error:
-        if error.name not in ("pettingzoo", "gymnasium"):
-            raise
-        raise VnetError(f"environment: {error.name} is not installed: pip install 'vnet-emulator[rl]'") from None
+    from emulator.learning.vehicle_environment import VehicleEnvironment
+
     for name, given in {"observe": observe, "act": act, "reward": reward}.items():
         _check(name, given, callable(given), "a function is needed")
     for name, space in {"observation_space": observation_space, "action_space": action_space}.items():

@@ -9,23 +9,25 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
-import matplotlib
 import numpy as np
 from markupsafe import Markup
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from emulator.pages.palette import PALETTE
 from emulator.pages.text import as_text
+from vnet.extras import is_installed, require
 from vnet.types import Array
+
+if TYPE_CHECKING:  # an extra, and slow to import: those who draw nothing do without
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GREY, SAND, RUST, NAVY = (
     colour.light for colour in PALETTE.values()
@@ -92,7 +94,16 @@ class Canvas:
     """Faults that are shaded, but have no room for their name."""
 
 
-styled = matplotlib.rc_context(STYLED)
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw in the style of the pages within the block; without matplotlib, with which nothing is drawn, in none."""
+    if not is_installed("matplotlib"):
+        yield
+        return
+    from matplotlib import rc_context
+
+    with rc_context(STYLED):
+        yield
 
 
 def canvas(
@@ -103,7 +114,13 @@ def canvas(
     end_s: float = 0.0,
     plot_px: float = PLOT_PX,
 ) -> Canvas:
-    """Make empty axes; with `spans`, faults are shaded on an axis of time until `end_s`, and named above it."""
+    """Make empty axes; with `spans`, faults are shaded on an axis of time until `end_s`, and named above it.
+
+    Raises VnetError if matplotlib is not installed.
+    """
+    require("a figure", "matplotlib")
+    from matplotlib.figure import Figure
+
     lanes = _in_lanes(spans, end_s)
     height_px = _TOP_PX + legend_rows * _LEGEND_ROW_PX + len(lanes) * _LANE_PX + plot_px + _BOTTOM_PX
     figure = Figure(figsize=(WIDTH_PX / 72, height_px / 72), dpi=72)
@@ -173,6 +190,8 @@ def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = L
 
 def from_zero(axes: Axes) -> None:
     """Make the y axis linear from zero, with few ticks."""
+    from matplotlib.ticker import MaxNLocator
+
     top = axes.get_ylim()[1]
     axes.set_ylim(0, top if top > 0 else 1)
     axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -180,6 +199,8 @@ def from_zero(axes: Axes) -> None:
 
 def logarithmic(axes: Axes) -> None:
     """Make the y axis logarithmic, with plain numbers; over few powers of ten with 2 and 5 between them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     between = (1, 2, 5) if high < 200 * low else (1,)
@@ -190,6 +211,8 @@ def logarithmic(axes: Axes) -> None:
 
 def whole_numbers(axes: Axes) -> None:
     """Put the y axis' ticks at integers, with commas at the thousands."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
 

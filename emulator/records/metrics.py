@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from emulator.records.distributions import chi2_quantiles
+from emulator.records.distributions import chi2_quantile
 from emulator.records.period_figures import (
     NUMBER,
     Period,
@@ -210,8 +210,8 @@ def _fitting(value: Value | None, size: int | None) -> Value | None:
 
 def anees_band(samples: int) -> tuple[float, float]:
     """The 95 % band of the mean of so many independent samples of two degrees of freedom, 1 being consistent."""
-    low, high = chi2_quantiles([0.025, 0.975], 2 * samples) / (2 * samples)
-    return float(low), float(high)
+    degrees = 2 * samples
+    return chi2_quantile(0.025, degrees) / degrees, chi2_quantile(0.975, degrees) / degrees
 
 
 def _is_not_finite(report: Report) -> bool:

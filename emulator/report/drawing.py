@@ -95,7 +95,7 @@ def faults_note(made: Canvas, source: Source) -> str:
     return f" Shaded: active faults, named above{unnamed}."
 
 
-@styled
+@styled()
 def draw_charts(
     drawers: Mapping[str, tuple[str, Callable[[], Drawing]]],
 ) -> tuple[list[Chart], dict[str, list[str]]]:

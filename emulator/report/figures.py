@@ -17,7 +17,7 @@ from emulator.records.tables import DRIVEN
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, faults_note, time_figure
 from emulator.report.map_figures import map_charts
 from emulator.report.network_figures import degrees, links, peers
-from emulator.report.program_figures import program_charts
+from emulator.report.program_figures import Drawers, program_charts
 from emulator.report.radio_figures import ages, busy, latency, outcomes, totals
 from emulator.report.source import NothingToShow, Source, maybe
 from vnet.errors import VnetError
@@ -137,15 +137,16 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
 """Title and drawing by id, in the order of the page. A figure without data raises NothingToShow."""
 
 
-def _figures(source: Source) -> dict[str, tuple[str, Callable[[Source], Drawing]]]:
-    """Return the figures of a run: those that its program declares around vnet's."""
+def figures_of(source: Source) -> Drawers:
+    """Return title and drawing of the figures of a run, by id: those that its program declares around vnet's."""
     declared = source.declared
     first = {each["id"]: (each["title"], partial(declared_chart, each)) for each in declared.charts}
     last = {
         f"peers-{name}": (f"{title_of(name).capitalize()} by vehicle", partial(peers, name))
         for name in declared.peers
     }
-    return {**first, **FIGURES, **last}
+    of_run: dict[str, tuple[str, Callable[[Source], Drawing]]] = {**first, **FIGURES, **last}
+    return {key: (title, partial(figure, source)) for key, (title, figure) in of_run.items()}
 
 
 @dataclass(frozen=True)
@@ -160,9 +161,8 @@ class Charts:
 
 def draw(source: Source) -> Charts:
     """Draw all figures of a run."""
-    drawers = {key: (title, partial(figure, source)) for key, (title, figure) in _figures(source).items()}
     network, program, figures = (
-        draw_charts(each) for each in (map_charts(source), program_charts(source), drawers)
+        draw_charts(each) for each in (map_charts(source), program_charts(source), figures_of(source))
     )
     missing: dict[str, list[str]] = {}
     for _, problems in (network, program, figures):

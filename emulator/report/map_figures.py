@@ -8,11 +8,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import to_rgba
-from matplotlib.lines import Line2D
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path as Outline
-from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, legend
@@ -96,6 +91,9 @@ def _coloured(source: Source, name: str) -> Drawing:
     columns = 2 if max(map(len, labels)) > LONG_LABEL else 3
     made, scale = _frame(source, -(-len(labels) // columns))
     position_m = _last_positions(source) * scale
+    from matplotlib.colors import to_rgba
+    from matplotlib.lines import Line2D
+
     handles = []
     dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 7, "markeredgewidth": 0.8}
     dots["markeredgecolor"] = BLUE
@@ -178,6 +176,9 @@ def _draw_buildings(made: Canvas, buildings: Buildings, scale: float) -> None:
     shown = buildings.largest(MOST_CORNERS)
     if not len(shown):
         return
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
     codes = np.full(len(shown.corner_m), Outline.LINETO, dtype=np.uint8)
     codes[shown.first[:-1]] = Outline.MOVETO
     closed = shown.first[1:]
@@ -196,6 +197,9 @@ def _draw_lines(made: Canvas, lines: Array, colour: str, opacity: float, width: 
     """Draw lines (k, points, 2) as one path; NaN are gaps."""
     if not len(lines):
         return
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
     codes = np.full(lines.shape[:2], Outline.LINETO, dtype=np.uint8)
     codes[:, 0] = Outline.MOVETO
     outline = Outline(lines.reshape(-1, 2), codes.ravel())
@@ -212,6 +216,8 @@ def _draw_background(made: Canvas, position: Array) -> None:
 
 def _draw_names(made: Canvas, node_ids: Sequence[str], position: Array) -> str:
     """Write each vehicle's name on a side where no other name is; returns what has no room, in words."""
+    from matplotlib.transforms import Bbox
+
     taken: list[Bbox] = []
     there = np.flatnonzero(np.isfinite(position).all(axis=1))
     for number in there.tolist():

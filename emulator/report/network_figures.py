@@ -8,9 +8,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from matplotlib.patches import Patch, PathPatch
-from matplotlib.path import Path as Outline
-from matplotlib.ticker import MaxNLocator
 
 from emulator.pages.canvas import BLUE, INK, RED, Canvas, canvas, legend, whole_numbers
 from emulator.radio.outcomes import DRAWN, Outcome
@@ -138,6 +135,8 @@ def degrees(source: Source) -> Drawing:
         cap = source.scenario.radio.max_peers
         made.axes.axvline(cap + 0.5, color=INK, linestyle=DASHES[2], label=f"peer cap {cap}")
     made.axes.set_xlim(edges[0] - 0.3, max(edges[-1], 4) + 0.3)
+    from matplotlib.ticker import MaxNLocator
+
     made.axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     whole_numbers(made.axes)
     legend(made)
@@ -166,6 +165,9 @@ def peers(name: str, source: Source) -> Drawing:
     if len(ids) > MOST_IN_MATRIX:
         raise VnetError(f"a matrix of {len(ids)} vehicles would not be readable")
     made = canvas("for vehicle", "reporting vehicle", legend_rows=2, plot_px=270)
+    from matplotlib.patches import Patch, PathPatch
+    from matplotlib.path import Path as Outline
+
     level = np.searchsorted(list(OPACITY), matrix)
     handles = []
     least = 0.0

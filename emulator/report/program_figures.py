@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-from matplotlib.axes import Axes
 
 from emulator.pages.canvas import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, canvas, legend
 from emulator.records.reported import is_text
@@ -15,6 +15,9 @@ from emulator.report.drawing import DASHES, TIME, Drawing, Line, faults_note, ti
 from emulator.report.source import NothingToShow, Source
 from vnet.types import Array
 from vnet.units import title_of, unit_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MOST_TEXTS = 6
 """Texts of one name that have a line; the others are counted together."""

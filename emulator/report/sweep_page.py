@@ -16,6 +16,7 @@ import numpy as np
 
 from emulator.pages.canvas import BLUE, GREEN, GREY, NAVY, ORANGE, PURPLE, RED, SKY, Canvas, canvas, legend
 from emulator.pages.page import render, table
+from emulator.records.distributions import student_quantile
 from emulator.records.period_figures import KeyFigure, estimates_differ, figures_if_here
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import DASHES, Drawing, draw_charts
@@ -62,12 +63,10 @@ class Mean:
 
 def mean_of(values: Sequence[float]) -> Mean:
     """Return the mean of one number or more, with the interval of Student's t distribution."""
-    from scipy.special import stdtrit  # slow to import, and commands that write no page need it not
-
     count = len(values)
     if count == 1:
         return Mean(float(values[0]), None, 1)
-    half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2) * np.std(values, ddof=1) / np.sqrt(count))
+    half = float(student_quantile((1 + CONFIDENCE) / 2, count - 1) * np.std(values, ddof=1) / np.sqrt(count))
     return Mean(float(np.mean(values)), half, count)
 
 

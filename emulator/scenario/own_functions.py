@@ -20,6 +20,7 @@ from typing import Any
 
 from emulator.scenario.program import Program
 from vnet.errors import ScenarioError, VnetError, printable
+from vnet.extras import missed_by
 
 LONGEST_ERROR = 300
 CONSTANT = "DECLARES"
@@ -53,7 +54,8 @@ def load_function(key: str, entry: str, program: Program, usage: str) -> Callabl
 
 def in_words(error: BaseException) -> str:
     """Return an exception in one line."""
-    return printable(" ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":"), LONGEST_ERROR)
+    said = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    return missed_by(error) or printable(said, LONGEST_ERROR)
 
 
 def outside(error: BaseException, *files: str) -> TracebackType | None:

@@ -19,6 +19,7 @@ import typer
 import typer.main
 
 from vnet.errors import LONGEST_MESSAGE, VnetError, printable
+from vnet.extras import missed_by
 from vnet.runtime import interrupts
 
 WRONG_USAGE = 2
@@ -124,6 +125,9 @@ def _say_unexpected(error: Exception, arguments: Sequence[str]) -> int:
     if isinstance(error, OSError) and error.errno in REFUSED_BY_THE_SYSTEM:
         where = "" if error.filename is None else f"{printable(str(error.filename))}: "
         _say(f"{where}{error.strerror}", log_format)
+        return WRONG_USAGE
+    if needed := missed_by(error):
+        _say(f"this command {needed}", log_format)
         return WRONG_USAGE
     what = printable(f"{type(error).__name__}: {error}", LONGEST_MESSAGE)
     if isinstance(error, MemoryError) or any(part in str(error).lower() for part in OUT_OF_MEMORY):

@@ -35,6 +35,7 @@ from rich.text import Text
 from emulator.checks.own import is_broken
 from emulator.pages.page import put_page, render, table
 from emulator.records.atomic import write_atomically
+from emulator.records.distributions import lowest_share
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
 from emulator.records.studies import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.verdicts import Verdict
@@ -163,10 +164,7 @@ def failure_kinds(failures: Iterable[tuple[str, Mapping[str, str]]]) -> list[Fai
 
 def green_runs_needed(failed: int, runs: int, alpha: float = ALPHA) -> int:
     """Return how many runs in a row must pass, if `failed` (at least one) of so many have failed before."""
-    from scipy.stats import beta  # takes longer to import than most of a campaign's other modules
-
-    least_rate = float(beta.ppf(alpha, failed, runs - failed + 1))
-    return math.ceil(math.log(alpha) / math.log1p(-least_rate))
+    return math.ceil(math.log(alpha) / math.log1p(-lowest_share(failed, runs, alpha)))
 
 
 def failures_by_check(results: Sequence[Mapping[str, Any]]) -> Counter[str]:

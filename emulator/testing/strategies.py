@@ -1,16 +1,18 @@
-"""A hypothesis strategy for schedules of faults. Needs hypothesis: `pip install vnet-emulator[testing]`."""
+"""A hypothesis strategy for schedules of faults. Needs hypothesis: `pip install vnet-emulator[hypothesis]`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, TypeVar
-
-from hypothesis import strategies as st
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from emulator.scenario.faults import Fault
 from emulator.testing.campaign_plan import ScheduleConstraints, draw_fault, known_kinds
 from emulator.testing.scenarios import Source, make_scenario
+from vnet.extras import require
+
+if TYPE_CHECKING:
+    from hypothesis import strategies as st
 
 T = TypeVar("T")
 
@@ -26,9 +28,13 @@ class _Drawn:
         self._draw = draw
 
     def integer(self, low: int, high: int) -> int:
+        from hypothesis import strategies as st
+
         return self._draw(st.integers(low, high))
 
     def choice(self, items: Sequence[T]) -> T:
+        from hypothesis import strategies as st
+
         return self._draw(st.sampled_from(items))
 
     def subset(self, items: Sequence[T], most: int) -> list[T]:
@@ -44,6 +50,9 @@ def faults(
     A failing schedule shrinks to the fewest faults, then the earliest and shortest, of the fewest vehicles and
     with the smallest parameters, that still fail; to none if it fails without.
     """
+    require("emulator.testing.strategies.faults", "hypothesis")
+    from hypothesis import strategies as st
+
     allowed = known_kinds(kinds)
 
     @cache

@@ -24,6 +24,7 @@ from urllib.parse import quote
 
 from emulator.records.run_folder import RECORDING, check_is_finished
 from vnet.errors import VnetError
+from vnet.extras import require
 
 if TYPE_CHECKING:  # Rerun is slow to import, and only those who open a recording need it
     import rerun
@@ -138,6 +139,7 @@ def choose_sinks(
         raise VnetError("--rerun-bind and --rerun-port are for --rerun serve")
     if not chosen:
         return None
+    require(f"--rerun {','.join(chosen)}", "rerun")
     place = place_to_serve(address, port) if served else None
     return Sinks(Path(RECORDING), place, "spawn" in chosen, vehicle)
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vnet.errors import ScenarioError, printable
+from vnet.extras import require
 from vnet.types import Array
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class Frame:
 
     @cached_property
     def _transformer(self) -> Transformer:
+        require("a place in degrees", "pyproj", error=ScenarioError)
         from pyproj import Transformer  # slow to import, and only points in degrees need it
         from pyproj.exceptions import ProjError
 

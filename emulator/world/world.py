@@ -58,7 +58,7 @@ def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
 
 def _drive(scenario: Scenario) -> World:
     """Return a world in which vehicles drive recorded trips, or generated ones through a city or a map."""
-    # Maps and trips need half of scipy, whose import takes longer than many a run of vehicles that stand.
+    # Maps and trips take longer to import than many a run of vehicles that stand.
     from emulator.world.maps.files import lanes_around, notes_of, read_roads
     from emulator.world.trips.drive import drive, drive_through_city
 

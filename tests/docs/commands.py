@@ -21,7 +21,21 @@ from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
 
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
-HERE = ("simulate", "check", "analyze", "access", "radio", "export", "report", "compare", "diff", "map", "trace")
+HERE = (
+    "simulate",
+    "check",
+    "analyze",
+    "access",
+    "radio",
+    "export",
+    "report",
+    "compare",
+    "diff",
+    "map",
+    "trace",
+    "docs",
+    "new",
+)
 """Commands of vnet that are run in this process."""
 APART = (
     *("run", "emulator", "host", "campaign", "sweep", "conformance"),  # they start processes

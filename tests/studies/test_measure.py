@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from emulator.records.distributions import chi2_quantiles
+from emulator.records.distributions import chi2_quantile
 from studies.measure import batch_means, converged_s, first_divergences, normalized
 from vnet.units import NS_PER_S
 
@@ -16,7 +16,7 @@ def test_normalized_errors_of_a_consistent_estimate_are_chi_squared() -> None:
     error_m = rng.multivariate_normal(np.zeros(2), covariance_m2, (400, 25))
     squares = normalized(error_m, np.broadcast_to(covariance_m2, (400, 25, 2, 2)))
     assert squares.mean() == pytest.approx(2.0, rel=0.05)
-    assert np.mean(squares <= chi2_quantiles(0.95, 2)) == pytest.approx(0.95, abs=0.01)
+    assert np.mean(squares <= chi2_quantile(0.95, 2)) == pytest.approx(0.95, abs=0.01)
     assert batch_means(squares / 2, 100) == pytest.approx([1.0] * 4, abs=0.08)
 
 

@@ -37,7 +37,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    for name in ("vnet", "agents", "emulator", "scenarios", "studies"):
+    for name in ("vnet", "agents", "emulator", "scenarios", "docs", "studies"):
         shutil.copytree(ROOT / name, source / name, symlinks=True)  # a build leaves files beside its source
     run_pip("wheel", "--no-deps", "--no-build-isolation", "-w", folder, source)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)
@@ -88,6 +88,15 @@ def test_a_new_project_runs_and_its_tests_pass(command: Command) -> None:
     command("vnet", "new", "mynet")
     assert "verdict: valid" in command("vnet", "simulate", "mynet.toml", "--quiet", folder="mynet")
     assert "2 passed" in command("python", "-m", "pytest", "-p", "no:cacheprovider", folder="mynet")
+
+
+def test_pages_and_examples_come_with_the_wheel(command: Command, environment: Path) -> None:
+    pages = [path for path in (ROOT / "docs").rglob("*.md") if "examples" not in path.parts]
+    assert len(command("vnet", "docs").splitlines()) == len(pages)
+    assert command("vnet", "docs", "tutorial") == (ROOT / "docs" / "tutorial.md").read_text()
+    assert Path(command("vnet", "docs", "--path").strip()).is_relative_to(environment.parent)
+    command("vnet", "new", "--example", "platoon")
+    assert "verdict: valid" in command("vnet", "simulate", "platoon/platoon.toml", "--duration", "6", "--quiet")
 
 
 def test_the_wheel_has_no_studies_and_says_in_one_line_where_they_are(environment: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from vnet.errors import ProgramError, did_you_mean
+from vnet.extras import missed_by
 from vnet.runtime.own_packages import name_clash
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ def load_program(entry: str) -> Program:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:
+        if needed := missed_by(error):
+            raise ProgramError(f"program.entry = {entry!r} {needed}") from error
         missed = getattr(error, "name", None) if isinstance(error, ImportError) else None
         raise _load_error(entry, f"cannot import: {error_line(error)}", missed or module_name) from error
     finally:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from vnet.errors import TransportError, shown
+from vnet.extras import require
 from vnet.transport import keys
 from vnet.transport.credentials import (
     Certificates,
@@ -356,11 +357,9 @@ def certifier(listen: str, names: Sequence[str] = ()) -> Callable[[Sequence[str]
     `names` are further host names or addresses of the router, which clients verify. Raise TransportError if the
     package cryptography is missing; the function raises it for a bad name.
     """
-    try:
-        from vnet.transport.authority import issue_certificates
-    except ImportError:
-        message = "certificates need the package cryptography: pip install 'vnet-emulator[tls]'"
-        raise TransportError(message) from None
+    require("a certificate", "cryptography", error=TransportError)
+    from vnet.transport.authority import issue_certificates
+
     return lambda users: issue_certificates(users, router_names(listen, names))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import select
 import subprocess
@@ -47,6 +46,7 @@ from emulator.world.driven.vehicles import COLLISION, LIMITED, Happening, Log
 from emulator.world.projection import Frame
 from vnet.driving import Action
 from vnet.errors import ScenarioError, VnetError, first_names, printable, shown
+from vnet.extras import require
 from vnet.node import Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
@@ -69,10 +69,7 @@ TRAFFIC_LIGHTS = "traffic_lights"
 
 def require_libsumo(path: Path) -> None:
     """Raise ScenarioError unless libsumo is installed; `path` is the configuration that needs it."""
-    if importlib.util.find_spec(LIBSUMO) is None:
-        raise ScenarioError(
-            f"{path}: network.step = true: libsumo is not installed: pip install 'vnet-emulator[sumo]'"
-        )
+    require(f"{path}: network.step = true", LIBSUMO, error=ScenarioError)
 
 
 class SumoProcess:

@@ -16,13 +16,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from emulator.world.maps.roads import LANE_WIDTH_M, LANES, NUMBER, Ints, Roads, RoadsBuilder
 from emulator.world.projection import Frame
 from vnet.errors import ScenarioError
+from vnet.extras import require
 from vnet.types import Array
 
 STEP_M = 30.0
@@ -148,6 +146,10 @@ class _Plan:
             [self._street[one], self._street[other], self._street[ends], self._street[self._joints]]
         )
         is_above = self._above[street] | np.isin(along, self._joints)
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+        from scipy.spatial import cKDTree
+
         pairs = cKDTree(np.column_stack([at_m, _ABOVE_M * is_above])).query_pairs(MERGE_M, output_type="ndarray")
         same = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(along), len(along)))
         crossings, number = connected_components(same, directed=False)
@@ -164,6 +166,8 @@ class _Plan:
         """
         segment = np.flatnonzero((self._street[:-1] == self._street[1:]) & ~self._above[self._street[:-1]])
         start, step = self.point_m[segment], self.point_m[segment + 1] - self.point_m[segment]
+        from scipy.spatial import cKDTree
+
         pairs = cKDTree(start + step / 2).query_pairs(STEP_M + 2 * _TOUCH_M, output_type="ndarray")
         pairs = pairs[self._street[segment[pairs[:, 0]]] != self._street[segment[pairs[:, 1]]]]
         one, other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
@@ -216,6 +220,9 @@ def _without_stubs(pieces: list[_Piece]) -> list[_Piece]:
 
 def _largest(pieces: list[_Piece], crossings: int) -> list[_Piece]:
     """Return the pieces of the connected component with the greatest length."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     ends = np.array([piece.ends for piece in pieces], dtype=np.intp)
     joined = coo_matrix((np.ones(len(ends)), ends.T), shape=(crossings, crossings))
     _, label = connected_components(joined, directed=False)
@@ -227,10 +234,11 @@ def _largest(pieces: list[_Piece], crossings: int) -> list[_Piece]:
 def city_roads(seed: int, size_m: float = SIZE_M) -> Roads:
     """Return the roads of a generated city, about `size_m` across; the same arguments give the same city.
 
-    Raise ScenarioError unless `size_m` is from `SMALLEST_M` to `LARGEST_M`.
+    Raise ScenarioError unless `size_m` is from `SMALLEST_M` to `LARGEST_M`, and if scipy is not installed.
     """
     if not SMALLEST_M <= size_m <= LARGEST_M:
         raise ScenarioError(f"size_m = {size_m:g}: {SMALLEST_M:g} to {LARGEST_M:g} allowed")
+    require("a generated city", "scipy", error=ScenarioError)
     rng = np.random.default_rng((seed, 0))
     city = _City(rng, size_m / _MARGIN)
     builder = RoadsBuilder(f"city of seed {seed}")

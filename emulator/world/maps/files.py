@@ -28,6 +28,7 @@ from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import Frame
 from vnet.counted import counted
 from vnet.errors import ScenarioError, printable, shown
+from vnet.extras import require
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
@@ -77,12 +78,9 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
 @contextmanager
 def osm_errors(path: Path) -> Iterator[None]:
     """Raise ScenarioError in place of pyosmium's errors, also if it is not installed."""
-    try:
-        import osmium
-    except ImportError:
-        raise ScenarioError(
-            f"{path}: OpenStreetMap files need pyosmium, which is not installed: pip install 'vnet-emulator[maps]'"
-        ) from None
+    require(f"{path}: a file of OpenStreetMap", "osmium", error=ScenarioError)
+    import osmium
+
     try:
         yield
     except osmium.InvalidLocationError as error:

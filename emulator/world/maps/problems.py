@@ -17,13 +17,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from emulator.world.maps.roads import NAMES, Ints, Roads
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError
+from vnet.extras import require
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
@@ -172,6 +170,7 @@ class MapReport:
 def examine(roads: Roads) -> MapReport:
     """Measure a map and count its likely errors."""
     km = roads.length_m / 1000
+    require("the problems of a map", "scipy", error=ScenarioError)
     by_class = {
         NAMES[kind]: (int((roads.kind == kind).sum()), float(km[roads.kind == kind].sum()))
         for kind in np.unique(roads.kind).tolist()
@@ -193,6 +192,9 @@ def _piece_of_node(roads: Roads) -> Ints:
     """Return the connected component (N,) of each point; component 0 has the greatest length of road."""
     start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
     count = len(roads.node_m)
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     joined = coo_matrix((np.ones(len(start)), (start, end)), shape=(count, count))
     pieces, label = connected_components(joined, directed=False)
     length_m = np.bincount(label[start], roads.segment_length_m, minlength=pieces)
@@ -224,6 +226,8 @@ def _add_count(found: dict[str, str], problem: str, count: int) -> None:
 
 
 def _gaps(roads: Roads, degree: Ints, start: Ints, end: Ints) -> int:
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(roads.node_m)
     ends = np.flatnonzero(degree == 1)
     neighbour = np.empty(len(roads.node_m), dtype=np.intp)

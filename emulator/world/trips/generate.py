@@ -13,12 +13,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 from emulator.world.maps.roads import NAMES, VEHICLE_WIDTH_M, Ints, Roads
 from emulator.world.trips.motion import MOST_STATES, SHORTEST_STAY_S, Motion, lateral_offsets_m
 from vnet.errors import ScenarioError
+from vnet.extras import require
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
@@ -90,6 +89,10 @@ class Network:
 
     def __init__(self, source: object, roads: Roads) -> None:
         """Find the component. Raise ScenarioError, naming `source`, if it has fewer than two points."""
+        require(f"{source}: a route on its roads", "scipy", error=ScenarioError)
+        from scipy.sparse import csr_matrix
+        from scipy.sparse.csgraph import connected_components
+
         self.streets = streets = _streets(roads)
         count = len(roads.node_m)
         graph = csr_matrix((streets.time_s, (streets.start, streets.end)), shape=(count, count))
@@ -122,6 +125,8 @@ class Network:
         It begins at a random edge and joins fastest paths to random destinations, without U-turns. It ends early
         where only a U-turn remains.
         """
+        from scipy.sparse.csgraph import dijkstra
+
         for _ in range(TRIES):
             first = self._starts[np.searchsorted(self._starts_by_length, rng.random())]
             route = [int(self.streets.start[first]), int(self.streets.end[first])]

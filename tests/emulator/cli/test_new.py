@@ -1,4 +1,4 @@
-"""`vnet new`: what it writes works as it is, and nothing that exists is overwritten."""
+"""`vnet new` and `vnet docs`: what is written works as it is, and nothing that exists is overwritten."""
 
 from pathlib import Path
 
@@ -6,12 +6,15 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cli.commands import app
+from emulator.cli.new import examples
+from emulator.scenario.loading import load_scenario
+from tests.support.paths import ROOT
 
 runner = CliRunner()
 
 
-def new(name: Path | str) -> tuple[int, str]:
-    done = runner.invoke(app, ["new", str(name)])
+def new(*words: Path | str) -> tuple[int, str]:
+    done = runner.invoke(app, ["new", *map(str, words)])
     return done.exit_code, " ".join(done.output.split())
 
 
@@ -42,3 +45,32 @@ def test_a_name_that_would_hide_a_module_is_refused(tmp_path: Path, name: str) -
     status, output = new(tmp_path / name)
     assert status == 2 and f"{name}: Python has a module of this name" in output
     assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("example", examples())
+def test_an_example_is_copied_so_that_it_stands_alone(example: str, tmp_path: Path) -> None:
+    assert new(tmp_path / "mine", "--example", example)[0] == 0
+    source = ROOT / "docs" / "examples" / example
+    copied = {path.name: path.read_text() for path in (tmp_path / "mine").iterdir()}
+    assert copied.keys() == {path.name for path in source.iterdir() if path.is_file()} - {"__init__.py"}
+    assert not any(place in text for text in copied.values() for place in ("docs.examples", "docs/examples"))
+    if example != "sumo_loop":  # reads the version of libsumo
+        (scenario,) = (tmp_path / "mine").glob("*.toml")
+        assert load_scenario(scenario).program.folders == (tmp_path / "mine",)
+
+
+def test_an_example_that_is_none_is_refused_with_those_there_are(tmp_path: Path) -> None:
+    status, output = new(tmp_path / "mine", "--example", "platon")
+    assert status == 2 and "no example (did you mean platoon?); there are brake_warning, cbf," in output
+    assert new()[0] == 2 and not (tmp_path / "mine").exists()
+
+
+def test_all_pages_are_listed_and_printed_as_they_are() -> None:
+    listed = [line.split()[0] for line in runner.invoke(app, ["docs"]).output.splitlines()]
+    pages = [path for path in (ROOT / "docs").rglob("*.md") if "examples" not in path.parts]
+    assert sorted(listed) == sorted(str(path.relative_to(ROOT / "docs").with_suffix("")) for path in pages)
+    for name in ("how-to/debugging", "debugging", "docs/how-to/debugging.md"):
+        assert runner.invoke(app, ["docs", name]).output == (ROOT / "docs" / "how-to" / "debugging.md").read_text()
+    assert Path(runner.invoke(app, ["docs", "--path"]).output.strip()) == ROOT / "docs"
+    refused = runner.invoke(app, ["docs", "../README"])
+    assert refused.exit_code == 2 and "no page" in refused.output

@@ -56,7 +56,7 @@ def campaign(text: str) -> str:
     return campaign_page(text, [text], {text: {text: Counter({Verdict.INVALID: 1})}}, [failure])
 
 
-@styled
+@styled()
 def drawing(label: str) -> Markup:
     """A picture without anything in it."""
     return to_svg(canvas("x", "y").figure, "key", label)

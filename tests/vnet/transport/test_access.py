@@ -87,7 +87,7 @@ def test_what_cannot_stand_in_a_certificate_is_one_line() -> None:
 
 
 def test_without_cryptography_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "vnet.transport.authority", None)
+    monkeypatch.setitem(sys.modules, "cryptography", None)
     with pytest.raises(TransportError, match=r"pip install 'vnet-emulator\[tls\]'"):
         create(TLS)
 

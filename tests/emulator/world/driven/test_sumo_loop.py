@@ -191,8 +191,10 @@ def test_a_folder_is_read_without_sumo_and_runs_again_only_with_the_same(
 
 
 def test_without_libsumo_it_is_said_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ScenarioError, match=r"libsumo is not installed: pip install 'vnet-emulator\[sumo\]'"):
+    monkeypatch.setitem(sys.modules, "libsumo", None)
+    with pytest.raises(
+        ScenarioError, match=r"network.step = true needs libsumo: pip install 'vnet-emulator\[sumo\]'"
+    ):
         build_world(Scenario.model_validate(write_scenario(tmp_path)))
 
 

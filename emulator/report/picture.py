@@ -1,0 +1,133 @@
+"""A run as one picture, laid out as its recording: heading, map and events on the left, curves on the right.
+
+The figures are those of the report. matplotlib draws them, as Rerun's viewer needs a display or a graphics driver.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any
+
+from emulator.pages.canvas import INK, PAPER, QUIET, WIDTH_PX, styled
+from emulator.pages.text import as_text
+from emulator.records.atomic import atomically
+from emulator.records.events import SAID, SAMPLES, Event
+from emulator.records.run_folder import check_is_run
+from emulator.report.figures import figures_of
+from emulator.report.map_figures import map_charts
+from emulator.report.program_figures import Drawers
+from emulator.report.source import NothingToShow, Source, maybe
+from emulator.report.write import key_figures
+from vnet.errors import VnetError
+from vnet.extras import require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+DPI = 72
+"""Pixels an inch: a point is a pixel."""
+MAP_PX, CURVE_PX = 760, 480
+"""Width of the map, and of each curve."""
+MARGIN_PX, HEADING_PX, TITLE_PX, LINE_PX = 20, 84, 22, 17
+COLUMNS, ROWS = 2, 4
+"""Curves beside the map: the first ones of the report that have data."""
+MOST_EVENTS = 12
+LONGEST_LINE = 104
+"""Letters of a line of an event or of the heading."""
+
+
+def write_picture(folder: Path, path: Path) -> None:
+    """Write a picture (PNG) of a finished run. Raise VnetError if it is none, or the file cannot be written."""
+    require("a picture", "matplotlib")
+    if path.suffix.lower() != ".png":
+        raise VnetError(f"--png {path}: a name that ends with .png is needed")
+    check_is_run(folder)
+    source = Source(folder)
+    with styled():
+        picture = _picture(source)
+        with atomically(path) as part:
+            picture.savefig(part, format="png", dpi=DPI, facecolor=PAPER)
+
+
+def _picture(source: Source) -> Figure:
+    """Return the picture of a run."""
+    from matplotlib.figure import Figure
+
+    problems: list[str] = []
+    chart = next(_drawn({"map": map_charts(source)["map"]}, MAP_PX, problems), None)
+    curves = list(islice(_drawn(figures_of(source), CURVE_PX, problems), COLUMNS * ROWS))
+    rows = [curves[first : first + COLUMNS] for first in range(0, len(curves), COLUMNS)]
+    heights = [TITLE_PX + max(pixels.shape[0] for _, pixels in row) for row in rows]
+    events = [line[:LONGEST_LINE] for line in (*_events(source), *problems)]
+    left_px = (TITLE_PX + chart[1].shape[0] if chart else 0) + (TITLE_PX + LINE_PX * len(events))
+    height_px = HEADING_PX + max(left_px, sum(heights)) + MARGIN_PX
+    width_px = 3 * MARGIN_PX + MAP_PX + COLUMNS * CURVE_PX
+    figure = Figure(figsize=(width_px / DPI, height_px / DPI), dpi=DPI)
+
+    def write(text: str, x: float, y: float, **look: Any) -> None:
+        figure.text(x / width_px, 1 - y / height_px, as_text(text), va="top", **look)
+
+    def place(title: str, pixels: NDArray[Any], x: int, y: int) -> None:
+        write(title, x + 8, y + 4, fontsize=13, color=INK)
+        figure.figimage(pixels, x, height_px - y - TITLE_PX - pixels.shape[0])
+
+    name, facts = _heading(source)
+    write(name, MARGIN_PX, 16, fontsize=20, color=INK)
+    write(facts, MARGIN_PX, 50, fontsize=13, color=QUIET)
+    y = HEADING_PX
+    if chart:
+        place(*chart, MARGIN_PX, y)
+        y += TITLE_PX + chart[1].shape[0]
+    write("Events", MARGIN_PX + 8, y + 4, fontsize=13, color=INK)
+    for number, line in enumerate(events):
+        write(line, MARGIN_PX + 8, y + TITLE_PX + 4 + LINE_PX * number, color=QUIET)
+    y = HEADING_PX
+    for row, height in zip(rows, heights, strict=True):
+        for column, (title, pixels) in enumerate(row):
+            place(title, pixels, 2 * MARGIN_PX + MAP_PX + column * CURVE_PX, y)
+        y += height
+    return figure
+
+
+def _drawn(drawers: Drawers, width_px: int, problems: list[str]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield title and pixels of each figure for which the run has data; what cannot be drawn is added in words."""
+    from matplotlib.image import imread
+
+    for title, draw in drawers.values():
+        try:
+            figure = draw().canvas.figure
+        except NothingToShow:
+            continue
+        except VnetError as error:
+            problems.append(f"{title} not shown: {error}")
+            continue
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=DPI * width_px / WIDTH_PX, transparent=True)
+        file.seek(0)
+        yield title, imread(file)
+
+
+def _heading(source: Source) -> tuple[str, str]:
+    """Return the name of a run with its verdict, and its figures in a line."""
+    record = maybe(lambda: source.record)
+    name = source.folder.resolve().name
+    if record is None:
+        return name, "without a verdict"
+    facts = " · ".join(f"{title} {value}" for title, value in key_figures(record).items())
+    return f"{name}: {record.verdict.value}", shorten(facts, 2 * LONGEST_LINE, placeholder=" …")
+
+
+def _events(source: Source) -> list[str]:
+    """Return the last events in a line each, without what programs said and samples."""
+    events = [event for event in maybe(lambda: source.events) or () if not event.has(SAMPLES | SAID)]
+    return [_line(event) for event in events[-MOST_EVENTS:]] or ["none"]
+
+
+def _line(event: Event) -> str:
+    who = event.node or event.details.get("fault", "")
+    return f"{event.time_ns / 1e9:8.2f} s   {event.kind}   {who}   {event.said}"
