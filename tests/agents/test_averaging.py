@@ -12,9 +12,8 @@ from agents.cooperative.cmm.consensus import Share
 from agents.cooperative.frame import short_name
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import prepared
 from vnet import Packet
 from vnet.errors import ProgramError
 
@@ -115,7 +114,7 @@ def emulate(folder: Path, options: dict[str, object], duration_s: float = 3.0) -
             "program": {"entry": "agents.averaging:main", "options": options},
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     simulate(emulation)
     assert [e.kind for e in emulation.folder.events if e.node] == []
     return emulation

@@ -10,11 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from docs.examples.hazard import read_warning
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import prepared
 from vnet.reports import Report
 
 WARNING = {"kind": "hazard", "event": "v01/1", "position_m": [1.0, 2.0], "since_ns": 0, "hops": 0}
@@ -40,7 +38,7 @@ def last_reports(
             "fault": faults,
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     found: dict[str, Report] = {}
     emulation.watch(lambda view: found.update({report.node: report for report in view.reports}))
     simulate(emulation)

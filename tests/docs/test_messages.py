@@ -11,14 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
 from tests.docs.layouts import Field, Layouts, split
 from tests.support.paths import ROOT
+from tests.support.recorded import prepared
 from tests.vnet.transport.test_wire import agent_messages, emulator_messages, names, reports, times, unit_messages
 from vnet.backbone import UnitAbilities
 from vnet.driving import Action
@@ -122,7 +120,7 @@ def test_a_plain_reader_decodes_what_observers_get(tmp_path: Path) -> None:
             "fault": [{"kind": "kill", "at_s": 0.3, "duration_s": 0.2, "nodes": {"ids": ["v02"]}}],
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     messages = Messages(emulation)
     told = [("Scene", messages.scene())]
     emulation.watch(lambda view: told.append(("Period", messages.period(view))))

@@ -9,17 +9,13 @@ import pytest
 from docs.generate import PAGES, REFERENCE, faults, files
 from docs.generate.keys import key_table
 from docs.generate.markdown import attribute_docstrings
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import ACKNOWLEDGED, CHOSEN, LATE
-from emulator.records.run_folder import RunFolder
 from emulator.records.tables import BUSY, METRICS, STATES, TABLES, TRACE, Column
 from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import Section
-from emulator.world.world import build_world
+from tests.support.recorded import recorded
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -77,8 +73,7 @@ def test_a_column_without_a_text_is_refused() -> None:
 def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "free_space"}, "mac": {}}
     scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "radio": radio})
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
-    conclude(emulation, simulate(emulation)[0], "simulate")
+    recorded(scenario, tmp_path / "run")
     left = {path.name + "/" * path.is_dir() for path in (tmp_path / "run").iterdir()}
     assert left <= {*files.FOLDER, *(table.file for table in TABLES)}
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())

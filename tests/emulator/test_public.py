@@ -87,6 +87,12 @@ def test_simulate_gives_a_run_with_what_was_changed(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.usefixtures("fit")
+def test_another_seed_is_another_run(tmp_path: Path) -> None:
+    one, two = (emulator.simulate(SMALL, seed=seed, out=tmp_path / str(seed)) for seed in (1, 2))
+    assert not one.trace.equals(two.trace)
+
+
+@pytest.mark.usefixtures("fit")
 def test_simulate_works_inside_a_running_event_loop(tmp_path: Path) -> None:
     async def main() -> emulator.Run:
         return emulator.simulate(SMALL, out=tmp_path / "run")

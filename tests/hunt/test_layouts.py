@@ -7,7 +7,7 @@ from tests.hunt.layouts import differences
 
 @pytest.mark.slow
 def test_random_programs_give_one_trace_in_simulated_layouts() -> None:
-    assert [*differences(range(40))] == []
+    assert [*differences(range(20))] == []
 
 
 @pytest.mark.slow

@@ -11,12 +11,10 @@ import pytest
 
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
-from emulator.world.world import build_world
 from tests.support.paths import ROOT
+from tests.support.recorded import prepared
 from tests.system.conftest import TIMEOUT_S
 from vnet.errors import VnetError
 from vnet.transport.access import Access, node_user
@@ -53,7 +51,7 @@ def run(folder: Path, access: Access, cheat: Cheat | None) -> tuple[dict[str, An
     """A live run; with what the cheater says of it."""
     overrides = ["network.vehicles=4", "run.duration_s=5"]
     scenario = load_scenario(ROOT / "scenarios" / "beacon.toml", overrides)
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     said: list[dict[str, Any]] = []
     on_state = cheat.on_state if cheat else (lambda text: None)
     if cheat:

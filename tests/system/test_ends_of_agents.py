@@ -18,11 +18,16 @@ def dead(done: Finished) -> dict[str, str]:
     return {event["node"]: event["how"] for event in done.events_of("died")}
 
 
-DEATHS = [("segfaults", "SIGSEGV"), ("exits_3", "status 3"), ("exits_0", "status 71"), ("exits_at_exit", "status")]
+DEATHS = [
+    ("segfaults", "SIGSEGV", "lockstep"),
+    ("exits_3", "status 3", "realtime"),
+    ("exits_0", "status 71", "lockstep"),
+    ("exits_at_exit", "status", "realtime"),
+    ("exits_at_exit", "status", "lockstep"),
+]
 
 
-@pytest.mark.parametrize(("program", "how"), DEATHS)
-@pytest.mark.parametrize("pacing", ["lockstep", "realtime"])
+@pytest.mark.parametrize(("program", "how", "pacing"), DEATHS)
 def test_a_death_once_the_run_is_over_counts_and_what_was_unhandled_is_told(
     vnet: Vnet, program: str, how: str, pacing: str
 ) -> None:

@@ -10,13 +10,11 @@ from typing import Any
 
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
-from emulator.world.world import build_world
 from tests.support.processes import has_ended
+from tests.support.recorded import prepared
 from tests.system.conftest import TIMEOUT_S, Vnet, running_agents, zygote_of
 from tests.system.test_faults import write
 from vnet.transport.access import Access
@@ -72,7 +70,7 @@ def test_no_agent_has_the_password_of_another_and_all_go_on_without_their_zygote
     scenario = load_scenario(Path(write(tmp_path, [restart], run=run, network={"vehicles": 3})))
     traces = []
     for name in ("live", "simulated"):
-        emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / name, scenario))
+        emulation = prepared(scenario, tmp_path / name)
         if name == "live":
             witness = Witness(tmp_path / name, access)
             emulation.watch(witness.look)

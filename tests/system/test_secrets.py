@@ -9,13 +9,11 @@ import pytest
 
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
 from emulator.viewer.sinks import Sinks
-from emulator.world.world import build_world
 from tests.support.paths import ROOT
+from tests.support.recorded import prepared
 from tests.system.conftest import running_agents
 from vnet.transport.access import Access, certifier
 from vnet.transport.credentials import KeyPair
@@ -46,7 +44,7 @@ def test_a_run_shows_no_secret(
     monkeypatch.setenv("RUST_LOG", "debug")  # Zenoh in the agents says all it can
     access, folder = create(listen), tmp_path / "run"
     scenario = load_scenario(ROOT / "scenarios" / "beacon.toml", ["network.vehicles=3", "run.duration_s=2"])
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     seen: dict[int, bytes] = {}
 
     def look(_: object) -> None:

@@ -12,10 +12,9 @@ import pytest
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
-from emulator.world.world import build_world
 from tests.support.paths import ROOT
+from tests.support.recorded import prepared
 from vnet.errors import VnetError
 from vnet.transport.access import Access
 
@@ -40,7 +39,7 @@ def emulation_of(folder: Path, *overrides: str) -> Emulation:
     scenario = load_scenario(
         ROOT / "scenarios" / "beacon.toml", ["network.vehicles=2", "run.duration_s=1", *overrides]
     )
-    return Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    return prepared(scenario, folder)
 
 
 def live(emulation: Emulation, **options: Any) -> bool:

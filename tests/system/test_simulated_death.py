@@ -40,10 +40,8 @@ def scenario(folder: Path) -> None:
     "end",
     [
         FAULT,
-        "os.kill(os.getpid(), signal.SIGSEGV)",
         "ctypes.CDLL(None)._exit(0)",
         "await asyncio.to_thread(ctypes.string_at, 0)",
-        "thread = threading.Thread(target=ctypes.string_at, args=(0,)); thread.start(); thread.join()",
     ],
 )
 def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end: str) -> None:
@@ -56,10 +54,9 @@ def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end:
     assert "v02" in done.stdout
 
 
-@pytest.mark.parametrize("processes", ["1", "2"])
 @pytest.mark.parametrize(
-    ("endless", "kind", "status"),
-    [("while True: pass", "stalled", 3), ("ctypes.CDLL(None).pthread_exit(None)", "died", 1)],
+    ("endless", "kind", "status", "processes"),
+    [("while True: pass", "stalled", 3, "1"), ("ctypes.CDLL(None).pthread_exit(None)", "died", 1, "2")],
 )
 def test_a_program_that_stalls_ends_the_run_with_its_name(
     tmp_path: Path, endless: str, kind: str, status: int, processes: str

@@ -4,8 +4,6 @@ import os
 import subprocess
 from pathlib import Path
 
-import pytest
-
 from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
 from tests.system.conftest import PATIENT, TIMEOUT_S, Finished, Vnet
@@ -28,9 +26,8 @@ def run_slowly(folder: Path, *words: str) -> Finished:
     return Finished(done.returncode, done.stdout, done.stderr, folder)
 
 
-@pytest.mark.parametrize(("name", "duration_s"), [("faults", 20), ("quickstart", 2)])
-def test_a_slow_machine_gives_the_same_verdict(vnet: Vnet, tmp_path: Path, name: str, duration_s: int) -> None:
-    words = [f"scenarios/{name}.toml", "--duration", str(duration_s)]  # the faults have healed by then
+def test_a_slow_machine_gives_the_same_verdict(vnet: Vnet, tmp_path: Path) -> None:
+    words = ["scenarios/faults.toml", "--duration", "20"]  # the faults have healed by then
     fast, slow = vnet("simulate", *words), run_slowly(tmp_path / "slow", *words)
     assert slow.status == fast.status == 0, slow.stderr + slow.stdout
     assert slow.fingerprint == fast.fingerprint

@@ -16,11 +16,9 @@ from agents.cooperative.estimator import Estimator, usable
 from agents.cooperative.fix_table import CAPACITY, FixTable
 from agents.cooperative.frame import RELAYED, CooperativeFrame, decode, encode, short_name
 from agents.cooperative.options import Options
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import prepared
 from vnet import Fix, Packet
 from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
@@ -388,7 +386,7 @@ def test_a_scenario_may_have_a_liar_and_what_is_rejected_is_reported(
     program = {"entry": "agents.cooperative:main", "options": options, "exceptions": [liar]}
     network = {"vehicles": 6, "layout": "dense"}
     scenario = Scenario.model_validate({"run": {"duration_s": 2.5}, "network": network, "program": program})
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     simulate(emulation)
     states = emulation.metrics.states_table().to_pylist()
     last = {row["node"]: row for row in states if row["period"] == 20}

@@ -10,15 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from emulator.checks.judge import Judgement, Verdict, check_run
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
 from emulator.records.manifest import write_manifest
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
 from tests.support.folder_edits import EDITS, Edit, forge, listing, table
 from tests.support.paths import ROOT
+from tests.support.recorded import recorded
 
 SETTINGS = {
     "run": {"duration_s": 4.0, "settle_s": 1.0},
@@ -32,9 +29,7 @@ OF_DIGESTS = {"files", "trace_sha256"}
 
 def simulated(folder: Path, **changes: object) -> Path:
     scenario = Scenario.model_validate(SETTINGS | changes)
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    conclude(emulation, simulate(emulation)[0], "simulate")
-    return folder
+    return recorded(scenario, folder)
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import prepared
 
 pytestmark = pytest.mark.slow
 
@@ -24,7 +22,7 @@ ODD: dict[str, dict[str, Any]] = {
 
 def run(folder: Path, data: dict[str, Any]) -> list[Any]:
     scenario = Scenario.model_validate({"run": {"duration_s": 2.0}, "network": {"vehicles": 4}, **data})
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     simulate(emulation)
     assert [event for event in emulation.folder.events if event.kind == "crashed"] == []
     assert all(emulation.up.values())

@@ -34,7 +34,7 @@ def taped(scenario: Scenario, run: Emulation, folder: Path) -> Scenario:
 
 
 @pytest.mark.slow
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     scenario=scenarios(),
     kind=st.sampled_from(["shuffle", "pct"]),
@@ -70,7 +70,7 @@ def test_a_timer_that_was_cancelled_is_no_option_wherever_a_vehicle_runs(kind: s
 
 
 @pytest.mark.slow
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(scenario=scenarios())
 def test_an_empty_tape_is_fifo(scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> None:
     """All decisions are made, each as FIFO makes it, whatever vehicles do with executors, timers and mail."""

@@ -44,11 +44,11 @@ async def sends(node: Node) -> None:
 async def forgets(node: Node) -> None:
     """Cancel sends early or late, and go on with others; v01 ends in the midst of one."""
     to = "v02" if node.id != "v02" else "v03"
-    for turn in range(60):
+    for turn in range(30):
         task = asyncio.create_task(node.radio.send(to, bytes(400)))
         await asyncio.sleep(float(node.rng.uniform(0, 0.006)))
         task.cancel()
-        if turn == 30 and node.id == "v01":
+        if turn == 15 and node.id == "v01":
             return
         node.event("turn", done=task.done(), waits=node.radio.is_sending)
 

@@ -8,9 +8,8 @@ import pytest
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.simulate import simulate
 from emulator.drivers.status import BINS, Course, Snapshot
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import prepared
 
 KILLED = {"kind": "kill", "at_s": 1.0, "duration_s": 1.0, "nodes": {"ids": ["v02"]}}
 PERIOD_WALL_S = 0.05
@@ -36,7 +35,7 @@ def emulate(folder: Path, **sections: object) -> Emulation:
     scenario = Scenario.model_validate(
         {"run": run, "network": network, "radio": {"loss": 0.2, "range_m": 1e5}, **sections}
     )
-    return Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    return prepared(scenario, folder)
 
 
 @pytest.fixture(scope="module")

@@ -89,7 +89,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     return scenario.model_copy(update={"fault": drawn})
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(scenarios())
 def test_random_runs_are_the_same_with_and_without_windows(scenario: Scenario) -> None:
     reference = fingerprint(simulated(scenario, False))
@@ -112,7 +112,7 @@ def test_a_medium_under_heavy_load_is_the_same_with_and_without_windows() -> Non
     assert same(fingerprint(simulated(scenario, True)), fingerprint(reference))
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(latency_ms=st.sampled_from([0.001, 2.0, 250.0]), seed=st.integers(0, 1000), data=st.data())
 def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
     latency_ms: float, seed: int, data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
@@ -220,7 +220,7 @@ def stepped(scenario: Scenario, windows: bool, stops_s: Sequence[float]) -> Emul
     return emulation
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(
     stops_ms=st.lists(st.integers(1, 900_000), min_size=2, max_size=4, unique=True).map(sorted),
     latency_ms=st.sampled_from([0.001, 2.0, 250.0]),

@@ -52,7 +52,7 @@ def test_with_everything_at_once_each_reception_has_one_outcome_and_all_are_coun
 
 
 @pytest.mark.slow
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.integers(0, 1000), st.data())
 def test_one_more_fault_changes_no_reception_it_does_not_touch(seed: int, data: st.DataObject) -> None:
     """Outcomes, arrivals and bytes of all other pairs stay the same; only the numbers of copies may shift."""
@@ -92,7 +92,7 @@ def test_copies_of_one_fault_do_not_depend_on_how_many_another_made() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.integers(0, 1000), st.lists(st.sampled_from(EVERYTHING), max_size=5))
 def test_one_more_vehicle_out_of_range_changes_no_draws_of_others(seed: int, faults: list[dict[str, Any]]) -> None:
     fixed = [f | {"nodes": {"ids": ["v1", "v3"]}} if "nodes" in f else f for f in faults]
@@ -108,7 +108,7 @@ def test_one_more_vehicle_out_of_range_changes_no_draws_of_others(seed: int, fau
 
 
 @pytest.mark.slow
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.integers(0, 1000), st.data())
 def test_after_all_have_ended_the_engine_is_as_one_that_never_had_faults(seed: int, data: st.DataObject) -> None:
     """Any faults, in any order of ending, healed early, twice, or before they begin."""

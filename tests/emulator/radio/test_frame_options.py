@@ -147,7 +147,7 @@ def test_the_checks_know_of_powers_and_rates(mac: bool, tmp_path: Path) -> None:
         **({"mac": {}} if mac else {}),
     }
     scenario = {
-        "run": {"duration_s": 4.0, "settle_s": 0.0},
+        "run": {"duration_s": 2.0, "settle_s": 0.0},
         "network": {"vehicles": 8, "layout": "dense"},
         "radio": {**radio, "fading": {}},
     }

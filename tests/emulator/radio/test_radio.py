@@ -9,17 +9,15 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
 from emulator.radio.propagation import MeanPower, Nakagami
 from emulator.radio.topology import Topology, connectivity_of, distances_m
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import dump_scenario, load_scenario
 from emulator.scenario.scenario import Radio, Scenario
-from emulator.world.world import build_world
 from tests.support.motion import along, scenario_of_trips, write_trips
 from tests.support.radio import engine, line, nist_qpsk_half
+from tests.support.recorded import prepared
 
 MS = 1_000_000
 PERIOD_NS = 100 * MS
@@ -81,7 +79,7 @@ def test_where_vehicles_drive_powers_are_worked_out_once_a_period(
     path = write_trips(tmp_path / "trips.csv", {f"c{n}": [(0.0, 3.0, along(60.0 * n, 20.0 * n))] for n in range(4)})
     scenario = scenario_of_trips(path, 2.0, radio={"path_loss": {"kind": "log_distance"}, "mac": {}})
     counted = Counted(monkeypatch)
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     simulate(emulation)
     assert len(emulation.engine.trace) > 50
     assert counted.times == 2 * 5, "two seconds, five periods each"

@@ -11,14 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from emulator.checks.judge import check_run
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
 from emulator.records import run_tables
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.stream.playback import messages
-from emulator.world.world import build_world
+from tests.support.recorded import recorded
 from vnet.errors import VnetError
 
 FILES = (
@@ -37,10 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenario = Scenario.model_validate(
         {"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "program": {"entry": "agents.beacon:main"}}
     )
-    folder = tmp_path_factory.mktemp("foreign") / "run"
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    conclude(emulation, simulate(emulation)[0], "simulate")
-    return folder
+    return recorded(scenario, tmp_path_factory.mktemp("foreign") / "run")
 
 
 @pytest.fixture

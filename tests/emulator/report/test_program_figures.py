@@ -4,17 +4,13 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
 from emulator.pages.canvas import BLUE, canvas
-from emulator.records.run_folder import RunFolder
 from emulator.report.drawing import Line, draw_charts, time_figure
 from emulator.report.map_figures import _draw_names, classes, map_charts
 from emulator.report.program_figures import points, program_charts, text_shares, usual_periods
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import recorded
 from vnet import Node
 
 
@@ -45,8 +41,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Source:
             "program": {"entry": f"{__name__}:talkative"},
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    conclude(emulation, simulate(emulation)[0], "simulate")
+    recorded(scenario, folder)
     return Source(folder)
 
 

@@ -11,18 +11,17 @@ import pyarrow.parquet as pq
 import pytest
 
 from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation, PeriodView
+from emulator.drivers.emulation import PeriodView
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import RunFolder
 from emulator.records.tables import mean_busy
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import LATENCY_BIN_NS, LATENCY_BINS, unpack, unpack_pairs
 from emulator.stream.playback import messages
-from emulator.world.world import build_world
 from tests.support.paths import ROOT
+from tests.support.recorded import prepared
 from vnet.errors import VnetError
 from vnet.transport import wire
 
@@ -58,7 +57,7 @@ def crossed(message: dict[str, Any]) -> dict[str, Any]:
 
 
 def watch(scenario: Scenario, folder: Path) -> Watched:
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     live = Messages(emulation)
     told = [("scene", crossed(live.scene()))]
     emulation.watch(lambda view: told.append(("period", crossed(live.period(view)))))
@@ -200,7 +199,7 @@ def test_who_comes_late_is_told_of_whole_periods(watched: Watched, tmp_path: Pat
     scenario = Scenario.model_validate(
         {"run": {"duration_s": 1.0}, "network": {"vehicles": NODES}, "program": {"entry": "agents.beacon:main"}}
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     always, late = Messages(emulation), Messages(emulation)
     told: list[tuple[dict[str, Any], dict[str, Any]]] = []
 

@@ -13,13 +13,9 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from emulator.cli.commands import app
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.safe_console import SafeConsole
-from emulator.world.world import build_world
+from tests.support.recorded import recorded
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\x00[/red] :smile:"
 
@@ -51,10 +47,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenario = Scenario.model_validate(
         {"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "program": {"entry": "agents.beacon:main"}}
     )
-    folder = tmp_path_factory.mktemp("safe") / "run"
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    conclude(emulation, simulate(emulation)[0], "simulate")
-    return folder
+    return recorded(scenario, tmp_path_factory.mktemp("safe") / "run")
 
 
 def of_events(folder: Path) -> None:

@@ -6,15 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
-from emulator.world.world import build_world
 from tests.emulator.viewer.test_recorder import views
+from tests.support.recorded import prepared
 from tests.support.recordings import Entity, read_back
 from vnet import Node
 
@@ -43,7 +41,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "program": {"entry": f"{__name__}:program"},
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder / "run", scenario))
+    emulation = prepared(scenario, folder / "run")
     messages = Messages(emulation)
     with Recorder(Sinks(save=folder / "recording.rrd", vehicle="v02"), "run") as recorder:
         recorder.take("scene", messages.scene())

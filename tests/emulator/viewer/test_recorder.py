@@ -9,11 +9,9 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from agents.cooperative.declared import paper_rmse
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
@@ -29,7 +27,7 @@ from emulator.viewer.radio_scene import STROKES, delivery_by_distance
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
 from emulator.viewer.vehicle_scene import range_rings_m
-from emulator.world.world import build_world
+from tests.support.recorded import prepared
 from tests.support.recordings import Entity, read_back, rrd
 from vnet.errors import VnetError
 from vnet.transport import wire
@@ -56,7 +54,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Told:
         }
     )
     folder = tmp_path_factory.mktemp("told") / "run"
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     messages = Messages(emulation)
     told = [("scene", messages.scene())]
     emulation.watch(lambda view: told.append(("period", messages.period(view))))

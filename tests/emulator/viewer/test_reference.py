@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import pack, unpack
 from emulator.viewer.overview_scene import DrawnReference
-from emulator.world.world import build_world
+from tests.support.recorded import prepared
 from vnet.node import Node
 
 DECLARES = "agents.cooperative.declared"
@@ -33,7 +31,7 @@ def tell(folder: Path, program: str, **sections: dict[str, Any]) -> list[dict[st
         **sections,
     }
     scenario = Scenario.model_validate(data)
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    emulation = prepared(scenario, folder)
     messages = Messages(emulation)
     told = [messages.scene()]
     emulation.watch(lambda view: told.append(messages.period(view)))

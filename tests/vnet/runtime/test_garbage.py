@@ -10,7 +10,7 @@ import pytest
 from tests.vnet.runtime.test_host import World
 from vnet import Node
 from vnet.reports import Report
-from vnet.runtime import host
+from vnet.runtime import host, outside_loop
 from vnet.runtime.outside_loop import MOST_UNCOLLECTED, collected_by_schedule
 from vnet.transport import wire
 
@@ -46,6 +46,26 @@ def test_the_collector_waits_within_the_block_alone(thresholds: tuple[int, int, 
         assert gc.get_threshold()[0] == MOST_UNCOLLECTED
     assert gc.get_threshold() == (500, 7, 8)
     assert gc.get_freeze_count() == 0
+
+
+@pytest.mark.parametrize(
+    ("objects_before", "threshold", "collects"), [(1, 700, True), (1, 0, False), (10**9, 700, False)]
+)
+def test_what_earlier_runs_have_left_is_collected_once_it_is_much(
+    objects_before: int,
+    threshold: int,
+    collects: bool,
+    thresholds: tuple[int, int, int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gc.unfreeze()  # what an earlier test has left
+    monkeypatch.setattr(outside_loop, "_objects", objects_before)
+    found: list[bool] = []
+    left = InCycle(lambda: found.append(True))
+    gc.set_threshold(threshold and 10**9)
+    del left
+    with collected_by_schedule():
+        assert bool(found) is collects
 
 
 def test_a_collector_that_is_switched_off_by_its_threshold_stays_so(thresholds: tuple[int, int, int]) -> None:

@@ -1,7 +1,10 @@
 """Surroundings of the parts of a live run, without processes and without Zenoh: it notes what it is told to do."""
 
+import asyncio
+import contextlib
 import signal
 from collections.abc import Callable, Coroutine, Iterable, Sequence
+from functools import wraps
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,16 +28,32 @@ IDS = ["v01", "v02", "v03", "v04"]
 ALONE = [[node] for node in IDS]
 
 
-def in_virtual_time(main: Coroutine[Any, Any, None], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run `main` on a loop that skips all waiting; the drivers take their clock from it."""
-    loop = VirtualTimeLoop(skip_to)
-    clock = SimpleNamespace(monotonic_ns=lambda: loop.now_ns, monotonic=lambda: loop.now_ns / NS_PER_S)
-    for module in (fleet, processes, realtime):
-        monkeypatch.setattr(module, "time", clock)
-    try:
-        loop.run_until_complete(main)
-    finally:
-        loop.close()
+AsyncTest = Callable[..., Coroutine[Any, Any, None]]
+
+
+def in_virtual_time(test: AsyncTest) -> Callable[..., None]:
+    """Run a test on a loop that skips all waiting; the drivers take their clock from it."""
+
+    @wraps(test)
+    def run(**fixtures: Any) -> None:
+        loop = VirtualTimeLoop(skip_to)
+        clock = SimpleNamespace(monotonic_ns=lambda: loop.now_ns, monotonic=lambda: loop.now_ns / NS_PER_S)
+        with pytest.MonkeyPatch.context() as patch, contextlib.closing(loop):
+            for module in (fleet, processes, realtime):
+                patch.setattr(module, "time", clock)
+            loop.run_until_complete(test(**fixtures))
+
+    return run
+
+
+def on_a_loop(test: AsyncTest) -> Callable[..., None]:
+    """Run a test on a loop of asyncio's."""
+
+    @wraps(test)
+    def run(**fixtures: Any) -> None:
+        asyncio.run(test(**fixtures))
+
+    return run
 
 
 def skip_to(next_timer_ns: int | None) -> int:

@@ -188,44 +188,40 @@ def test_nothing_is_said_to_a_process_that_is_not_there() -> None:
     run(main)
 
 
-def test_a_host_that_is_gone_takes_its_processes_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def main() -> None:
-        play = Play()
-        play.join()
-        await play.bundles()
-        play.fleet.take_token("b", False)
-        assert play.came == [], "its last messages may still arrive"
-        await asyncio.sleep(DEATH_GRACE_S + 0.1)
-        lost = (["v03", "v04"], "the connection of host b closed")
-        assert play.came == [("v03", False), ("v04", False), lost]
-        assert list(play.fleet.pids) == ["v01"]
-        play.fleet.take("b", hello("b", b"2"))
-        assert "the run goes on without it" in play.refused[0]
-        play.fleet.send("v03", GRANT)
-        assert await play.bundles() == []
-        play.came.clear()
-        play.fleet.start_agents("", play.access, [["v03"]])  # a fault heals
-        await asyncio.sleep(0)
-        assert play.came[-1] == (["v03"], "the connection of host b closed")
-
-    in_virtual_time(main(), monkeypatch)
+@in_virtual_time
+async def test_a_host_that_is_gone_takes_its_processes_along() -> None:
+    play = Play()
+    play.join()
+    await play.bundles()
+    play.fleet.take_token("b", False)
+    assert play.came == [], "its last messages may still arrive"
+    await asyncio.sleep(DEATH_GRACE_S + 0.1)
+    lost = (["v03", "v04"], "the connection of host b closed")
+    assert play.came == [("v03", False), ("v04", False), lost]
+    assert list(play.fleet.pids) == ["v01"]
+    play.fleet.take("b", hello("b", b"2"))
+    assert "the run goes on without it" in play.refused[0]
+    play.fleet.send("v03", GRANT)
+    assert await play.bundles() == []
+    play.came.clear()
+    play.fleet.start_agents("", play.access, [["v03"]])  # a fault heals
+    await asyncio.sleep(0)
+    assert play.came[-1] == (["v03"], "the connection of host b closed")
 
 
-def test_the_end_waits_for_what_is_handed_in_and_not_for_the_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def main() -> None:
-        play = Play()
-        play.join()
-        await play.bundles()
-        ending = asyncio.ensure_future(play.fleet.hand_in(1.0))
-        assert [host for host, _ in await play.bundles()] == ["a", "b"]
-        play.news("a", ("handing_in",))
-        await asyncio.sleep(4 * ANSWER_PATIENCE_S)  # on a machine that is busy
-        assert not ending.done()
-        play.news("a", ("handed_in",))
-        play.fleet.take_token("a", False)
-        await ending
-        silent = [event for event in play.emulation.folder.events if event.kind == "host_silent"]
-        assert [event.details["host"] for event in silent] == ["b"]
-        assert [orders for _, orders in await play.bundles()] == [[("leave",)], [("leave",)]]
-
-    in_virtual_time(main(), monkeypatch)
+@in_virtual_time
+async def test_the_end_waits_for_what_is_handed_in_and_not_for_the_silent() -> None:
+    play = Play()
+    play.join()
+    await play.bundles()
+    ending = asyncio.ensure_future(play.fleet.hand_in(1.0))
+    assert [host for host, _ in await play.bundles()] == ["a", "b"]
+    play.news("a", ("handing_in",))
+    await asyncio.sleep(4 * ANSWER_PATIENCE_S)  # on a machine that is busy
+    assert not ending.done()
+    play.news("a", ("handed_in",))
+    play.fleet.take_token("a", False)
+    await ending
+    silent = [event for event in play.emulation.folder.events if event.kind == "host_silent"]
+    assert [event.details["host"] for event in silent] == ["b"]
+    assert [orders for _, orders in await play.bundles()] == [[("leave",)], [("leave",)]]

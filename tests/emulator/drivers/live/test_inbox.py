@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.processes import Heard
-from tests.emulator.drivers.live.fakes import Stage, hello
+from tests.emulator.drivers.live.fakes import Stage, hello, on_a_loop
 from vnet.transport import wire
 
 
@@ -46,33 +46,31 @@ def yield_of(seq: int, nonce: bytes = b"1") -> bytes:
     return wire.encode(wire.Yield(nonce, seq, None, (), (), (), 1))
 
 
-def test_what_threads_put_comes_out_on_the_loop_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def run() -> None:
-        post = Post()
-        loop_thread = threading.current_thread()
-        taken: list[tuple[str, Any]] = []
-        take = post.live.take
+@on_a_loop
+async def test_what_threads_put_comes_out_on_the_loop_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    post = Post()
+    loop_thread = threading.current_thread()
+    taken: list[tuple[str, Any]] = []
+    take = post.live.take
 
-        def noting(what: str, name: str, item: Any) -> None:
-            taken.append((what, threading.current_thread()))
-            take(what, name, item)
+    def noting(what: str, name: str, item: Any) -> None:
+        taken.append((what, threading.current_thread()))
+        take(what, name, item)
 
-        monkeypatch.setattr(post.live, "take", noting)
+    monkeypatch.setattr(post.live, "take", noting)
 
-        def zenoh() -> None:
-            for node in ("v03", "v01", "v02"):
-                post.hear(node, yield_of(0))
-            post.live.hear("token", "v02", True)
-            post.live.hear("token", "v02", False)
-            post.live.hear("query", "status", "a query")
+    def zenoh() -> None:
+        for node in ("v03", "v01", "v02"):
+            post.hear(node, yield_of(0))
+        post.live.hear("token", "v02", True)
+        post.live.hear("token", "v02", False)
+        post.live.hear("query", "status", "a query")
 
-        await asyncio.to_thread(zenoh)
-        await post.settle()
-        assert taken == [(w, loop_thread) for w in ("message", "message", "message", "token", "token", "query")]
-        assert await post.came() == [("v03", 0), ("v01", 0), ("v02", 0)]
-        assert post.stage.queries == [("status", "a query")]
-
-    asyncio.run(run())
+    await asyncio.to_thread(zenoh)
+    await post.settle()
+    assert taken == [(w, loop_thread) for w in ("message", "message", "message", "token", "token", "query")]
+    assert await post.came() == [("v03", 0), ("v01", 0), ("v02", 0)]
+    assert post.stage.queries == [("status", "a query")]
 
 
 @pytest.mark.parametrize(
@@ -84,77 +82,65 @@ def test_what_threads_put_comes_out_on_the_loop_in_order(monkeypatch: pytest.Mon
         (b"", "0 bytes are not a message"),
     ],
 )
-def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: bytes, reason: str) -> None:
-    async def run() -> None:
-        post = Post()
-        post.hear("v01", payload)
-        post.hear("v01", yield_of(0))
-        await post.settle()
-        assert await post.came() == [("v01", 0)]
-        ((node, said),) = post.refused
-        assert node == "v01" and said.startswith(reason)
-
-    asyncio.run(run())
+@on_a_loop
+async def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: bytes, reason: str) -> None:
+    post = Post()
+    post.hear("v01", payload)
+    post.hear("v01", yield_of(0))
+    await post.settle()
+    assert await post.came() == [("v01", 0)]
+    ((node, said),) = post.refused
+    assert node == "v01" and said.startswith(reason)
 
 
-def test_a_yield_of_another_window_is_refused_as_it_comes_and_so_is_a_second_one() -> None:
-    async def run() -> None:
-        post = Post()
-        for seq in (7, 0, 0):
-            post.hear("v01", yield_of(seq))
-        await post.settle()
-        assert await post.came() == [("v01", 0)]
-        assert [reason for _, reason in post.refused] == ["yield 7 of v01: expected 0"]  # the first of each key
-        post.live.write_refused()
-        (total,) = [e.details["count"] for e in post.stage.emulation.folder.events if e.kind == "refused_total"]
-        assert total == 2
-
-    asyncio.run(run())
+@on_a_loop
+async def test_a_yield_of_another_window_is_refused_as_it_comes_and_so_is_a_second_one() -> None:
+    post = Post()
+    for seq in (7, 0, 0):
+        post.hear("v01", yield_of(seq))
+    await post.settle()
+    assert await post.came() == [("v01", 0)]
+    assert [reason for _, reason in post.refused] == ["yield 7 of v01: expected 0"]  # the first of each key
+    post.live.write_refused()
+    (total,) = [e.details["count"] for e in post.stage.emulation.folder.events if e.kind == "refused_total"]
+    assert total == 2
 
 
-def test_a_hello_needs_no_nonce_that_is_known() -> None:
-    async def run() -> None:
-        post = Post()
-        post.hear("v09", wire.encode(hello("v09", nonce=b"new")))
-        await post.settle()
-        assert post.refused == [("v09", "'v09' is not a node of this run")]
-
-    asyncio.run(run())
+@on_a_loop
+async def test_a_hello_needs_no_nonce_that_is_known() -> None:
+    post = Post()
+    post.hear("v09", wire.encode(hello("v09", nonce=b"new")))
+    await post.settle()
+    assert post.refused == [("v09", "'v09' is not a node of this run")]
 
 
-def test_of_each_key_the_first_refusal_is_logged_and_all_are_counted() -> None:
-    async def run() -> None:
-        post = Post()
-        for node in ("v01", "v02", "v01", "v01"):
-            post.hear(node, b"nonsense")
-        await post.settle()
-        assert [node for node, _ in post.refused] == ["v01", "v02"]
-        post.live.write_refused()
-        events = post.stage.emulation.folder.events
-        totals = {e.details["key"]: e.details["count"] for e in events if e.kind == "refused_total"}
-        assert sorted(totals.values()) == [1, 3]
-
-    asyncio.run(run())
+@on_a_loop
+async def test_of_each_key_the_first_refusal_is_logged_and_all_are_counted() -> None:
+    post = Post()
+    for node in ("v01", "v02", "v01", "v01"):
+        post.hear(node, b"nonsense")
+    await post.settle()
+    assert [node for node, _ in post.refused] == ["v01", "v02"]
+    post.live.write_refused()
+    events = post.stage.emulation.folder.events
+    totals = {e.details["key"]: e.details["count"] for e in events if e.kind == "refused_total"}
+    assert sorted(totals.values()) == [1, 3]
 
 
-def test_connections_are_kept() -> None:
-    async def run() -> None:
-        post = Post()
-        for node, alive in (("v01", True), ("v02", True), ("v01", False)):
-            post.live.hear("token", node, alive)
-        await post.settle()
-        assert post.live.connected == {"v02"}
-
-    asyncio.run(run())
+@on_a_loop
+async def test_connections_are_kept() -> None:
+    post = Post()
+    for node, alive in (("v01", True), ("v02", True), ("v01", False)):
+        post.live.hear("token", node, alive)
+    await post.settle()
+    assert post.live.connected == {"v02"}
 
 
-def test_once_closed_nothing_is_handled_any_more() -> None:
-    async def run() -> None:
-        post = Post()
-        post.hear("v01", yield_of(0))
-        post.live.close()
-        post.hear("v02", yield_of(0))
-        await post.settle()
-        assert await post.came() == []
-
-    asyncio.run(run())
+@on_a_loop
+async def test_once_closed_nothing_is_handled_any_more() -> None:
+    post = Post()
+    post.hear("v01", yield_of(0))
+    post.live.close()
+    post.hear("v02", yield_of(0))
+    await post.settle()
+    assert await post.came() == []

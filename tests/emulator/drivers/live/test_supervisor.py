@@ -4,7 +4,6 @@ import asyncio
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
@@ -13,21 +12,11 @@ from hypothesis import strategies as st
 
 from emulator.drivers.launch import Exit
 from emulator.drivers.live.supervisor import ProcessState
-from tests.emulator.drivers.live.fakes import ALONE, IDS, Stage
+from tests.emulator.drivers.live.fakes import ALONE, IDS, Stage, on_a_loop
 from vnet.errors import VnetError
 from vnet.transport import wire
 
 RUNNING, PAUSED, AWAY, RETURNING, DEAD = ProcessState
-
-
-def on_a_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]:
-    """Run a coroutine test on an event loop of its own."""
-
-    def run() -> None:
-        asyncio.run(test())
-
-    run.__name__ = test.__name__
-    return run
 
 
 def states(stage: Stage) -> list[ProcessState]:

@@ -18,6 +18,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import scene_message, unpack
 from emulator.world.world import build_world
 from tests.support.motion import Course, Stay, along, scenario_of_trips, write_trips
+from tests.support.recorded import prepared
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
 
@@ -92,7 +93,7 @@ def test_what_the_map_may_be_shifted_by_is_stated_and_not_exchanged(tmp_path: Pa
         scenario = driving(tmp_path, seconds=4.0, sigma_m=1.0, datum_sigma_m=sigma_m)
         options = {"exchange": exchange, "particles": 100}
         scenario = scenario.model_copy(update={"program": scenario.program.model_copy(update={"options": options})})
-        emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / f"{sigma_m}", scenario))
+        emulation = prepared(scenario, tmp_path / f"{sigma_m}")
         simulate(emulation)
         last = emulation.metrics.rows[-1]
         anees.append((last.common_error_anees, last.position_anees))
@@ -136,7 +137,7 @@ def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> 
     section = {"path": str(write_cross(tmp_path / "cross.geojson")), "origin_deg": list(ORIGIN_DEG)}
     scenario = scenario_of_trips(trips, 11.8, "agents.centralized:main", radio={"loss": 0.0})
     scenario = Scenario.model_validate(scenario.model_dump(mode="json", exclude_none=True) | {"map": section})
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     simulate(emulation)
     error = [row.common_error_rmse_m for row in emulation.metrics.rows]
     left = 41  # the period after the one in which b leaves
