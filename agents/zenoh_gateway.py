@@ -45,7 +45,7 @@ END_S = 0.5
 REMOTE = zenoh.Locality.REMOTE
 
 
-class Crossing(msgspec.Struct, array_like=True, frozen=True):
+class Crossing(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
     """A sample on its way over the radio.
 
     `time` is seconds, nanoseconds and id of its timestamp. `source` stands for its `SourceInfo`, which Python
@@ -64,6 +64,25 @@ class Crossing(msgspec.Struct, array_like=True, frozen=True):
     source: tuple[int, int] | None
 
 
+class Question(msgspec.Struct, array_like=True, frozen=True, tag="query"):
+    """A query on its way over the radio, with its number among those of the asking vehicle."""
+
+    number: int
+    selector: str
+    payload: bytes | None
+    encoding: str | None
+    attachment: bytes | None
+
+
+class Answer(msgspec.Struct, array_like=True, frozen=True, tag="reply"):
+    """A reply to query `number` of vehicle `to`: a sample, or payload and encoding of an error."""
+
+    to: str
+    number: int
+    sample: Crossing | None
+    error: tuple[bytes, str] | None = None
+
+
 class Fragment(msgspec.Struct, array_like=True, frozen=True):
     """Contents of a frame: part `index` of `parts` of the sender's sample `number`."""
 
@@ -76,25 +95,30 @@ class Fragment(msgspec.Struct, array_like=True, frozen=True):
 _sources: OrderedDict[int, zenoh.SourceInfo] = OrderedDict()
 _source_numbers = count()
 _encode = msgspec.msgpack.Encoder().encode
-_crossing = msgspec.msgpack.Decoder(Crossing).decode
+_message = msgspec.msgpack.Decoder(Crossing | Question | Answer).decode
 _fragment = msgspec.msgpack.Decoder(Fragment).decode
 
 
 @dataclass(frozen=True)
 class Options:
-    """`[program.options]`: `keys` that cross the radio, `commands` to start, the `port` of the first vehicle."""
+    """`[program.options]`: `keys` that cross the radio, `commands` to start, the `port` of the first vehicle.
 
-    keys: tuple[str, ...] = ("**",)
+    `query_s` is for how long replies to a query are awaited: who will answer over the radio is not known.
+    """
+
+    keys: tuple[str, ...] = ("**", "**/@adv/**")
     commands: tuple[tuple[str, ...], ...] = ()
     port: int = 0
+    query_s: float = 1.0
 
     @classmethod
     def of(cls, node: Node) -> Options:
         """Return the options of a node. Raise ProgramError for what cannot be."""
         given = dict(node.options)
-        keys, command, port = given.pop("keys", "**"), given.pop("command", []), given.pop("port", 0)
+        keys, command = given.pop("keys", cls.keys), given.pop("command", [])
+        port, query_s = given.pop("port", cls.port), given.pop("query_s", cls.query_s)
         if given:
-            raise ProgramError(f"program.options.{next(iter(given))}: allowed are keys, command and port")
+            raise ProgramError(f"program.options.{next(iter(given))}: allowed are keys, command, port and query_s")
         keys = _texts("keys", keys)
         for key in keys:
             try:
@@ -107,8 +131,10 @@ class Options:
             raise ProgramError(f"program.options.command = {shown(command)}: a command has a word at least")
         if not isinstance(port, int) or not 0 <= port <= 65_535:
             raise ProgramError(f"program.options.port = {shown(port)}: 0 to 65535")
+        if not isinstance(query_s, int | float) or not 0 < query_s <= 3600:
+            raise ProgramError(f"program.options.query_s = {shown(query_s)}: seconds above 0, at most 3600")
         number = int("".join(c for c in node.id if c.isdigit()) or 1)
-        return cls(keys, tuple(commands), port and port + number - 1)
+        return cls(keys, tuple(commands), port and port + number - 1, query_s)
 
 
 def _texts(name: str, given: object) -> tuple[str, ...]:
@@ -126,8 +152,10 @@ class Gateway:
         self._node = node
         self._options = options
         self._loop = asyncio.get_running_loop()
-        self._put: asyncio.Queue[Crossing] = asyncio.Queue()
+        self._put: asyncio.Queue[Crossing | Question | Answer] = asyncio.Queue()
         self._numbers = count()
+        self._queries: dict[int, zenoh.Query] = {}
+        self._query_numbers = count()
         self._parts: dict[str, OrderedDict[int, dict[int, bytes]]] = {}
         self._folder = TemporaryDirectory(prefix="vnet-")
         self._session: zenoh.Session | None = None
@@ -151,6 +179,7 @@ class Gateway:
         self.endpoint = await asyncio.to_thread(router_endpoint, self._session)
         for key in self._options.keys:
             self._session.declare_subscriber(key, self._taken, allowed_origin=REMOTE)
+            self._session.declare_queryable(key, self._asked, allowed_origin=REMOTE)
         self._session.declare_subscriber(REPORT_KEY, self._reported, allowed_origin=REMOTE)
 
     def close(self) -> None:
@@ -164,6 +193,12 @@ class Gateway:
     def _taken(self, sample: zenoh.Sample) -> None:
         if not str(sample.key_expr).startswith(OWN_KEYS):
             self._call(self._put.put_nowait, crossing_of(sample))
+
+    def _asked(self, query: zenoh.Query) -> None:
+        if not str(query.key_expr).startswith(OWN_KEYS):
+            self._call(self._ask, query)
+        else:
+            query.drop()  # type: ignore[no-untyped-call]
 
     def _reported(self, sample: zenoh.Sample) -> None:
         self._call(self._report, sample.payload.to_bytes())
@@ -179,19 +214,89 @@ class Gateway:
         except (msgspec.MsgspecError, TypeError, ValueError) as error:
             self._node.log(f"{REPORT_KEY}: {error}", "warning")
 
+    # Queries and replies.
+
+    def _ask(self, query: zenoh.Query) -> None:
+        """Send a query of a program by radio, and take replies to it for a while."""
+        number = next(self._query_numbers)
+        self._queries[number] = query
+        self._loop.call_later(self._options.query_s, self._conclude, number)
+        encoding = None if query.encoding is None else str(query.encoding)
+        question = Question(number, str(query.selector), _bytes(query.payload), encoding, _bytes(query.attachment))
+        self._put.put_nowait(question)
+
+    def _conclude(self, number: int) -> None:
+        self._queries.pop(number).drop()  # type: ignore[no-untyped-call]
+
+    def _pass_on(self, asker: str, question: Question) -> None:
+        """Ask the programs of this vehicle, and send their replies by radio."""
+        assert self._session is not None
+
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answer = Answer(asker, question.number, crossing_of(reply.ok))
+            else:
+                assert reply.err is not None
+                error = reply.err.payload.to_bytes(), str(reply.err.encoding)
+                answer = Answer(asker, question.number, None, error)
+            self._call(self._put.put_nowait, answer)
+
+        self._session.get(
+            question.selector,
+            answered,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=self._options.query_s,
+            payload=question.payload,
+            encoding=question.encoding,
+            attachment=question.attachment,
+            allowed_destination=REMOTE,
+        )
+
+    def _reply(self, answer: Answer) -> None:
+        """Give a reply to the program that has asked, if it still waits."""
+        query = self._queries.get(answer.number) if answer.to == self._node.id else None
+        if query is None:
+            return
+        if answer.sample is None:
+            assert answer.error is not None
+            query.reply_err(answer.error[0], encoding=answer.error[1])
+            return
+        sample, options = answer.sample, _options(answer.sample)
+        if (
+            "source_info" in options
+        ):  # a reply of Python has none: so advanced subscribers are given the sample itself
+            self._show(sample)
+            return
+        kept = {name: options[name] for name in ("attachment", "express", "timestamp") if name in options}
+        if sample.is_delete:
+            query.reply_del(sample.key, **kept)
+        else:
+            query.reply(sample.key, sample.payload, encoding=sample.encoding, **kept)
+
+    def _show(self, sample: Crossing) -> None:
+        """Put a sample at the programs of this vehicle."""
+        assert self._session is not None
+        options: dict[str, Any] = {**_options(sample), "allowed_destination": REMOTE}
+        if sample.is_delete:
+            self._session.delete(sample.key, **options)
+        else:
+            self._session.put(sample.key, sample.payload, encoding=sample.encoding, **options)
+
     # Tasks of the vehicle.
 
     async def send(self) -> None:
         """Send what the programs put, a frame or several a sample."""
         while True:
-            content, number = _encode(await self._put.get()), next(self._numbers)
+            message = await self._put.get()
+            content, number = _encode(message), next(self._numbers)
             size = self._node.radio.max_payload - FRAGMENT_BYTES
             pieces = [content[start : start + size] for start in range(0, len(content), max(size, 1))]
             if size < 1 or len(pieces) > MOST_FRAGMENTS:
                 text = f"a sample of {len(content)} bytes needs more than {MOST_FRAGMENTS} frames"
                 self._node.log(f"{text} of radio.max_payload_bytes = {self._node.radio.max_payload}", "error")
                 continue
-            self.sent += 1
+            self.sent += isinstance(message, Crossing)
             for index, piece in enumerate(pieces):
                 await self._node.radio.broadcast(_encode(Fragment(number, index, len(pieces), piece)))
 
@@ -201,7 +306,7 @@ class Gateway:
             try:
                 content = self._whole(packet)
                 if content is not None:
-                    self._show(_crossing(content))
+                    self._take(packet.sender, _message(content))
             except (msgspec.MsgspecError, zenoh.ZError, KeyError) as error:  # bytes that a fault has changed
                 self._node.log(f"a frame of {packet.sender} is no sample: {error}", "debug")
 
@@ -221,24 +326,14 @@ class Gateway:
             self.incomplete += 1
         return None
 
-    def _show(self, sample: Crossing) -> None:
-        assert self._session is not None
-        self.heard += 1
-        options: dict[str, Any] = {
-            "attachment": sample.attachment,
-            "priority": getattr(zenoh.Priority, sample.priority),
-            "congestion_control": getattr(zenoh.CongestionControl, sample.congestion),
-            "express": sample.express,
-            "allowed_destination": REMOTE,
-        }
-        if sample.time is not None:
-            options["timestamp"] = zenoh.Timestamp(zenoh.NTP64(*sample.time[:2]), sample.time[2])
-        if sample.source is not None and sample.source[0] == os.getpid():
-            options["source_info"] = _sources.get(sample.source[1])
-        if sample.is_delete:
-            self._session.delete(sample.key, **options)
+    def _take(self, sender: str, message: Crossing | Question | Answer) -> None:
+        if isinstance(message, Question):
+            self._pass_on(sender, message)
+        elif isinstance(message, Answer):
+            self._reply(message)
         else:
-            self._session.put(sample.key, sample.payload, encoding=sample.encoding, **options)
+            self.heard += 1
+            self._show(message)
 
     async def tell_fixes(self) -> None:
         """Put each fix of the receiver at the programs, and report what has crossed."""
@@ -302,13 +397,32 @@ def crossing_of(sample: zenoh.Sample) -> Crossing:
         sample.payload.to_bytes(),
         str(sample.encoding),
         sample.kind == zenoh.SampleKind.DELETE,
-        None if sample.attachment is None else sample.attachment.to_bytes(),
+        _bytes(sample.attachment),
         str(sample.priority).rpartition(".")[2],
         str(sample.congestion_control).rpartition(".")[2],
         sample.express,
         time,
         None if sample.source_info is None else (os.getpid(), _number_of(sample.source_info)),
     )
+
+
+def _options(sample: Crossing) -> dict[str, Any]:
+    """Return the arguments with which a sample is put, deleted or replied."""
+    options: dict[str, Any] = {
+        "attachment": sample.attachment,
+        "priority": getattr(zenoh.Priority, sample.priority),
+        "congestion_control": getattr(zenoh.CongestionControl, sample.congestion),
+        "express": sample.express,
+    }
+    if sample.time is not None:
+        options["timestamp"] = zenoh.Timestamp(zenoh.NTP64(*sample.time[:2]), sample.time[2])
+    if sample.source is not None and sample.source[0] == os.getpid() and sample.source[1] in _sources:
+        options["source_info"] = _sources[sample.source[1]]
+    return options
+
+
+def _bytes(content: zenoh.ZBytes | None) -> bytes | None:
+    return None if content is None else content.to_bytes()
 
 
 def _number_of(source: zenoh.SourceInfo) -> int:

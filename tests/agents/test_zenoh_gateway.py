@@ -19,8 +19,8 @@ PATIENCE_S = 60.0
 class Radio:
     """Frames of one vehicle reach all of `others`, unless `is_lost` says so of their number."""
 
-    def __init__(self, max_payload: int) -> None:
-        self.max_payload = max_payload
+    def __init__(self, name: str, max_payload: int) -> None:
+        self.name, self.max_payload = name, max_payload
         self.others: list[Radio] = []
         self.is_lost: Callable[[int], bool] = lambda number: False
         self.frames: list[bytes] = []
@@ -31,7 +31,7 @@ class Radio:
         self.frames.append(payload)
         if not self.is_lost(len(self.frames) - 1):
             for other in self.others:
-                other.inbox.put_nowait(Packet("other", 0, 0, payload))
+                other.inbox.put_nowait(Packet(self.name, 0, 0, payload))
 
     async def __aiter__(self) -> AsyncIterator[Packet]:
         while True:
@@ -42,7 +42,7 @@ class Vehicle:
     """What a gateway uses of its node."""
 
     def __init__(self, name: str, max_payload: int) -> None:
-        self.id, self.radio, self.options = name, Radio(max_payload), dict[str, Any]()
+        self.id, self.radio, self.options = name, Radio(name, max_payload), dict[str, Any]()
         self.reports: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
         self.lines: list[str] = []
 
@@ -182,6 +182,55 @@ def test_an_advanced_subscriber_finds_exactly_the_samples_that_the_radio_has_los
     two(test)
 
 
+def test_a_query_is_answered_by_the_programs_of_another_vehicle_with_samples_and_errors() -> None:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            asked = b"" if query.payload is None else query.payload.to_bytes()
+            if query.parameters.get("fails"):
+                query.reply_err(b"no")
+            else:
+                query.reply(query.key_expr, asked + b"!", attachment=b"extra", encoding="text/plain")
+
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        sessions[1].declare_queryable("service", reply)
+        listen(sessions[1], "other")
+        answers = await asyncio.to_thread(lambda: list(sessions[0].get("service", payload=b"hello")))
+        ok = answers[0].ok
+        assert ok is not None and ok.attachment is not None
+        assert (ok.payload.to_bytes(), ok.attachment.to_bytes()) == (b"hello!", b"extra")
+        assert len(answers) == 1
+        answers = await asyncio.to_thread(lambda: list(sessions[0].get("service?fails=1")))
+        assert answers[0].err is not None and answers[0].err.payload.to_bytes() == b"no"
+        assert len(vehicles[0].radio.frames) == len(vehicles[1].radio.frames) == 2
+
+    two(test)
+
+
+def test_an_advanced_subscriber_recovers_what_the_radio_has_lost_from_the_publishers_cache() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        loop, heard = asyncio.get_running_loop(), asyncio.Queue[int]()
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            sessions[1],
+            "pose",
+            lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample.payload.to_bytes()[0]),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+        listen(sessions[1], "other")
+        vehicles[0].radio.is_lost = lambda number: number in (2, 5, 6)
+        publisher = zenoh.ext.declare_advanced_publisher(
+            sessions[0],
+            "pose",
+            cache=zenoh.ext.CacheConfig(10),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None),
+        )
+        for number in range(10):
+            publisher.put(bytes([number]))
+        assert [await heard.get() for _ in range(10)] == list(range(10))
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    two(test, keys=Options().keys)
+
+
 def test_bytes_that_a_fault_has_changed_are_no_sample_and_the_vehicle_goes_on() -> None:
     async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
         heard = listen(sessions[1], "**")
@@ -211,6 +260,7 @@ def test_a_program_reports_by_its_key() -> None:
         ({"command": [["x"], []]}, "command"),
         ({"command": [3]}, "command"),
         ({"port": 70_000}, "port"),
+        ({"query_s": 0}, "query_s"),
         ({"prot": 1}, "prot"),
     ],
 )
