@@ -54,8 +54,11 @@ program that makes so many between two instants needs the memory."""
 _lock = threading.Lock()
 _schedules = 0
 _before_schedules: tuple[tuple[int, int, int], bool] = (gc.get_threshold(), False)
+BLOCKS_A_COUNT = 20
+"""Blocks from one count of all objects to the next: counting takes milliseconds."""
+_blocks = 0
 _objects = 0
-"""Objects at the beginning of the first block, or left by the last collection before one."""
+"""Objects at the first count, or left by the last collection before a block."""
 _takers: weakref.WeakKeyDictionary[Node, weakref.WeakMethod[Taker]] = weakref.WeakKeyDictionary()
 _started_by: weakref.WeakKeyDictionary[threading.Thread, Node] = weakref.WeakKeyDictionary()
 _watchers = 0
@@ -98,10 +101,14 @@ def _freeze() -> None:
     Python would never find what is left of earlier runs: within blocks it is frozen, and between them, Python
     makes too few objects to look through the old ones.
     """
-    global _objects
+    global _blocks, _objects
     gc.freeze()
-    _objects = _objects or gc.get_freeze_count()
-    if gc.get_freeze_count() > 1.25 * _objects and gc.isenabled() and gc.get_threshold()[0]:
+    _blocks += 1
+    if _blocks % BLOCKS_A_COUNT:
+        return
+    count = gc.get_freeze_count()
+    _objects = _objects or count
+    if count > 1.25 * _objects and gc.isenabled() and gc.get_threshold()[0]:
         gc.unfreeze()
         gc.collect()
         gc.freeze()

@@ -11,7 +11,7 @@ from tests.vnet.runtime.test_host import World
 from vnet import Node
 from vnet.reports import Report
 from vnet.runtime import host, outside_loop
-from vnet.runtime.outside_loop import MOST_UNCOLLECTED, collected_by_schedule
+from vnet.runtime.outside_loop import BLOCKS_A_COUNT, MOST_UNCOLLECTED, collected_by_schedule
 from vnet.transport import wire
 
 SECOND_NS = 1_000_000_000
@@ -60,6 +60,7 @@ def test_what_earlier_runs_have_left_is_collected_once_it_is_much(
 ) -> None:
     gc.unfreeze()  # what an earlier test has left
     monkeypatch.setattr(outside_loop, "_objects", objects_before)
+    monkeypatch.setattr(outside_loop, "_blocks", BLOCKS_A_COUNT - 1)
     found: list[bool] = []
     left = InCycle(lambda: found.append(True))
     gc.set_threshold(threshold and 10**9)
