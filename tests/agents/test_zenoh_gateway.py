@@ -39,7 +39,7 @@ class Radio:
 
 
 class Vehicle:
-    """What a gateway uses of its node."""
+    """The part of a node that a gateway uses."""
 
     def __init__(self, name: str, max_payload: int) -> None:
         self.id, self.radio, self.options = name, Radio(name, max_payload), dict[str, Any]()
