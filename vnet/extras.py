@@ -25,6 +25,8 @@ EXTRA_OF = {
     "scipy": "scipy",
 }
 """Extra of `vnet-emulator` that installs a library, by the name under which it is imported."""
+ALSO_IN = {"scipy": {"cooperative", "maps"}}
+"""Further extras that install a library."""
 
 
 def is_installed(library: str) -> bool:
@@ -34,7 +36,9 @@ def is_installed(library: str) -> bool:
 
 def needs(*libraries: str) -> str:
     """Return what a user is told who lacks these libraries."""
-    extras = ",".join(dict.fromkeys(EXTRA_OF[library] for library in libraries))
+    wanted = dict.fromkeys(EXTRA_OF[library] for library in libraries)
+    covered = {EXTRA_OF[library] for library in libraries if wanted.keys() & ALSO_IN.get(library, set())}
+    extras = ",".join(extra for extra in wanted if extra not in covered)
     listed = ", ".join(libraries[:-1]) + " and " * (len(libraries) > 1) + libraries[-1]
     return f"needs {listed}: pip install 'vnet-emulator[{extras}]'"
 

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import pytest
 
 from tests.support.paths import ROOT
-from vnet.extras import EXTRA_OF
+from vnet.extras import ALSO_IN, EXTRA_OF, needs
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 IMPORTED_AS = {"eclipse-sumo": None, "rerun-sdk": "rerun", "pycrate": "pycrate_asn1dir", "pytest": None}
@@ -106,6 +106,22 @@ def test_each_library_of_an_extra_names_it() -> None:
     for library, extra in EXTRA_OF.items():
         names = {IMPORTED_AS.get(name := re.split("[<>=]", wanted)[0], name) for wanted in extras[extra]}
         assert library in names
+
+
+@pytest.mark.parametrize(
+    ("libraries", "extras"),
+    [
+        (["scipy"], "scipy"),
+        (["scipy", "daqp", "osqp"], "cooperative"),
+        (["osmium", "scipy"], "maps"),
+        (["scipy", "mcap"], "scipy,export"),
+    ],
+)
+def test_missing_libraries_name_no_extra_that_another_includes(libraries: list[str], extras: str) -> None:
+    assert needs(*libraries).endswith(f"pip install 'vnet-emulator[{extras}]'")
+    for library in libraries:
+        for extra in ALSO_IN.get(library, ()):
+            assert any(wanted.startswith(library) for wanted in PROJECT["optional-dependencies"][extra])
 
 
 def test_all_and_dev_have_every_extra_for_users_that_is_small() -> None:
