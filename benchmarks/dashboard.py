@@ -12,7 +12,7 @@ from emulator.drivers.session import Session
 from emulator.drivers.status import Course, Snapshot
 from emulator.scenario.loading import load_scenario
 from emulator.terminal.dashboard import Dashboard
-from emulator.terminal.painter import EVERY_S, Painter
+from emulator.terminal.live import EVERY_S, LivePicture
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "faults.toml"
 OVERRIDES = ["network.vehicles=50", "program.entry=agents.beacon:main"]
@@ -30,11 +30,11 @@ def measure(width: int = 100, height: int = 30) -> dict[str, float]:
         session.run()
     with Path("/dev/null").open("w") as nobody:
         console = Console(file=nobody, force_terminal=True, width=width, height=height, color_system="truecolor")
-        painter = Painter(console, lambda: Dashboard(shots[0]))
+        picture = LivePicture(console, lambda: Dashboard(shots[0]))
         redraw_ms = []
         while len(shots) > 1:
             shots.pop(0)
-            redraw_ms.append(_ms(painter.draw))
+            redraw_ms.append(_ms(picture.refresh))
     together_ms = statistics.median(snapshot_ms) + statistics.median(redraw_ms)
     return {
         "snapshot_ms": statistics.median(snapshot_ms),

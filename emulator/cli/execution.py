@@ -33,8 +33,8 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import recorded_code
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, say_first, tell
+from emulator.terminal.live import SafeConsole
 from emulator.terminal.progress import Progress, show_progress
-from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import StandardOutput
 from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks

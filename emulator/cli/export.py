@@ -23,7 +23,7 @@ from emulator.records.atomic import atomically, disk_errors
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, UnicastFigures, radio_metrics, unicast_figures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.terminal.console import one_line_errors
-from emulator.terminal.safe_console import SafeConsole
+from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError
 
 WORST_LINKS = 10

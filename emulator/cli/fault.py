@@ -19,9 +19,7 @@ from emulator.drivers.status import Snapshot
 from emulator.scenario.faults import KINDS, OwnRule, parse_fault
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.dashboard import Dashboard
-from emulator.terminal.painter import Painter
-from emulator.terminal.progress import terminal
-from emulator.terminal.safe_console import SafeConsole
+from emulator.terminal.live import LivePicture, SafeConsole, terminal
 from vnet.errors import ScenarioError, VnetError, first_names
 
 app = group("Inject faults into a running emulator, and heal them.")
@@ -112,7 +110,7 @@ def _watch(run: Path, shot: Snapshot) -> None:
     if console is None:
         raise VnetError("--watch: needs a terminal; elsewhere use --json, now and then")
     taken_s = time.monotonic()
-    with Painter(console, lambda: Dashboard(shot, time.monotonic() - taken_s)):
+    with LivePicture(console, lambda: Dashboard(shot, time.monotonic() - taken_s)):
         while True:
             time.sleep(WATCH_EVERY_S)
             try:

@@ -18,7 +18,7 @@ from emulator.records.parting import FrameEntry, Parting, before, frame_log, par
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.program import from_here, split_file
 from emulator.terminal.console import one_line_errors
-from emulator.terminal.safe_console import SafeConsole
+from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError, did_you_mean, printable, shown
 from vnet.runtime.programs import error_line, search_programs_in
 from vnet.units import NS_PER_S

@@ -15,7 +15,7 @@ from rich.table import Table
 from emulator.cli.application import group
 from emulator.cli.options import pair
 from emulator.terminal.console import one_line_errors
-from emulator.terminal.safe_console import SafeConsole
+from emulator.terminal.live import SafeConsole
 from emulator.world.maps.city import SIZE_M, city_roads
 from emulator.world.maps.files import read_roads, write_roads, writer_of
 from emulator.world.maps.problems import PLACE_M, Calibration, MapReport, calibrate, examine, residuals

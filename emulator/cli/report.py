@@ -12,7 +12,7 @@ import typer
 from emulator.cli.options import LATEST, RunArgument
 from emulator.records.run_folder import VERDICT_FILE
 from emulator.terminal.console import one_line_errors, tell
-from emulator.terminal.safe_console import SafeConsole
+from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError
 
 

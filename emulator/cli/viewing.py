@@ -29,7 +29,7 @@ from emulator.records.run_folder import RECORDING, RunFolder, check_is_finished,
 from emulator.stream.playback import Message, messages, schedule
 from emulator.stream.playback import play as play_scheduled
 from emulator.terminal.console import one_line_errors
-from emulator.terminal.safe_console import SafeConsole
+from emulator.terminal.live import SafeConsole
 from emulator.viewer.sinks import (
     Sinks,
     choose_sinks,

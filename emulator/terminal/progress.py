@@ -19,8 +19,7 @@ from emulator.drivers.status import Course, Snapshot
 from emulator.records.events import GROUPED, Event, key_of, kinds_of
 from emulator.terminal.console import LogFormat
 from emulator.terminal.dashboard import Dashboard
-from emulator.terminal.painter import EVERY_S, Painter
-from emulator.terminal.safe_console import SafeConsole
+from emulator.terminal.live import EVERY_S, LivePicture, terminal
 from vnet.errors import first_names, printable
 
 PLAIN_LINE_EVERY_S = 5.0
@@ -64,15 +63,6 @@ def show_progress(emulation: Emulation, log_format: LogFormat, quiet: bool, pict
     return PlainLines(emulation, sys.stderr) if console is None else Picture(emulation, console)
 
 
-def terminal(file: TextIO) -> Console | None:
-    """A console on a terminal that can show a picture; None for a file, a pipe, or a terminal that cannot."""
-    console = SafeConsole(file)
-    able = file.isatty() and console.is_interactive and not console.options.ascii_only
-    if able and console.no_color:  # and none of its sisters, bold and dim
-        console = SafeConsole(file, colours=False)
-    return console if able else None
-
-
 class Picture(Progress):
     """The live picture of a terminal."""
 
@@ -80,8 +70,7 @@ class Picture(Progress):
         self._course = Course(emulation)
         self._shot = self._course.snapshot()
         self._taken_s = time.monotonic()
-        self._painter = Painter(console, self._picture)
-        self._open = False
+        self._live = LivePicture(console, self._picture)
         emulation.watch(self._look)
 
     def _picture(self) -> Dashboard:
@@ -94,19 +83,16 @@ class Picture(Progress):
             self._shot, self._taken_s = self._course.snapshot(), now_s
 
     def __enter__(self) -> Picture:
-        self._painter.__enter__()
-        self._open = True
+        self._live.start()
         return self
 
     def close(self) -> None:
         """Leave the terminal as it was."""
-        if self._open:
-            self._open = False
-            self._painter.__exit__()
+        self._live.stop()
 
     def state(self, text: str) -> None:
         """Leave it above the picture: one may want to copy it."""
-        self._painter.print_above(text + "\n")
+        self._live.print_above(text + "\n")
 
     def awaits(self, nodes: Sequence[str]) -> None:
         """Draw who is missing."""

@@ -29,14 +29,14 @@ class Screen:
             elif plain:
                 self._print(plain)
             else:
-                self._control(private + final, int(numbers.split(";")[0] or 1))
+                self._control(private + final, int(numbers.split(";")[0] or (final == "A")))
 
     def _control(self, what: str, count: int) -> None:
         match what:
             case "A":
                 self.row = max(self.row - count, 0, len(self.rows) - self.height)
             case "K":
-                self.rows[self.row] = self.rows[self.row][: self.column]
+                self.rows[self.row] = "" if count == 2 else self.rows[self.row][: self.column]
             case "J":
                 self.rows[self.row] = self.rows[self.row][: self.column]
                 del self.rows[self.row + 1 :]
@@ -59,12 +59,10 @@ class Screen:
             self.column += 1
 
     def resize(self, width: int, height: int) -> None:
-        """Make it narrower or wider; the cursor stands at the beginning of a row."""
-        assert self.column == 0
-        above = [self._broken(row, width) for row in self.rows[: self.row]]
-        below = [self._broken(row, width) for row in self.rows[self.row :]]
-        self.row = sum(map(len, above))
-        self.rows = [part for parts in [*above, *below] for part in parts]
+        """Make it narrower or wider; the cursor stands at the end of the last row."""
+        assert self.row == len(self.rows) - 1 and self.column == len(self.rows[-1])
+        self.rows = [part for row in self.rows for part in self._broken(row, width)]
+        self.row, self.column = len(self.rows) - 1, len(self.rows[-1])
         self.width, self.height = width, height
 
     @staticmethod

@@ -13,9 +13,10 @@ import pytest
 from emulator.drivers.conclude import conclude
 from emulator.drivers.simulate import simulate
 from emulator.terminal.console import LogFormat
-from emulator.terminal.progress import JsonLines, Picture, PlainLines, Progress, show_progress, terminal
+from emulator.terminal.live import terminal
+from emulator.terminal.progress import JsonLines, Picture, PlainLines, Progress, show_progress
 from tests.emulator.drivers.test_status import KILLED, emulate
-from tests.emulator.terminal.test_painter import Terminal
+from tests.emulator.terminal.test_live import Terminal
 
 CRASHING = {"entry": "tests.system.programs:raises"}
 
@@ -196,11 +197,11 @@ def test_a_picture_of_a_run_leaves_nothing_but_what_was_said(tmp_path: Path) -> 
 
 def test_a_picture_follows_who_joins(tmp_path: Path) -> None:
     screen = Terminal(80, 24)
-    picture = Picture(emulate(tmp_path / "run"), screen.console)
-    picture.awaits(["v02"])
-    picture._painter.draw()
-    assert "5 of 6" in screen.screen.text
-    assert "v02" in screen.screen.text
-    picture.judging()
-    picture._painter.draw()
-    assert "judging the run" in screen.screen.text
+    with Picture(emulate(tmp_path / "run"), screen.console) as picture:
+        picture.awaits(["v02"])
+        picture._live.refresh()
+        assert "5 of 6" in screen.screen.text
+        assert "v02" in screen.screen.text
+        picture.judging()
+        picture._live.refresh()
+        assert "judging the run" in screen.screen.text
