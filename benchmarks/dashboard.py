@@ -30,11 +30,11 @@ def measure(width: int = 100, height: int = 30) -> dict[str, float]:
         session.run()
     with Path("/dev/null").open("w") as nobody:
         console = Console(file=nobody, force_terminal=True, width=width, height=height, color_system="truecolor")
-        picture = LivePicture(console, lambda: Dashboard(shots[0]))
         redraw_ms = []
-        while len(shots) > 1:
-            shots.pop(0)
-            redraw_ms.append(_ms(picture.refresh))
+        with LivePicture(console, lambda: Dashboard(shots[0])) as picture:
+            while len(shots) > 1:
+                shots.pop(0)
+                redraw_ms.append(_ms(picture.refresh))
     together_ms = statistics.median(snapshot_ms) + statistics.median(redraw_ms)
     return {
         "snapshot_ms": statistics.median(snapshot_ms),

@@ -8,21 +8,19 @@ and the rows stay where they are for as long as the terminal keeps its size. Not
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from itertools import groupby, pairwise
 
-from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.segment import Segment
 from rich.style import Style
+from rich.text import Text
 
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN
 from vnet.errors import printable
 
-Line = list[Segment]
+Words = tuple[str, Style]
 
 GREEN, RED, ORANGE, SKY = (Style(color=PALETTE[name].either) for name in ("green", "red", "orange", "sky"))
 PLAIN, BOLD, DIM = Style(), Style(bold=True), Style(dim=True)
@@ -37,20 +35,10 @@ SMALLEST_FACTOR = 4.0
 IDLE_S = 5.0
 """So long without a period that has ended is worth telling."""
 
-# The rows in the order in which they are worth having.
-ROWS = ["title", "time", "vehicles", "declared", "frames", "events", "faults", "declared", "shares", "position"]
-MORE_ROWS = ["events", "faults"] * 5
-GROUPS = (
-    ("title", "time"),
-    ("vehicles",),
-    ("declared", "position"),
-    ("frames", "shares"),
-    ("faults",),
-    ("events",),
-)
+MOST_FAULTS = MOST_EVENTS = 6
+"""Rows at most."""
 PATIENCE_S = 1.0
 """Emulated time after which a value that is not reported has no row."""
-EARLY_ROWS = {"starting": ["title"], "joining": ["title", "joined", "vehicles", "missing"]}
 
 
 class Dashboard:
@@ -65,50 +53,33 @@ class Dashboard:
         self._steady = steady
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        # The line below the picture is the cursor's.
-        height = (options.height or options.size.height) - 1
-        for number, line in enumerate(self.lines(options.max_width, height, console.color_system is not None)):
-            if number:
-                yield Segment.line()
-            yield from Segment.adjust_line_length(line, options.max_width, pad=False)
-        yield Segment.line()
+        width, height = options.max_width, options.height or options.size.height
+        draw = _Rows(self._snapshot, self._later_s, width, console.color_system is not None)
+        for line in self._lines(draw, height - 1):  # the line below the picture is the cursor's
+            line.truncate(width, overflow="crop")
+            line.no_wrap = True
+            yield line
 
-    def lines(self, width: int, height: int, coloured: bool = True) -> list[Line]:
-        """The rows, at most `height` of them; the caller cuts what is wider than `width`."""
+    def _lines(self, draw: _Rows, height: int) -> list[Text]:
+        """Return the rows, at most `height` of them: the most important first."""
         shot = self._snapshot
-        draw = _Rows(shot, self._later_s, width, coloured)
-        if shot.phase in EARLY_ROWS:
-            return [line for row in EARLY_ROWS[shot.phase][:height] for line in getattr(draw, row)(1)]
-        count = self._allot(height)
-        groups = [[row for row in group if count[row]] for group in GROUPS]
-        groups = [group for group in groups if group]
-        gap: list[Line] = [[]] if count.total() + len(groups) - 1 <= height else []
-        found: list[Line] = []
-        for number, group in enumerate(groups):
-            found += gap if number else []
-            for row in group:
-                found += getattr(draw, row)(count[row])
-        spare = height - len(found) if self._steady else 0
-        return found + [[]] * min(spare, count["events"] - max(1, len(shot.events)))
-
-    def _allot(self, height: int) -> Counter[str]:
-        """Rows given to each part."""
-        shot = self._snapshot
-        most = {**dict.fromkeys(ROWS, height), "faults": len(shot.faults), "declared": len(_declared(shot))}
-        count: Counter[str] = Counter()
-        for row in ROWS + MORE_ROWS:
-            if count[row] < most[row] and count.total() < height:
-                count[row] += 1
-        return count
-
-
-def _declared(shot: Snapshot) -> list[tuple[str, tuple[str, str]]]:
-    """The figures that the program declares to have a line, but for those that nobody reports."""
-    return [each for each in shot.lines.items() if shot.emulated_s < PATIENCE_S or not shot.never_reported(each[0])]
+        if shot.phase == "starting":
+            return [draw.title()]
+        if shot.phase == "joining":
+            return [draw.title(), draw.joined(), draw.vehicles(), draw.missing()][:height]
+        groups = [[draw.title(), draw.time()], [draw.vehicles()], draw.figures(), [draw.frames(), draw.legend()]]
+        room = max(0, height - sum(map(len, groups)))
+        faults = min(len(shot.faults), room // 2)
+        events = min(MOST_EVENTS, room - faults)
+        faults = min(len(shot.faults), MOST_FAULTS, room - events)
+        groups += [draw.faults(faults)] if faults else []
+        groups += [draw.events(events, self._steady)] if events else []
+        gap = [Text()] if sum(map(len, groups)) + len(groups) - 1 <= height else []
+        return [line for group in groups for line in [*gap, *group]][len(gap) :][:height]
 
 
 class _Rows:
-    """The rows of the picture: each method draws one, or as many as it is given."""
+    """The rows of the picture, by subject."""
 
     def __init__(self, shot: Snapshot, later_s: float, width: int, coloured: bool) -> None:
         self._shot = shot
@@ -119,152 +90,128 @@ class _Rows:
         words = 34 if width >= 90 else 26
         self._axis = max(4, min(width - self._label - words - 2, BINS))
 
-    def _row(self, label: str, axis: Line, words: Sequence[Segment], label_style: Style = DIM) -> Line:
+    def _row(self, label: str, axis: Text, *words: Words, label_style: Style = DIM) -> Text:
         """A row over the axis."""
-        filled = sum(segment.cell_length for segment in axis)
-        start = Segment(_cut_middle(label, self._label - 1).ljust(self._label), label_style)
-        return [start, *axis, Segment(" " * (self._axis - filled + 2)), *words]
+        start = (_cut_middle(label, self._label - 1).ljust(self._label), label_style)
+        return Text.assemble(start, axis, " " * (self._axis - axis.cell_len + 2), *words)
 
-    def title(self, rows: int) -> list[Line]:
+    def title(self) -> Text:
         """Line with the run's name, pacing and speed."""
         shot = self._shot
         about = [shot.pacing, f"seed {shot.seed}", f"{len(shot.node_ids)} vehicles"]
         if shot.emulator_memory_mb is not None:
             about.append(f"emulator {shot.emulator_memory_mb:.0f} MB")
-        right = self._headline()
-        room = self._width - len(shot.run) - 2 - sum(cell_len(segment.text) for segment in right) - 2
-        while about and len(" · ".join(about)) > room:
+        right = Text.assemble(*self._headline())
+        while about and len(" · ".join(about)) > self._width - len(shot.run) - right.cell_len - 4:
             about.pop()
-        left = [Segment(shot.run, BOLD), Segment("  " + " · ".join(about), DIM)]
-        gap = self._width - sum(cell_len(segment.text) for segment in [*left, *right])
-        return [[*left, Segment(" " * max(gap, 2)), *right]]
+        left = Text.assemble((shot.run, BOLD), ("  " + " · ".join(about), DIM))
+        return left.append(" " * max(self._width - left.cell_len - right.cell_len, 2)).append(right)
 
-    def _headline(self) -> Line:
+    def _headline(self) -> list[Words]:
         shot = self._shot
         idle_s = shot.idle_s + self._later_s
         if shot.phase == "judging":
-            return [Segment("judging the run")]
+            return [("judging the run", PLAIN)]
         if shot.phase != "running":
-            return [Segment(f"{shot.phase} …")]
+            return [(f"{shot.phase} …", PLAIN)]
         if idle_s >= IDLE_S:
-            return [Segment(f"no period for {_duration(idle_s)}", ORANGE + BOLD)]
+            return [(f"no period for {_duration(idle_s)}", ORANGE + BOLD)]
         if shot.real_time_factor is None or shot.remaining_s is None:
             return []
         left = f"{_duration(shot.remaining_s)} left" if shot.remaining_s > 0 else "ending"
-        return [Segment(f"{shot.real_time_factor:.1f}× real time", BOLD), Segment(f" · {left}")]
+        return [(f"{shot.real_time_factor:.1f}× real time", BOLD), (f" · {left}", PLAIN)]
 
-    def time(self, rows: int) -> list[Line]:
+    def time(self) -> Text:
         """Progress bar of the emulated time."""
         shot = self._shot
         done = shot.emulated_s / shot.duration_s
-        words = [Segment(f"{shot.emulated_s:.1f}", BOLD), Segment(f" of {shot.duration_s:g} s")]
-        return [self._row("time", self._bar(done), [*words, Segment(f"  {done:4.0%}", DIM)])]
+        words = ((f"{shot.emulated_s:.1f}", BOLD), (f" of {shot.duration_s:g} s", PLAIN), (f"  {done:4.0%}", DIM))
+        return self._row("time", self._bar(done), *words)
 
-    def _bar(self, share: float) -> Line:
+    def _bar(self, share: float) -> Text:
         done = min(int(share * self._axis), self._axis)
-        return [Segment("━" * done, SKY), Segment("─" * (self._axis - done), DIM)]
+        return Text.assemble(("━" * done, SKY), ("─" * (self._axis - done), DIM))
 
-    def joined(self, rows: int) -> list[Line]:
+    def joined(self) -> Text:
         """Line with the number of vehicles that have joined and the time left to join."""
         shot = self._shot
         count = len(shot.node_ids)
         joined = count - len(shot.missing)
-        words = [Segment(f"{joined} of {count}", BOLD)]
-        waited_s = shot.wall_s + self._later_s
-        words.append(Segment(f"  {waited_s:.0f} s, at most {shot.join_timeout_s:g} s", DIM))
-        return [self._row("joined", self._bar(joined / count), words)]
+        waited = f"  {shot.wall_s + self._later_s:.0f} s, at most {shot.join_timeout_s:g} s"
+        return self._row("joined", self._bar(joined / count), (f"{joined} of {count}", BOLD), (waited, DIM))
 
-    def missing(self, rows: int) -> list[Line]:
+    def missing(self) -> Text:
         """Line with the vehicles that have not joined."""
-        named = _names(self._shot.missing, self._width - self._label)
-        return [[Segment("missing".ljust(self._label), DIM), Segment(named)]]
+        return self._cut(Text.assemble(("missing".ljust(self._label), DIM), ", ".join(self._shot.missing)))
 
-    def vehicles(self, rows: int) -> list[Line]:
+    def vehicles(self) -> Text:
         """A dot a vehicle, fainter for those that are not there, and the names of those who are down."""
         shot = self._shot
         away = shot.missing or shot.down
         strip = self._strip(shot.node_ids, set(away))
         if shot.phase == "joining":
-            return [self._row("vehicles", strip, [])]
-        words = [Segment(f"{len(shot.node_ids) - len(away) - len(shot.absent)} up", BOLD)]
-        if shot.absent:
-            words.append(Segment(f"  {len(shot.absent)} not there", DIM))
-        if away:
-            words.append(Segment(f"  {len(away)} down: ", BAD))
-            room = self._width - self._label - self._axis - 2 - sum(segment.cell_length for segment in words)
-            words.append(Segment(_names(away, room), RED))
-        return [self._row("vehicles", strip, words)]
+            return self._row("vehicles", strip)
+        words = [(f"{len(shot.node_ids) - len(away) - len(shot.absent)} up", BOLD)]
+        words += [(f"  {len(shot.absent)} not there", DIM)] if shot.absent else []
+        words += [(f"  {len(away)} down: ", BAD), (", ".join(away), RED)] if away else []
+        return self._cut(self._row("vehicles", strip, *words))
 
-    def _strip(self, node_ids: Sequence[str], away: set[str]) -> Line:
+    def _strip(self, node_ids: Sequence[str], away: set[str]) -> Text:
         """Dots for the vehicles; with more vehicles than room a dot stands for several, hollow if any is away."""
         dots = min(len(node_ids), self._axis)
         hollow = DIM if self._shot.phase == "joining" else RED
         absent = set(self._shot.absent)
         parts = (node_ids[n * len(node_ids) // dots : (n + 1) * len(node_ids) // dots] for n in range(dots))
-        return _joined(
-            ("○", hollow)
-            if any(node in away for node in part)
-            else ("·", DIM)
-            if all(node in absent for node in part)
-            else ("●", GREEN)
+        cells = (
+            ("○", hollow) if away.intersection(part) else ("·", DIM) if absent.issuperset(part) else ("●", GREEN)
             for part in parts
         )
+        return Text.assemble(*((sign * len([*same]), style) for (sign, style), same in groupby(cells)))
 
-    def declared(self, rows: int) -> list[Line]:
-        """Lines of the figures that the program declares."""
-        return [self._figure(label, name, about) for name, (label, about) in _declared(self._shot)[:rows]]
-
-    def position(self, rows: int) -> list[Line]:
-        """RMSE of the positions, beside that of the raw fixes; or that alone."""
-        if self._shot.never_reported("position_rmse_m"):
-            return [self._figure("raw fixes", "fix_rmse_m", "RMSE")]
-        raw_m = self._shot.figures["fix_rmse_m"]
+    def figures(self) -> list[Text]:
+        """The figures that the program declares, and the RMSE of the positions beside that of the raw fixes."""
+        shot = self._shot
+        lines = [
+            self._figure(label, name, about)
+            for name, (label, about) in shot.lines.items()
+            if shot.emulated_s < PATIENCE_S or not shot.never_reported(name)
+        ]
+        if shot.never_reported("position_rmse_m"):
+            return [*lines, self._figure("raw fixes", "fix_rmse_m", "RMSE")]
+        raw_m = shot.figures["fix_rmse_m"]
         raw = "" if raw_m is None else f"raw fixes {_short(raw_m)} m"
-        return [self._figure("position", "position_rmse_m", raw)]
+        return [*lines, self._figure("position", "position_rmse_m", raw)]
 
-    def _figure(self, label: str, name: str, about: str) -> Line:
+    def _figure(self, label: str, name: str, about: str) -> Text:
         value = self._shot.figures[name]
-        line = sparkline(self._shot.over_time[name], self._axis)
-        shown = () if value is None else (Segment(f"{_short(value):>5} m", BOLD), Segment(f"  {about}", DIM))
-        return self._row(label, [Segment(line, SKY)], shown)
+        line = Text(sparkline(self._shot.over_time[name], self._axis), SKY)
+        shown = () if value is None else ((f"{_short(value):>5} m", BOLD), (f"  {about}", DIM))
+        return self._row(label, line, *shown)
 
-    def frames(self, rows: int) -> list[Line]:
+    def frames(self) -> Text:
         """Shares of the outcomes of the last second."""
         rates = _shown(self._shot.frames_per_s)
         total = sum(rates.values())
-        bar: Line = []
-        if total:
-            edges = _edges(list(rates.values()), self._axis)
-            for outcome, cells in zip(rates, edges, strict=True):
-                style, sign = OUTCOMES[outcome]
-                bar.append(Segment(("█" if self._coloured else sign) * cells, style))
-        words = [Segment(f"{total:,.0f}", BOLD), Segment(" a second, in range", DIM)]
-        return [self._row("frames", bar, words)]
-
-    def shares(self, rows: int) -> list[Line]:
-        """The legend of the bar above; where there is no room, first without rates, then without the least."""
-        rates = _shown(self._shot.frames_per_s)
-        named = list(rates)
-        line = self._legend(rates, named, rated=True)
-        while sum(segment.cell_length for segment in line) > self._width:
-            line = self._legend(rates, named, rated=False)
-            if not named:
-                break
-            named.remove(min(named, key=rates.__getitem__))
-        return [line]
-
-    def _legend(self, rates: Mapping[str, float], named: Sequence[str], rated: bool) -> Line:
-        total = sum(rates.values())
-        line: Line = [Segment(" " * (self._label - 2))]
-        for outcome in named:
+        bar = Text()
+        for outcome, cells in zip(rates, _edges(list(rates.values()), self._axis), strict=True):
             style, sign = OUTCOMES[outcome]
-            mark = Segment("■" if self._coloured else sign, style)
-            number = Segment(f" {rates[outcome]:,.0f}/s" if rated else "", DIM)
-            name, share = Segment(f" {outcome.replace('_', ' ')} "), Segment(f"{rates[outcome] / total:.1%}", BOLD)
-            line += [Segment("  "), mark, name, share, number]
-        return line if len(named) == len(rates) else [*line, Segment("  …", DIM)]
+            bar.append(("█" if self._coloured else sign) * cells, style)
+        return self._row("frames", bar, (f"{total:,.0f}", BOLD), (" a second, in range", DIM))
 
-    def faults(self, rows: int) -> list[Line]:
+    def legend(self) -> Text:
+        """The legend of the bar above; without rates where there is no room for them."""
+        rates = _shown(self._shot.frames_per_s)
+        total = sum(rates.values())
+        rated, short = Text(" " * (self._label - 2)), Text(" " * (self._label - 2))
+        for outcome, rate in rates.items():
+            style, sign = OUTCOMES[outcome]
+            mark = ("■" if self._coloured else sign, style)
+            words = Text.assemble("  ", mark, f" {outcome.replace('_', ' ')} ", (f"{rate / total:.1%}", BOLD))
+            short.append(words)
+            rated.append(words).append(f" {rate:,.0f}/s", DIM)
+        return rated if rated.cell_len <= self._width else self._cut(short)
+
+    def faults(self, rows: int) -> list[Text]:
         """Those that act, then the next, then the last that were; in the order in which they begin."""
         order = {"acting": 0, "to come": 1, "ended": 2}
         now_s = self._shot.emulated_s
@@ -275,10 +222,10 @@ class _Rows:
         shown = sorted(by_worth[:rows], key=lambda f: (f.start_s, f.fault))
         lines = [self._fault(fault) for fault in shown]
         if more := len(self._shot.faults) - len(shown):
-            lines[-1].append(Segment(f"  +{more}", DIM))
+            lines[-1].append(f"  +{more}", DIM)
         return lines
 
-    def _fault(self, fault: FaultState) -> Line:
+    def _fault(self, fault: FaultState) -> Text:
         scale = self._axis / self._shot.duration_s
         first = min(int(fault.start_s * scale), self._axis - 1)
         last = max(first + 1, min(math.ceil(fault.end_s * scale), self._axis))
@@ -288,21 +235,26 @@ class _Rows:
             "to come": ("┄", DIM, f"in {fault.start_s - now_s:.1f} s"),
             "ended": ("─", DIM, "over"),
         }[fault.state]
-        axis = [Segment(" " * first), Segment(sign * (last - first), style)]
-        return self._row(fault.fault, axis, [Segment(words, style)], style)
+        axis = Text.assemble(" " * first, (sign * (last - first), style))
+        return self._row(fault.fault, axis, (words, style), label_style=style)
 
-    def events(self, rows: int) -> list[Line]:
-        """The last ones, the newest at the foot."""
-        lines: list[Line] = []
-        for event in self._shot.events[-rows:]:
-            label = "" if lines else "events"
-            when = f"{event.time_ns / 1e9:>6.1f} s  "
-            about = _cut(printable(event.text, 300), max(1, self._width - self._label - len(when)))
-            style = BAD if event.is_bad else PLAIN
-            lines.append([Segment(label.ljust(self._label), DIM), Segment(when, DIM), Segment(about, style)])
-        if not lines:
-            lines.append([Segment("events".ljust(self._label), DIM), Segment("none yet", DIM)])
-        return lines
+    def events(self, rows: int, steady: bool) -> list[Text]:
+        """The last ones, the newest at the foot; if `steady`, all the rows, for those to come."""
+        lines = [
+            Text.assemble(
+                ("".ljust(self._label) if number else "events".ljust(self._label), DIM),
+                (f"{event.time_ns / 1e9:>6.1f} s  ", DIM),
+                (printable(event.text, 300), BAD if event.is_bad else PLAIN),
+            )
+            for number, event in enumerate(self._shot.events[-rows:])
+        ]
+        lines = [self._cut(line) for line in lines] or [Text("events".ljust(self._label) + "none yet", DIM)]
+        return lines + [Text()] * (rows - len(lines)) if steady else lines
+
+    def _cut(self, line: Text) -> Text:
+        """The line, whose end is an ellipsis where it is too long."""
+        line.truncate(self._width, overflow="ellipsis")
+        return line
 
 
 def sparkline(values: Sequence[float | None], width: int) -> str:
@@ -329,17 +281,6 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def _joined(cells: Iterator[tuple[str, Style]]) -> Line:
-    """Cells of one character, neighbours of one style as one segment."""
-    line: Line = []
-    for text, style in cells:
-        if line and line[-1].style is style:
-            line[-1] = Segment(line[-1].text + text, style)
-        else:
-            line.append(Segment(text, style))
-    return line
-
-
 def _shown(rates: Mapping[str, float]) -> dict[str, float]:
     """The outcomes of pairs in range, in their order."""
     return {outcome: rates[outcome] for outcome in OUTCOMES if rates.get(outcome)}
@@ -352,22 +293,6 @@ def _edges(values: Sequence[float], width: int) -> list[int]:
         so_far += value
         ends.append(round(so_far / total * width))
     return [after - before for before, after in pairwise(ends)]
-
-
-def _names(names: Sequence[str], room: int) -> str:
-    """As many names as fit, and how many there are if they do not."""
-    text = ", ".join(names)
-    if len(text) <= room:
-        return text
-    shown = 0
-    ending = f", … ({len(names)})"
-    while shown < len(names) and len(", ".join(names[: shown + 1])) + len(ending) <= room:
-        shown += 1
-    return ", ".join(names[:shown]) + ending if shown else "…"
-
-
-def _cut(text: str, width: int) -> str:
-    return text if cell_len(text) <= width else text[: max(width - 1, 0)] + "…"
 
 
 def _cut_middle(text: str, width: int) -> str:

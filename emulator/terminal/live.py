@@ -21,6 +21,7 @@ from emulator.pages.text import as_text
 EVERY_S = 0.25
 MOST_WAITING = 10_000
 """Pieces of text that wait for the next redraw; a thread that prints more redraws, at the terminal's speed."""
+_BEGIN, _END = "\x1b[?2026h", "\x1b[?2026l"  # show it when all is there; terminals that cannot pass it over
 _ERASE_AND_UP = ((ControlType.ERASE_IN_LINE, 2), (ControlType.CURSOR_UP, 1))
 
 
@@ -116,15 +117,20 @@ class LivePicture(Live):
         if self._stopped:
             way_back, self._stopped = [], False
         self._widths = self._next_widths
-        return [*way_back, self._whole_lines(), picture]
+        return [_raw(_BEGIN), *way_back, _raw(self._whole_lines()), picture, _raw(_END)]
 
-    def _whole_lines(self) -> Segments:
+    def _whole_lines(self) -> str:
         """Return the whole lines that were printed since the last redraw, as they are."""
         text = self._unfinished + "".join(self._printed.popleft() for _ in range(len(self._printed)))
         if text and not self.is_started:  # the last redraw
             text = text.removesuffix("\n") + "\n"
         lines, newline, self._unfinished = text.rpartition("\n")
-        return Segments([Segment(lines + newline, None, [(ControlType.CARRIAGE_RETURN,)])])  # not cut, not wrapped
+        return lines + newline
+
+
+def _raw(text: str) -> Segments:
+    """Text that is neither cut nor wrapped, nor loses its escape sequences: to rich, controls are that."""
+    return Segments([Segment(text, None, [(ControlType.CARRIAGE_RETURN,)])])
 
 
 class _Above(FileProxy):

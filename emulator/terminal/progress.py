@@ -1,6 +1,6 @@
 """Progress of a run, for its user: a live picture in a terminal, plain lines elsewhere, JSON for machines.
 
-All of it goes to stderr, and whatever becomes of stderr, the run goes on.
+All of it goes to stderr, which a command has made tolerant: whatever becomes of it, the run goes on.
 """
 
 from __future__ import annotations
@@ -113,7 +113,6 @@ class _Lines(Progress):
     def __init__(self, emulation: Emulation, file: TextIO) -> None:
         self._course = Course(emulation)
         self._file = file
-        self._gone = False
         self._told_events = 0
         self._last_s = 0.0
         self._closed = False
@@ -121,13 +120,8 @@ class _Lines(Progress):
         emulation.watch(self._period)
 
     def _write(self, line: str) -> None:
-        if self._gone:
-            return
-        try:
-            self._file.write(line + "\n")
-            self._file.flush()
-        except (OSError, ValueError):  # nobody reads it any more
-            self._gone = True
+        self._file.write(line + "\n")  # a tolerant stream, which drops it if nobody reads
+        self._file.flush()
 
     def _is_time(self) -> bool:
         now_s = time.monotonic()

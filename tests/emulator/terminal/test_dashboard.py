@@ -105,13 +105,11 @@ UNREPORTED = {
 LEGEND = {"frames_per_s": {"delivered": 800.0, "lost": 100.0, "peer_cap": 30.0, "fault": 70.0}}
 VEHICLES = tuple(f"n{n}" for n in range(460))
 PICTURES: dict[str, tuple[dict[str, Any], list[tuple[int, int]]]] = {
-    "running": ({}, [(100, 30), (60, 12), (60, 5)]),
+    "running": ({}, [(100, 30), (60, 12)]),
     "joining": ({"phase": "joining", "missing": ("v02", "v11"), "down": (), "wall_s": 12.0}, [(100, 30)]),
     "faults that act, then the next": ({"faults": MANY}, [(100, 18)]),
     "nobody reports": (UNREPORTED, [(100, 18)]),
-    "nobody has reported yet": ({**UNREPORTED, "emulated_s": 0.5}, [(100, 18)]),
-    "a legend": (LEGEND, [(120, 12), (80, 12), (40, 12)]),
-    "one of many is down": ({"node_ids": VEHICLES, "down": VEHICLES[-1:]}, [(100, 12)]),
+    "a legend": (LEGEND, [(120, 12), (40, 12)]),
     "many of many are down": ({"node_ids": VEHICLES, "down": VEHICLES[:100]}, [(100, 12)]),
 }
 """Runs, and the sizes of the terminals at which they are shown."""
@@ -156,7 +154,7 @@ def test_it_fits_whatever_terminal_there_is(width: int, height: int, changes: di
     assert not set(text) & set("\r\t\v\f")
 
 
-@pytest.mark.parametrize("height", [8, 12, 15, 24, 30, 60])
+@pytest.mark.parametrize("height", [12, 15, 24, 30, 60])
 def test_nothing_moves_while_events_and_frames_come(height: int) -> None:
     shots = [make(), make(events=()), make(events=EVENTS[:1]), make(frames_per_s={}), make(down=())]
     shots += [make(emulated_s=seconds) for seconds in (1.0, 19.9)]

@@ -174,19 +174,6 @@ def test_lines_of_json_of_joining(tmp_path: Path) -> None:
     assert told == [("starting", [], 6), ("joining", ["v01", "v02"], 6), ("running", [], 6)]
 
 
-@pytest.mark.parametrize("show", [PlainLines, JsonLines])
-def test_a_reader_that_goes_away_does_not_end_the_run(
-    tmp_path: Path, show: type[PlainLines] | type[JsonLines], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(show, "every_s", 0.0)
-    reader, writer = os.pipe()
-    os.close(reader)
-    file = os.fdopen(writer, "w")
-    assert told(tmp_path / "run", show, file)["verdict"] == "valid"
-    with pytest.raises(BrokenPipeError):  # what could not be written is still in it
-        file.close()
-
-
 def test_a_picture_of_a_run_leaves_nothing_but_what_was_said(tmp_path: Path) -> None:
     screen = Terminal(80, 24)
     verdict = told(tmp_path / "run", lambda emulation, file: Picture(emulation, file.console), screen)
