@@ -9,14 +9,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from emulator.drivers.emulation import Emulation
-from emulator.records.run_folder import RunFolder
+from emulator.drivers.session import Session
 from emulator.scenario.scenario import Scenario
 from emulator.testing.conformance import scene as timing
 from emulator.testing.conformance.courses import Barrier, Clock, Course
 from emulator.testing.conformance.findings import Findings
 from emulator.testing.conformance.scene import PLACEHOLDERS, Bench, Pacing, Scene, SceneOverError
-from emulator.world.world import build_world
 from vnet.errors import VnetError, did_you_mean
 from vnet.transport import wire
 from vnet.transport.access import Access, certifier, is_tls
@@ -205,12 +203,11 @@ class Conformance:
 
     def play(self, on_scene: Callable[[str], None] = lambda name: None) -> Findings:
         """Play the scenes; `on_scene` is given each name. Raises VnetError if the command cannot be started."""
-        world = build_world(self.scenario)
+        emulation = Session(self.scenario).emulation
         certify = certifier(self.listen) if is_tls(self.listen) else None
-        access = Access.create(self.scenario.run.name, [[world.node_ids[0]]], certify)
+        access = Access.create(self.scenario.run.name, [[emulation.world.node_ids[0]]], certify)
         findings = Findings()
         with tempfile.TemporaryDirectory(prefix="vnet-") as name:
-            emulation = Emulation(self.scenario, world, RunFolder(Path(name)))
             for scene_name in self.scenes:
                 on_scene(scene_name)
                 findings.begin(scene_name)

@@ -19,7 +19,8 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.processes import ProtocolError, check_ownership
 from emulator.drivers.zygote import GroupProcess
 from emulator.radio.unicast import MOST_ATTEMPTS
-from emulator.testing.conformance.findings import Findings, counted, decoding_problem
+from emulator.testing.conformance.findings import Findings, decoding_problem
+from vnet.counted import counted
 from vnet.errors import VnetError
 from vnet.reports import Report
 from vnet.transport import keys, wire
