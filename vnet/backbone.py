@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+from vnet.arguments import checked_payload
 from vnet.errors import PayloadTooLargeError, shown
 from vnet.mailbox import Mailbox
-from vnet.payload import checked_payload
 
 
 class BackboneMessage(NamedTuple):

@@ -16,8 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, FARTHEST_M, TIME_AIM, Comparison, compare
-from benchmarks.ns3.figure import draw
+from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, FARTHEST_M, TIME_AIM, Comparison, compare, draw
 from benchmarks.ns3.ground import BIN_M
 from benchmarks.ns3.simulators import MissingError, build
 

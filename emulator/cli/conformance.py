@@ -11,8 +11,8 @@ import typer
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import one_line_errors
-from emulator.testing.conformance.findings import counted
 from emulator.testing.conformance.play import PATIENCE_S, SCENES, Conformance
+from vnet.counted import counted
 
 SOMETHING_WRONG = 1
 

@@ -68,7 +68,14 @@ class Stalled(Exception):
 
 
 class ProtocolError(VnetError):
-    """A message that does not fit what its process was told, or speaks for others."""
+    """A message that does not fit what its process was told, or speaks for others.
+
+    `rule` is the check of `vnet conformance` that an agent which sends it does not pass.
+    """
+
+    def __init__(self, text: str, rule: str = "yields") -> None:
+        super().__init__(text)
+        self.rule = rule
 
 
 def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
@@ -78,10 +85,10 @@ def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequen
     own = frozenset(nodes)  # of a simulation a thousand, each of which is looked for several times
     for node in [part.node for parts in told for part in parts] + [*waiting]:
         if node not in own:
-            raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")
+            raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own", "own_node")
     for action in traffic.actions:
         if not action.is_sound:
-            raise ProtocolError(f"{action.node} asks for an acceleration that is no number")
+            raise ProtocolError(f"{action.node} asks for an acceleration that is no number", "numbers")
 
 
 def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_ns: int) -> None:
@@ -89,7 +96,8 @@ def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_
     if message.next_timer_ns is not None and message.next_timer_ns < end_ns:
         raise ProtocolError(
             f"yield {message.seq} of {nodes[0]}: its next timer, {message.next_timer_ns}, lies before the end "
-            f"of its window, {end_ns}"
+            f"of its window, {end_ns}",
+            "timers",
         )
     check_ownership(nodes, wire.Traffic(), [*message.waiting_radio, *message.waiting_gnss])
     earliest_ns = granted_ns
@@ -97,7 +105,8 @@ def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_
         if not earliest_ns <= step.time_ns < end_ns:
             raise ProtocolError(
                 f"yield {message.seq} of {nodes[0]}: a step at {step.time_ns}, where {earliest_ns} to "
-                f"{end_ns - 1} are allowed"
+                f"{end_ns - 1} are allowed",
+                "steps",
             )
         earliest_ns = step.time_ns + 1
         check_ownership(nodes, step.traffic)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ns3 import acknowledged, buildings
-from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, LEAST_PAIRS, Comparison
-from benchmarks.ns3.figure import draw
+from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, LEAST_PAIRS, Comparison, draw
 from benchmarks.ns3.ground import RATE_HZ, Curve, Outcome, ScheduleConstraints
 from benchmarks.ns3.simulators import ours
 from tests.support.paths import ROOT

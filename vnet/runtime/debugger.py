@@ -32,10 +32,10 @@ _NOT_STEPPED_INTO = (
     "agents.host",
     "emulator.",
     "namedtuple_",  # what Python generates for named tuples
+    "vnet.arguments",
     "vnet.driving",
     "vnet.backbone",
     "vnet.mailbox",
-    "vnet.payload",
     "vnet.node",
     "vnet.radio",
     "vnet.reports",

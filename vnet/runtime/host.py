@@ -516,7 +516,8 @@ class Host:
         `take_traffic` then returns the exceptions that nobody has handled, and programs in a deadlock.
         """
         self._closing = True
-        self._tell_deadlocks([node for node in self.nodes.values() if self._runs(node)])
+        if self._mains:  # else the run has ended before the first grant
+            self._tell_deadlocks([node for node in self.nodes.values() if self._runs(node)])
         tasks = self._cancel_all()
         with contextlib.suppress(LoopAbandonedError, SpinError):
             while True:

@@ -1,5 +1,5 @@
 """Conformance of agents written without vnet: plays the emulator's side in scenes, and checks each answer.
 
-`findings` collects what the checks say, `bench` is the router and the agent under test, `inspection` judges single
-messages, `scene` is what all scenes share, `joining`, `lockstep` and `realtime` are the scenes, `play` plays them.
+`findings` lists the checks and collects what they say, `scene` is the agent under test and what all scenes share,
+`courses` grant windows and send batches, and `play` is the table of scenes.
 """

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgpack
 
+from vnet.counted import counted
 from vnet.errors import WireError, printable
 from vnet.transport import wire
 
@@ -99,11 +100,6 @@ class Findings:
                 yield f"ok     {name:13}  {expected} ({counted(len(scenes), 'scene')})"
             elif unreached:
                 yield f"-      {name:13}  {expected} (not reached)"
-
-
-def counted(count: int, noun: str) -> str:
-    """A number with its noun."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def described(data: bytes) -> str:

@@ -78,6 +78,13 @@ class World:
         return [step.traffic for message in self.yields for step in message.steps]
 
 
+def test_a_host_closed_before_its_first_grant_tells_of_no_deadlock() -> None:
+    world = World("v1")
+    world.host.close(world.loop)
+    world.loop.close()
+    assert world.traffic == []
+
+
 def test_a_program_that_only_waits_on_the_radio_is_woken_by_each_packet() -> None:
     heard: list[tuple[int, int]] = []
 

@@ -2,7 +2,6 @@
 
 import queue
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -26,8 +25,8 @@ class Late:
 
 
 def test_what_an_agent_says_last_is_heard_after_its_exit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    agent: Any = SimpleNamespace(exit_status=0)
-    bench = Bench(Access.create("r", [["v01"]]), "tcp/127.0.0.1:0", agent, tmp_path)
+    monkeypatch.setattr(Bench, "exit_status", 0)
+    bench = Bench(Access.create("r", [["v01"]]), "tcp/127.0.0.1:0", [], tmp_path)
     last = Said(b"", 0, None, "nothing")
     monkeypatch.setattr(bench, "_incoming", Late(last, False))
     bench.present = True

@@ -12,11 +12,12 @@ import pytest
 from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import run_app
-from emulator.testing.conformance import lockstep, realtime
+from emulator.testing.conformance import courses
+from emulator.testing.conformance import play as play_module
 from emulator.testing.conformance import scene as scene_module
 from emulator.testing.conformance.findings import CHECKS, Findings, decoding_problem, described
 from emulator.testing.conformance.play import SCENES, Conformance
-from emulator.testing.conformance.scene import Inspection, Said, Scene, SceneOverError
+from emulator.testing.conformance.scene import Said, Scene, SceneOverError
 from tests.support.paths import ROOT
 from vnet.errors import VnetError
 from vnet.transport import wire
@@ -50,7 +51,7 @@ def wrong(mistake: str) -> list[str]:
 def at_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    wait_for(monkeypatch, realtime, ACKNOWLEDGE_S=LONG_S, FINAL_S=LONG_S)
+    wait_for(monkeypatch, courses, ACKNOWLEDGE_S=LONG_S, FINAL_S=LONG_S)
 
 
 def wait_for(monkeypatch: pytest.MonkeyPatch, module: ModuleType, **times_s: float) -> None:
@@ -77,8 +78,10 @@ def test_a_program_that_awaits_the_results_of_its_sends_is_told_them() -> None:
 
 def test_two_frames_to_single_vehicles_with_one_number_are_found() -> None:
     findings, frame = Findings(), wire.Frame("v01", b"", to="v02", number=3)
-    inspection = Inspection(findings, "v01", 100)
-    inspection.inspect_frames(wire.Frames(b"n", 0, 0, [], wire.Traffic([frame, frame])), b"", 0)
+    bench: Any = SimpleNamespace(node="v01")
+    emulation: Any = SimpleNamespace(scenario=Scenario())
+    scene = Scene(bench, findings, emulation, "realtime", LONG_S)
+    scene.check_traffic(wire.Traffic([frame, frame]), b"", (0, 0), "")
     ((_, came),) = findings.failed["sends"]
     assert came.startswith("a second frame with number 3")
 
@@ -102,12 +105,12 @@ def test_an_agent_passes_over_tls() -> None:
         ("CountsByItself", "lockstep", "yields", "seq = 1, and not 0"),
         ("YieldsTwice", "lockstep", "yields", "seq = 0, and not 1"),
         ("YieldsBeforeTheGrant", "lockstep-ended", "silence", "Yield"),
-        ("TimerInThePast", "lockstep", "timers", "next_timer_ns = 0 in a window to 2000000"),
+        ("TimerInThePast", "lockstep", "timers", "its next timer, 0, lies before the end of its window, 2000000"),
         ("StepsAfterItsWindow", "lockstep", "steps", "a step at 2000000, where 0 to 1999999 are allowed"),
         ("KnowsNoWindows", "refusal", "version", "version = 1"),
         ("WaitsForNothing", "lockstep-lost", "wakes", "it waits for nothing"),
         ("AnswersLate", "lockstep-lost", "yields", "no Yield within 0.5 s"),
-        ("SpeaksForOthers", "lockstep-lost", "own_node", "a frame of 'v02'"),
+        ("SpeaksForOthers", "lockstep-lost", "own_node", "speaks for v02, which is not its own"),
         ("SendsTooMuch", "lockstep-lost", "payload", "100000 bytes, where"),
         ("ReportsNan", "lockstep-lost", "numbers", "not finite"),
         ("ReportsWallClock", "lockstep-lost", "report_time", "and not 0"),
@@ -149,20 +152,18 @@ def test_an_agent_is_told_its_mistake(
 def arrange(mistake: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Give what comes a long time, however slow the machine, and what does not come a short one."""
     match mistake:
-        case "TakesAnyWelcome":
-            wait_for(monkeypatch, scene_module, QUIET_S=LONG_S)
-        case "YieldsBeforeTheGrant":
+        case "TakesAnyWelcome" | "YieldsBeforeTheGrant":
             wait_for(monkeypatch, scene_module, QUIET_S=LONG_S)
         case "GivesUpAtOnce":
             wait_for(monkeypatch, scene_module, ORPHAN_TIMEOUT_S=LONG_S)
-            wait_for(monkeypatch, scene_module, ORPHAN_TIMEOUT_S=LONG_S, AWAY_S=LONG_S)
+            wait_for(monkeypatch, play_module, AWAY_S=LONG_S)
         case "SaysHelloOnce":
-            wait_for(monkeypatch, scene_module, HELLO_WAIT_S=SHORT_S)
+            wait_for(monkeypatch, play_module, HELLO_WAIT_S=SHORT_S)
         case "NeverAcknowledges" | "NoLastWords":
-            wait_for(monkeypatch, realtime, ACKNOWLEDGE_S=SHORT_S, FINAL_S=SHORT_S)
+            wait_for(monkeypatch, courses, ACKNOWLEDGE_S=SHORT_S, FINAL_S=SHORT_S)
         case "IgnoresStackRequests":
-            ask = scene_module.ask_stack
-            monkeypatch.setattr(lockstep, "ask_stack", lambda scene, timeout_s: ask(scene, SHORT_S))
+            ask = Scene.ask_stack
+            monkeypatch.setattr(Scene, "ask_stack", lambda scene, timeout_s: ask(scene, SHORT_S))
 
 
 def test_an_agent_that_does_not_start_is_told_what_it_printed() -> None:
@@ -249,12 +250,12 @@ def test_an_agent_that_never_stops_sending_does_not_hold_a_scene(monkeypatch: py
     now_s = itertools.count(step=0.01)
     taken: list[Said] = []
     monkeypatch.setattr("emulator.testing.conformance.scene.time.monotonic", lambda: next(now_s))
-    scene: Any = Scene.__new__(Scene)
-    scene.patience_s, scene.silent, scene.findings, scene.nonce = 5.0, False, Findings(), b""
     endless = (frames(seq) for seq in itertools.count())
-    scene.bench = SimpleNamespace(hear=lambda timeout_s: next(endless), agent=SimpleNamespace(exit_status=None))
-    scene.take_frames = taken.append
-    assert list(scene.until_quiet()) == []
+    bench: Any = SimpleNamespace(hear=lambda timeout_s: next(endless), exit_status=None)
+    emulation: Any = None
+    scene = Scene(bench, Findings(), emulation, "realtime", 5.0)
+    scene.silent, scene.take_frames = False, taken.append
+    assert scene.until_quiet() == []
     assert len(taken) > 3, "none is passed over"
     with pytest.raises(SceneOverError):
         scene.await_message(wire.StackDump, "stack", 1.0)

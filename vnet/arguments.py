@@ -1,8 +1,21 @@
-"""Payloads that programs send: bytes, and nothing else."""
+"""Arguments that programs give to calls of their vehicle: what counts as a number, and as a payload."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 from vnet.errors import shown
+
+
+def number_or_nan(value: Any) -> float:
+    """Return a number, numpy's included, as a float; NaN for what is none: texts, booleans, and beyond floats."""
+    if isinstance(value, (str, bytes, bytearray, bool)):
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def checked_payload(call: str, payload: bytes) -> bytes:
