@@ -21,6 +21,12 @@ from vnet.node import Node
 Program = Callable[[Node], Awaitable[None]]
 
 
+@pytest.fixture(autouse=True)
+def _nothing_left_by_other_tests() -> None:
+    """Discard what an earlier test has left in a cycle: a run that finds it would be told of its failure."""
+    gc.collect()
+
+
 class FailsWhenDiscarded:
     def __del__(self) -> None:
         raise ValueError("boom")
