@@ -11,16 +11,18 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import secrets
 import shutil
 import sys
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import count
+from functools import cache
+from itertools import combinations, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import zenoh
@@ -57,8 +59,10 @@ class Crossing(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
     encoding: str
     is_delete: bool
     attachment: bytes | None
-    priority: str
-    congestion: str
+    priority: Literal[
+        "REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"
+    ]
+    congestion: Literal["DROP", "BLOCK", "BLOCK_FIRST"]
     express: bool
     time: tuple[int, int, bytes] | None
     source: tuple[int, int] | None
@@ -125,6 +129,9 @@ class Options:
                 zenoh.KeyExpr(key)
             except zenoh.ZError:
                 raise ProgramError(f"program.options.keys: {shown(key)} is no key expression of Zenoh") from None
+        for one, other in combinations(keys, 2):  # a sample of both would be sent twice
+            if zenoh.KeyExpr(one).intersects(other):
+                raise ProgramError(f"program.options.keys: {shown(one)} and {shown(other)} overlap")
         several = isinstance(command, list) and all(isinstance(words, list) for words in command)
         commands = [_texts("command", words) for words in (command if several else [command])]
         if not all(commands):
@@ -160,8 +167,8 @@ class Gateway:
         self._folder = TemporaryDirectory(prefix="vnet-")
         self._session: zenoh.Session | None = None
         self.endpoint = ""
-        self.sent = self.heard = self.incomplete = 0
-        """Samples that were sent and heard, and those heard of which a part is missing."""
+        self.sent = self.heard = 0
+        """Samples that were sent, and that were heard."""
 
     async def open(self) -> None:
         """Open the vehicle's router. Raise ProgramError if it cannot listen."""
@@ -263,9 +270,7 @@ class Gateway:
             query.reply_err(answer.error[0], encoding=answer.error[1])
             return
         sample, options = answer.sample, _options(answer.sample)
-        if (
-            "source_info" in options
-        ):  # a reply of Python has none: so advanced subscribers are given the sample itself
+        if "source_info" in options:  # which Python cannot give a reply, and advanced subscribers need
             self._show(sample)
             return
         kept = {name: options[name] for name in ("attachment", "express", "timestamp") if name in options}
@@ -307,7 +312,8 @@ class Gateway:
                 content = self._whole(packet)
                 if content is not None:
                     self._take(packet.sender, _message(content))
-            except (msgspec.MsgspecError, zenoh.ZError, KeyError) as error:  # bytes that a fault has changed
+            except (msgspec.MsgspecError, zenoh.ZError, LookupError, ValueError, OverflowError) as error:
+                # bytes that a fault has changed
                 self._node.log(f"a frame of {packet.sender} is no sample: {error}", "debug")
 
     def _whole(self, packet: Packet) -> bytes | None:
@@ -323,7 +329,6 @@ class Gateway:
             return b"".join(parts[index] for index in range(fragment.parts))
         if len(unfinished) > MOST_UNFINISHED:
             unfinished.popitem(last=False)
-            self.incomplete += 1
         return None
 
     def _take(self, sender: str, message: Crossing | Question | Answer) -> None:
@@ -398,11 +403,11 @@ def crossing_of(sample: zenoh.Sample) -> Crossing:
         str(sample.encoding),
         sample.kind == zenoh.SampleKind.DELETE,
         _bytes(sample.attachment),
-        str(sample.priority).rpartition(".")[2],
-        str(sample.congestion_control).rpartition(".")[2],
+        _name_of(sample.priority),
+        _name_of(sample.congestion_control),
         sample.express,
         time,
-        None if sample.source_info is None else (os.getpid(), _number_of(sample.source_info)),
+        None if sample.source_info is None else (_this_process(), _number_of(sample.source_info)),
     )
 
 
@@ -416,13 +421,23 @@ def _options(sample: Crossing) -> dict[str, Any]:
     }
     if sample.time is not None:
         options["timestamp"] = zenoh.Timestamp(zenoh.NTP64(*sample.time[:2]), sample.time[2])
-    if sample.source is not None and sample.source[0] == os.getpid() and sample.source[1] in _sources:
+    if sample.source is not None and sample.source[0] == _this_process() and sample.source[1] in _sources:
         options["source_info"] = _sources[sample.source[1]]
     return options
 
 
 def _bytes(content: zenoh.ZBytes | None) -> bytes | None:
     return None if content is None else content.to_bytes()
+
+
+def _name_of(member: zenoh.Priority | zenoh.CongestionControl) -> Any:
+    return str(member).rpartition(".")[2]
+
+
+@cache
+def _this_process() -> int:
+    """Return a number that no process on any host shares; agents are forked after the import, so not before."""
+    return secrets.randbits(62)
 
 
 def _number_of(source: zenoh.SourceInfo) -> int:
