@@ -47,6 +47,11 @@ END_S = 0.5
 REMOTE = zenoh.Locality.REMOTE
 
 
+Priority = Literal[
+    "REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"
+]
+
+
 class Crossing(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
     """A sample on its way over the radio.
 
@@ -59,9 +64,7 @@ class Crossing(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
     encoding: str
     is_delete: bool
     attachment: bytes | None
-    priority: Literal[
-        "REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"
-    ]
+    priority: Priority
     congestion: Literal["DROP", "BLOCK", "BLOCK_FIRST"]
     express: bool
     time: tuple[int, int, bytes] | None

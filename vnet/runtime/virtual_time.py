@@ -298,11 +298,12 @@ class VirtualTimeLoop(SkewedLoop):
         asyncio_internals.check_not_closed(self)
         self._check_thread()
         when = self._own_when(when)
-        place: int | tuple[int, int] = next(self._timers)
+        number = next(self._timers)
+        place: int | tuple[int, int] = number
         if when < LATEST_S:
             when_ns = round(when * NS_PER_S)
             if self._timer_grid.step_ns:
-                place = when_ns, place
+                place = when_ns, number
                 when_ns = self._timer_grid.at_or_after(when_ns)
             when = when_ns / NS_PER_S
         timer = NumberedTimer(place, when, callback, args, self, context)
