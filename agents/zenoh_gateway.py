@@ -22,7 +22,7 @@ from functools import cache
 from itertools import combinations, count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import zenoh
@@ -31,6 +31,7 @@ from vnet import Node, Packet
 from vnet.errors import ProgramError, shown
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport.session import RUNTIME_VARIABLE, router_endpoint
+from vnet.units import NS_PER_S
 
 OWN_KEYS = "vnet/"
 """Prefix of keys that never cross the radio: what vnet tells the programs of a vehicle, and they it."""
@@ -52,6 +53,12 @@ Priority = Literal[
 ]
 
 
+# Zenoh panics on a timestamp beyond these.
+Seconds = Annotated[int, msgspec.Meta(ge=0, lt=2**32)]
+Nanoseconds = Annotated[int, msgspec.Meta(ge=0, lt=NS_PER_S)]
+TimestampId = Annotated[bytes, msgspec.Meta(min_length=1, max_length=16)]
+
+
 class Crossing(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
     """A sample on its way over the radio.
 
@@ -67,7 +74,7 @@ class Crossing(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
     priority: Priority
     congestion: Literal["DROP", "BLOCK", "BLOCK_FIRST"]
     express: bool
-    time: tuple[int, int, bytes] | None
+    time: tuple[Seconds, Nanoseconds, TimestampId] | None
     source: tuple[int, int] | None
 
 
