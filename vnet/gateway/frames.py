@@ -1,0 +1,144 @@
+"""What Zenoh programs say to each other over the radio, and the frames that carry it.
+
+A sample, a query, a reply or a liveliness token is encoded with msgpack and cut into as many frames as the radio's
+payload asks for. Both sides of the wall read them: gateways and emulated sessions, and the emulator's records.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from itertools import count
+from typing import Annotated, Literal
+
+import msgspec
+
+from vnet.units import NS_PER_S
+
+FRAGMENT_BYTES = 24
+"""Most bytes of a frame around its part of a message."""
+MOST_UNFINISHED = 64
+"""Messages in parts that are kept of each sender until the rest has come; the oldest go first."""
+MOST_FRAGMENTS = 65_535
+
+Priority = Literal[
+    "REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"
+]
+# Zenoh panics on a timestamp beyond these.
+Seconds = Annotated[int, msgspec.Meta(ge=0, lt=2**32)]
+Nanoseconds = Annotated[int, msgspec.Meta(ge=0, lt=NS_PER_S)]
+TimestampId = Annotated[bytes, msgspec.Meta(min_length=1, max_length=16)]
+
+
+class CrossingSample(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
+    """A sample on its way over the radio.
+
+    `time` is seconds, nanoseconds and id of its timestamp. `source` stands for its `SourceInfo`, which Python
+    cannot construct: process and number there. Gateways of other processes put the sample without.
+    """
+
+    key: str
+    payload: bytes
+    encoding: str
+    is_delete: bool
+    attachment: bytes | None
+    priority: Priority
+    congestion: Literal["DROP", "BLOCK", "BLOCK_FIRST"]
+    express: bool
+    time: tuple[Seconds, Nanoseconds, TimestampId] | None
+    source: tuple[int, int] | None
+
+
+class CrossingQuery(msgspec.Struct, array_like=True, frozen=True, tag="query"):
+    """A query on its way over the radio, with its number among those of the asking vehicle."""
+
+    number: int
+    selector: str
+    payload: bytes | None
+    encoding: str | None
+    attachment: bytes | None
+
+
+class CrossingReply(msgspec.Struct, array_like=True, frozen=True, tag="reply"):
+    """A reply to query `number` of vehicle `to`: a sample, or payload and encoding of an error."""
+
+    to: str
+    number: int
+    sample: CrossingSample | None
+    error: tuple[bytes, str] | None = None
+
+
+class CrossingToken(msgspec.Struct, array_like=True, frozen=True, tag="token"):
+    """A liveliness token of the sender that is there (`alive`), or is there no more."""
+
+    key: str
+    alive: bool
+
+
+Message = CrossingSample | CrossingQuery | CrossingReply | CrossingToken
+
+
+class Fragment(msgspec.Struct, array_like=True, frozen=True):
+    """Contents of a frame: part `index` of `parts` of the sender's message `number`."""
+
+    number: int
+    index: int
+    parts: int
+    content: bytes
+
+
+_encode = msgspec.msgpack.Encoder().encode
+decode_message = msgspec.msgpack.Decoder(Message).decode
+"""Decode a whole message. Raises msgspec.MsgspecError for what is none."""
+decode_fragment = msgspec.msgpack.Decoder(Fragment).decode
+"""Decode a frame's payload. Raises msgspec.MsgspecError for what is none."""
+
+
+class TooLargeError(Exception):
+    """A message needs more than `MOST_FRAGMENTS` frames."""
+
+
+class Fragments:
+    """Cuts the messages of one sender into payloads of at most `max_payload` bytes."""
+
+    def __init__(self, max_payload: int) -> None:
+        self._max_payload = max_payload
+        self._numbers = count()
+
+    def of(self, message: Message) -> Iterator[bytes]:
+        """Return the payloads of a message's frames. Raises TooLargeError."""
+        content, number = _encode(message), next(self._numbers)
+        size = self._max_payload - FRAGMENT_BYTES
+        parts = -(-len(content) // max(size, 1))
+        if size < 1 or parts > MOST_FRAGMENTS:
+            raise TooLargeError(
+                f"a message of {len(content)} bytes needs more than {MOST_FRAGMENTS} frames of "
+                f"radio.max_payload_bytes = {self._max_payload}"
+            )
+        pieces = (content[start : start + size] for start in range(0, len(content), size))
+        return (_encode(Fragment(number, index, parts, piece)) for index, piece in enumerate(pieces))
+
+
+class Reassembly:
+    """Puts messages together from the frames of all senders that one vehicle hears."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, OrderedDict[int, dict[int, bytes]]] = {}
+
+    def take(self, sender: str, payload: bytes) -> Message | None:
+        """Return the message that a frame completes, if it does.
+
+        Raises msgspec.MsgspecError or LookupError for bytes that no sender has sent, as a fault makes them.
+        """
+        fragment = decode_fragment(payload)
+        if fragment.parts == 1:
+            return decode_message(fragment.content)
+        unfinished = self._parts.setdefault(sender, OrderedDict())
+        parts = unfinished.setdefault(fragment.number, {})
+        parts[fragment.index] = fragment.content
+        if len(parts) == fragment.parts:
+            del unfinished[fragment.number]
+            return decode_message(b"".join(parts[index] for index in range(fragment.parts)))
+        if len(unfinished) > MOST_UNFINISHED:
+            unfinished.popitem(last=False)
+        return None
