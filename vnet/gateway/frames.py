@@ -68,14 +68,16 @@ class CrossingReply(msgspec.Struct, array_like=True, frozen=True, tag="reply"):
     error: tuple[bytes, str] | None = None
 
 
-class CrossingToken(msgspec.Struct, array_like=True, frozen=True, tag="token"):
-    """A liveliness token of the sender that is there (`alive`), or is there no more."""
+class CrossingTokens(msgspec.Struct, array_like=True, frozen=True, tag="tokens"):
+    """All liveliness tokens of the sender's programs: told when they change, and again while there are any.
 
-    key: str
-    alive: bool
+    So neither a lost frame nor a vehicle that comes into range later is left with another picture for long.
+    """
+
+    keys: tuple[str, ...]
 
 
-Message = CrossingSample | CrossingQuery | CrossingReply | CrossingToken
+Message = CrossingSample | CrossingQuery | CrossingReply | CrossingTokens
 
 
 class Fragment(msgspec.Struct, array_like=True, frozen=True):
