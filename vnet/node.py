@@ -22,16 +22,7 @@ from vnet.backbone import Backbone, BackboneTransport, UnitAbilities
 from vnet.driving import Action, checked_action
 from vnet.mailbox import Mailbox
 from vnet.radio import NO_ABILITIES, Radio, RadioAbilities, RadioTransport, SendOptions
-from vnet.reports import (
-    NoteDetail,
-    Report,
-    Value,
-    check_name,
-    checked_covariance,
-    checked_detail,
-    checked_numbers,
-    checked_value,
-)
+from vnet.reports import NoteDetail, Report, Reporter, checked_detail
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
@@ -148,7 +139,7 @@ class Node:
         disk: Callable[[], Path] | None = None,
         unit: UnitAbilities | None = None,
     ) -> None:
-        self._is_text: dict[str, bool] = {}  # by the name of each reported value
+        self._reporter = Reporter(node_id)
         self.id = node_id
         self._hashes = count(crc32(node_id.encode()))  # of its tasks and futures
         self._task_names = count(1)
@@ -221,34 +212,7 @@ class Node:
         none (not finite, not symmetric, or not positive semidefinite), for a name that is none or that vnet's
         own columns have, and for a text under a name that this node has reported numbers by, or the reverse.
         """
-        estimate = None if estimate_m is None else checked_numbers("estimate_m", estimate_m, 2)
-        covariance = None if covariance_m2 is None else checked_covariance("covariance_m2", covariance_m2)
-        named = {name: checked_value(name, value) for name, value in values.items()}
-        for name, kept in named.items():
-            self._check_kind(name, kept)
-        self._transport.send_report(
-            Report(
-                time_ns=self.now_ns,
-                node=self.id,
-                estimate_m=None if estimate is None else (estimate[0], estimate[1]),
-                covariance_m2=(
-                    None if covariance is None else (covariance[0], covariance[1], covariance[2], covariance[3])
-                ),
-                values=named,
-            )
-        )
-
-    def _check_kind(self, name: str, value: Value) -> None:
-        """Raise ValueError for a name that no value can have, and for a text where numbers were, or the reverse."""
-        is_text = isinstance(value, str)
-        if name not in self._is_text:
-            check_name(name)
-            self._is_text[name] = is_text
-        elif self._is_text[name] != is_text:
-            before, now = ("a text", "a number") if self._is_text[name] else ("a number", "a text")
-            raise ValueError(
-                f"report({name}={value!r}): {now}, but {self.id} has reported {before} by this name; use two names"
-            )
+        self._transport.send_report(self._reporter.report(self.now_ns, estimate_m, covariance_m2, values))
 
     def log(self, text: str, level: str = "info") -> None:
         """Write a line to this vehicle's log, with the emulated time and a level.

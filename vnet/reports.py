@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
@@ -105,3 +106,45 @@ def checked_value(name: str, value: ArrayLike) -> Value:
         return float(value)
     flat = checked_numbers(name, value)
     return flat[0] if np.ndim(value) == 0 else flat
+
+
+class Reporter:
+    """Makes the reports of one program of `node`, and holds it to one kind of value a name."""
+
+    def __init__(self, node: str) -> None:
+        self._node = node
+        self._is_text: dict[str, bool] = {}  # by the name of each reported value
+
+    def report(
+        self,
+        time_ns: int,
+        estimate_m: ArrayLike | None,
+        covariance_m2: ArrayLike | None,
+        values: Mapping[str, ArrayLike],
+    ) -> Report:
+        """Return a report; the arguments and errors are those of `Node.report`."""
+        estimate = None if estimate_m is None else checked_numbers("estimate_m", estimate_m, 2)
+        covariance = None if covariance_m2 is None else checked_covariance("covariance_m2", covariance_m2)
+        named = {name: checked_value(name, value) for name, value in values.items()}
+        for name, kept in named.items():
+            self._check_kind(name, kept)
+        return Report(
+            time_ns=time_ns,
+            node=self._node,
+            estimate_m=None if estimate is None else (estimate[0], estimate[1]),
+            covariance_m2=(
+                None if covariance is None else (covariance[0], covariance[1], covariance[2], covariance[3])
+            ),
+            values=named,
+        )
+
+    def _check_kind(self, name: str, value: Value) -> None:
+        """Raise ValueError for a name that no value can have, and for a text where numbers were, or the reverse."""
+        is_text = isinstance(value, str)
+        if name not in self._is_text:
+            check_name(name)
+            self._is_text[name] = is_text
+        elif self._is_text[name] != is_text:
+            before, now = ("a text", "a number") if self._is_text[name] else ("a number", "a text")
+            text = f"{now}, but {self._node} has reported {before} by this name; use two names"
+            raise ValueError(f"report({name}={value!r}): {text}")

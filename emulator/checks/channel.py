@@ -16,6 +16,7 @@ from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.faults import Custom, CustomSender, SenderFault, StaleMessages
 from emulator.world.radio_inputs import LinkTable
 from vnet.counted import counted
+from vnet.errors import first_names
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 
@@ -284,12 +285,14 @@ def check_isolation(recorded: RecordedRun) -> Finding:
         return nothing_seen(name, recorded, "nothing arrived")
     foreign = _foreign(recorded)
     claims = _claims_beyond(recorded)
-    broken = int(foreign.sum()) + len(claims)
+    strangers_at = sorted({event.node or "" for event in recorded.event(EventKind.extra_session)})
+    broken = int(foreign.sum()) + len(claims) + len(strangers_at)
     reporting = int(np.isfinite(recorded.value("heard")).any(axis=0).sum())
     text = f"{counted(arrived, 'arrival')} as they were sent"
     text += f"; {reporting} programs report no more received packets than that" if reporting else ""
     unsent, overstated = counted(int(foreign.sum()), "arrival"), counted(len(claims), "report")
     broken_text = f"{unsent} of what was never sent, {overstated} of more than arrived"
+    broken_text += f", sessions beside the radio at {first_names(strangers_at)}" if strangers_at else ""
     figures = {"arrivals": arrived, "foreign": int(foreign.sum()), "claims": len(claims), "refused": refused}
     return result(name, broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
 

@@ -51,7 +51,9 @@ class Attachment:
         lease_ms: int,
         drops: bool,
         hear: Hear,
+        has_agents: bool = True,
     ) -> None:
+        self._has_agents = has_agents
         self._connect = options.connect if options.router is None else options.router.endpoint
         self.endpoint = self._connect or options.listen
         self._options = options
@@ -95,7 +97,9 @@ class Attachment:
             )
             for stream in ("scene", "period", "end")
         }
-        nodes, units = ((), ()) if hosts else (self._node_ids, options.access.units)  # those on hosts are their own
+        nodes, units = (self._node_ids, options.access.units)
+        if hosts or not self._has_agents:  # the keys of those on hosts are their hosts' own
+            nodes, units = (), ()
         self._agents = AgentKeys(session, run, nodes, units, self._drops, self._hear, stack)
         stack.enter_context(session.declare_queryable(keys.control(run, "*"), self._take_query))
         stack.enter_context(session.liveliness().declare_token(keys.emulator_alive(run)))

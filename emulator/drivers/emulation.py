@@ -454,7 +454,7 @@ class Emulation:
             incarnation,
             scenario.run.pacing,
             program.entry,
-            program.options,
+            scenario.options_of(node),
             self.world.lane_map.to_wire(),
             node_seed(scenario.run.seed, node, incarnation),
             self.world.period_ns,

@@ -92,6 +92,9 @@ class AgentProcesses(Protocol):
     def log_tail(self, name: str) -> str:
         """Return the last lines of a process's log."""
 
+    def takes_end(self, name: str, how: Exit) -> bool:
+        """Take the end of a process that the launcher has started and that is no agent; returns whether it is."""
+
 
 class Launcher:
     """The processes that a run has started, which log to `logs`.
@@ -220,6 +223,25 @@ class Launcher:
             command += ["--credentials", f"/dev/fd/{read_end}"]
         os.close(write_end)
         try:
+            self._start(name, command, {**SAME_ARITHMETIC, **os.environ, **environment}, own_session, [read_end])
+        finally:
+            os.close(read_end)
+
+    def start_command(self, name: str, words: Sequence[str], environment: Mapping[str, str], nice: int) -> None:
+        """Start a command in a group of its own that ends with this process; it prints to `logs/{name}.log`."""
+        tied = [sys.executable, "-P", "-m", "vnet.runtime.die_with_parent"]
+        self._start(name, [*tied, *words], environment)
+        self._lower_priority(name, nice)
+
+    def _start(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        own_session: bool = False,
+        descriptors: Sequence[int] = (),
+    ) -> None:
+        try:
             inherit = nullcontext() if name in self._services else default_time_slice()
             with (self.logs / f"{name}.log").open("ab") as log, inherit:
                 self._processes[name] = GroupProcess(
@@ -227,15 +249,13 @@ class Launcher:
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=subprocess.STDOUT,
-                    pass_fds=[read_end],
+                    pass_fds=descriptors,
                     process_group=None if own_session else 0,
                     start_new_session=own_session,
-                    env={**SAME_ARITHMETIC, **os.environ, **environment},
+                    env=environment,
                 )
         except OSError as error:
             raise _cannot_start(name, error.strerror) from None
-        finally:
-            os.close(read_end)
 
     @property
     def pids(self) -> dict[str, int]:
@@ -283,6 +303,16 @@ class Launcher:
         """Send a signal to a process, if it is there."""
         if name in self._processes:
             self._processes[name].send_signal(number)
+
+    def signal_group(self, name: str, number: int) -> None:
+        """Send a signal to a process and all that it has started in its group, if it is there."""
+        process = self._processes.get(name)
+        if process is not None and process.poll() is None:
+            os.killpg(process.pid, number)
+
+    def takes_end(self, name: str, how: Exit) -> bool:
+        """All that it starts are agents, and what belongs to the run itself."""
+        return False
 
     def detach(self, name: str) -> Callable[[float], None]:
         """Forget a process that has been told to go: `ended` does not report it.

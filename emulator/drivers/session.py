@@ -102,7 +102,8 @@ class Session:
         """`loads_programs` has live ones loaded in a process aside first, to tell of what is wrong with them."""
         scenario = with_order_steps(scenario)
         is_local = isinstance(programs, Local)
-        with nullcontext() if is_local or not loads_programs else program_check(scenario) as check:
+        loads_programs = loads_programs and not is_local and bool(entries_of(scenario))
+        with program_check(scenario) if loads_programs else nullcontext() as check:
             world = build_world(scenario)
             self._local = programs if isinstance(programs, Local) else Local()
             self._processes = process_count(self._local.processes, len(world.node_ids))

@@ -33,7 +33,7 @@ def code_digests(scenario: Scenario) -> dict[str, str]:
 
     A program that cannot be found has none.
     """
-    return digests_of(entries_of(scenario), scenario.program.folders) | rule_digests(scenario)
+    return digests_of(_sources_of(scenario), scenario.program.folders) | rule_digests(scenario)
 
 
 def rule_digests(scenario: Scenario) -> dict[str, str]:
@@ -73,9 +73,21 @@ def changed_code(recorded: Mapping[str, Any], now: Mapping[str, str]) -> str:
 
 
 def entries_of(scenario: Scenario) -> tuple[str, ...]:
-    """The entries of all programs of a scenario, sorted."""
+    """The entries of all programs of a scenario that vnet loads, sorted."""
     program = scenario.program
+    if scenario.has_gateways:
+        return ()
     return tuple(sorted({program.entry, *(exception.entry for exception in program.exceptions)}))
+
+
+def _sources_of(scenario: Scenario) -> tuple[str, ...]:
+    """The same, but scripts as modules in the place of the commands of Zenoh programs."""
+    program = scenario.program
+    if program.kind != "zenoh":
+        return entries_of(scenario)
+    commands = [words for each in (program, *program.exceptions) for words in each.commands]
+    scripts = {Path(word).stem for words in commands for word in words[:2] if word.endswith(".py")}
+    return tuple(f"{script}:main" for script in sorted(scripts))
 
 
 def program_digest(entries: Iterable[str], folders: Iterable[Path] = ()) -> str | None:

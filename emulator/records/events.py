@@ -156,6 +156,9 @@ class EventKind(StrEnum):
     router_restarted = "router_restarted", "", "down_s", "the separate router is back", CHANGE
     refused = "refused", "vehicle", "key reason", "the first message on this key that was not believed", WARNING
     refused_total = "refused_total", "", "key count", "how many there were", NOTE, MEASURED
+    extra_session = (
+        "extra_session", "vehicle", "count limit which", "more Zenoh sessions than `program.zenoh.sessions` are "
+        "connected to its endpoint: a way around the radio, and no isolation", FAILURE)
     observer_ended = "observer_ended", "process", "how", "a recorder ended before the run did", WARNING
     host_gone = (
         "host_gone", "", "host where", "the connection of this host closed; its processes have `died` with it",

@@ -215,6 +215,8 @@ def with_rules(
     exceptions = [
         each.model_copy(update={"entry": found.entry("program.entry", each.entry)}) for each in program.exceptions
     ]
+    for command in (words for each in (program, *program.exceptions) for words in each.commands):
+        found.command(command)
     data = {
         "entry": found.entry("program.entry", program.entry),
         "exceptions": tuple(exceptions),
@@ -274,6 +276,13 @@ class _Modules:
             self._holding.update(path for path in self._searched if _holds(path, parts))
         return entry
 
+    def command(self, words: Sequence[str]) -> None:
+        """Take note of the folders of the files of a command. Raises ScenarioError for a script that is missing."""
+        for word in words[:2]:
+            if split_file(word) is not None and not Path(word).is_absolute():
+                folder = self._holder("program.command", word)
+                self._holding.add(folder)
+
     def fault(self, fault: Fault) -> Fault:
         """Return a fault with its rule, if it has one, as `module:function`."""
         if not isinstance(fault, OwnRule):
@@ -282,19 +291,24 @@ class _Modules:
 
     def _file(self, key: str, entry: str, name: str, function: str) -> str:
         problem = f"{self._source}{key} = {shown(entry)}"
-        try:
-            found = next((path for folder in self._searched if (path := folder / name).is_file()), None)
-        except (OSError, ValueError):
-            found = None
-        if found is None:
-            where = " or in ".join(dict.fromkeys(str(folder.resolve()) for folder in self._searched))
-            raise ScenarioError(f"{problem}: no such file in {where}")
+        found = self._holder(key, name, entry) / name
         if not found.stem.replace(" ", "_").isidentifier():
             raise ScenarioError(f"{problem}: not importable: name the file with letters, digits, blanks and _ only")
         folder = self._of_files.setdefault(found.stem, found.parent)
         if folder.resolve() != found.parent.resolve():
             raise ScenarioError(f"{problem}: there is another {found.name} in {folder}: rename one of them")
         return f"{found.stem}:{function or DEFAULT_FUNCTIONS[key]}"
+
+    def _holder(self, key: str, name: str, entry: str = "") -> Path:
+        """Return the first folder with a file of this name. Raises ScenarioError if there is none."""
+        try:
+            found = next((folder for folder in self._searched if (folder / name).is_file()), None)
+        except (OSError, ValueError):
+            found = None
+        if found is None:
+            where = " or in ".join(dict.fromkeys(str(folder.resolve()) for folder in self._searched))
+            raise ScenarioError(f"{self._source}{key} = {shown(entry or name)}: no such file in {where}")
+        return found
 
     def _folder(self, path: Path, base: Path | None) -> Path:
         folder = (base or Path()) / path
@@ -458,9 +472,13 @@ def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
     if isinstance(run.tape, Path):
         run = run.model_copy(update={"tape": _absolute(run.tape, "run.tape", scenario_path)})
     world = _world_of(scenario, scenario_path)
-    return scenario.model_copy(
-        update={"run": run, "network": network, "radio": radio, "map": roads, "world": world}
-    )
+    parts: dict[str, Any] = {"run": run, "network": network, "radio": radio, "map": roads, "world": world}
+    if (sessions := scenario.program.zenoh) is not None:
+        files = {name: path for name, path in sessions if isinstance(path, Path)}
+        files = {name: _absolute(path, f"program.zenoh.{name}", scenario_path) for name, path in files.items()}
+        program = scenario.program.model_copy(update={"zenoh": sessions.model_copy(update=files)})
+        parts["program"] = program
+    return scenario.model_copy(update=parts)
 
 
 def _world_of(scenario: Scenario, scenario_path: Path) -> WorldSection:

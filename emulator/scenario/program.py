@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -15,6 +15,7 @@ from vnet.errors import ScenarioError, shown
 
 _MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
+MANY_SESSIONS = 10_000
 Coordinate = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
 NodeId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 
@@ -42,14 +43,69 @@ def _is_entry(entry: str) -> str:
 Entry = Annotated[str, AfterValidator(_is_entry)]
 
 
+ZENOH_ENTRY = "vnet.gateway.emulated:main"
+"""Entry of vehicles of kind "zenoh" in lockstep, which runs their commands on virtual time."""
+_ENTRY = "agents.beacon:main"
+
+
 class OneProgram(Section):
     """A program as `package.module:function`, and the options it is given."""
 
-    entry: Entry = "agents.beacon:main"
+    command: tuple[tuple[str, ...], ...] | None = None
+    """`kind = "zenoh"`: the words of the command that starts a program that speaks Zenoh, or a list of such lists.
+    `{id}`, `{endpoint}` and `{port}` are filled in; `python` is vnet's own. If left out, others start them."""
+    entry: Entry = _ENTRY
     """An async function of one argument, the `Node`: `package.module:function` or `file.py:function`; a file's is
     `main` if left out."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Given to the program as `node.options`; what is allowed is its own business."""
+
+    @field_validator("command", mode="before")
+    @classmethod
+    def _is_one_or_several(cls, given: Any) -> Any:
+        several = isinstance(given, list | tuple) and all(isinstance(words, list | tuple) for words in given)
+        commands = given if given is None or several else [given]
+        for words in commands or ():
+            if not isinstance(words, list | tuple) or not words or not all(isinstance(word, str) for word in words):
+                raise ValueError('write its words, as ["python", "talker.py", "{id}"], or a list of such lists')
+        return commands
+
+    @property
+    def commands(self) -> tuple[tuple[str, ...], ...]:
+        """The commands that vnet starts in each of the vehicles."""
+        return self.command or ()
+
+
+class ZenohSessions(Section):
+    """`[program.zenoh]`: the endpoints to which programs of `kind = "zenoh"` connect, one for each vehicle."""
+
+    listen: str = Field("tcp/127.0.0.1:0", pattern=r"^(tcp|tls|quic)/\S+:\d{1,5}$")
+    """Real time: the endpoint of the first vehicle; with a port, the next vehicles have the next ports. Port 0
+    stands for any: the run's `endpoints.json` has them."""
+    query_s: float = Field(1.0, gt=0, le=3600)
+    """Time for which replies to a query are awaited: over the radio nobody can say who will answer."""
+    liveliness_s: float = Field(1.0, gt=0, le=3600)
+    """Time between two frames that tell of a vehicle's liveliness tokens, if it has any. Who has not heard them for
+    three such times takes them for gone."""
+    sessions: int | None = Field(None, ge=1, le=MANY_SESSIONS)
+    """Real time: most sessions that a vehicle's programs have at a time; more are a way around the radio. As many
+    as commands if left out; no limit where others start the programs."""
+    users: Path | None = None
+    """Real time: a file of lines `user:password`, one of which programs then need. Commands have the first."""
+    certificate: Path | None = None
+    """Real time: the certificate of endpoints at `tls/…`, as a PEM file."""
+    private_key: Path | None = None
+    """Its key."""
+    authority: Path | None = None
+    """The certificate of the authority that has issued it, for the commands."""
+
+    @model_validator(mode="after")
+    def _tls_has_a_certificate(self) -> ZenohSessions:
+        secure = not self.listen.startswith("tcp/")
+        for name in ("certificate", "private_key", "authority"):
+            if secure != (getattr(self, name) is not None):
+                raise ValueError(f"listen = {shown(self.listen)}: {name} goes with tls/ and quic/, which need it")
+        return self
 
 
 class ProgramException(OneProgram):
@@ -71,6 +127,11 @@ class ProgramException(OneProgram):
 class Program(OneProgram):
     """`[program]`: the program of every vehicle, except the `exceptions`."""
 
+    kind: Literal["vnet", "zenoh"] = "vnet"
+    """`vnet`: an async function of a `Node`. `zenoh`: unmodified programs that speak Zenoh
+    (docs/how-to/zenoh.md)."""
+    zenoh: ZenohSessions | None = None
+    """Endpoints of programs of `kind = "zenoh"`."""
     checks: tuple[Entry, ...] = ()
     """Checks of your own: `package.module:function` or `file.py:function`; a file's is `check` if left out."""
     folders: tuple[Path, ...] = ()
@@ -79,12 +140,38 @@ class Program(OneProgram):
     exceptions: tuple[ProgramException, ...] = ()
     """Vehicles that run another program."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _entry_is_of_its_kind(cls, data: Any) -> Any:
+        """Give programs of kind "zenoh" the entry that runs their commands."""
+        if not isinstance(data, dict):
+            return data
+        exceptions = data.get("exceptions")
+        exceptions = exceptions if isinstance(exceptions, list | tuple) else ()
+        given = [each for each in (data, *exceptions) if isinstance(each, dict)]
+        if data.get("kind", "vnet") != "zenoh":
+            if data.get("zenoh") is not None or any(each.get("command") is not None for each in given):
+                raise ValueError('command and zenoh go with kind = "zenoh"')
+            return data
+        for each in given:
+            if each.get("entry", ZENOH_ENTRY) not in (ZENOH_ENTRY, _ENTRY) or each.get("options"):
+                raise ValueError('kind = "zenoh" has a command, and neither entry nor options')
+        own = {**data, "entry": ZENOH_ENTRY}
+        if exceptions:
+            own["exceptions"] = [{**each, "entry": ZENOH_ENTRY} for each in given[1:]]
+        return own
+
     @model_validator(mode="after")
     def _one_program_a_node(self) -> Program:
         named = Counter(node for exception in self.exceptions for node in exception.nodes)
         if twice := sorted(node for node, count in named.items() if count > 1):
             raise ValueError(f"node {shown(twice[0])} is in two exceptions")
         return self
+
+    @property
+    def sessions(self) -> ZenohSessions:
+        """Endpoints of programs of `kind = "zenoh"`."""
+        return self.zenoh or ZenohSessions()
 
     def of(self, node: str) -> OneProgram:
         """Return the program of `node`."""

@@ -140,6 +140,9 @@ class Radio(Section):
     """All share one medium, and listen before they talk; without it nobody is in anybody's way."""
     congestion: Congestion | None = None
     """Senders send less where the medium is busy."""
+    keys: tuple[str, ...] | None = None
+    """For programs of `kind = "zenoh"`: key expressions that cross the radio, none of which overlap; `**` and
+    `**/@adv/**` if left out. What is put elsewhere stays in its vehicle, and so does `vnet/**`."""
 
     @property
     def is_physical(self) -> bool:
@@ -211,6 +214,29 @@ class Scenario(Section):
         return self
 
     @model_validator(mode="after")
+    def _zenoh_programs_can_run(self) -> Scenario:
+        if self.program.kind != "zenoh":
+            if self.radio.keys is not None:
+                raise ValueError('radio.keys goes with program.kind = "zenoh"')
+            return self
+        for unit in self.roadside:
+            if unit.entry is not None:
+                raise ValueError(f'roadside.entry = {shown(unit.entry)} goes with program.kind = "vnet"')
+        if self.run.pacing == "lockstep":
+            if not self.program.commands:
+                raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
+            return self
+        if self.run.nodes_per_process != 1:
+            raise ValueError('run.nodes_per_process goes with program.kind = "vnet": Zenoh programs have their own')
+        for number, fault in enumerate(self.fault):
+            if fault.kind in ("skew", "drift"):
+                raise ValueError(
+                    f'fault.{number}.kind = "{fault.kind}" needs run.pacing = "lockstep": in real time nothing '
+                    "changes the clock of a Zenoh program"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _slack_divides_the_period(self) -> Scenario:
         slack_us = self.run.order_slack_us
         if slack_us and self.period_ns % (slack_us * 1_000):
@@ -249,6 +275,20 @@ class Scenario(Section):
         if buildings is not None and buildings.path is None and self.map is None:
             raise ValueError("radio.buildings.path is missing: without [map] there is no other file of buildings")
         return self
+
+    @property
+    def has_gateways(self) -> bool:
+        """True if programs speak Zenoh to gateways, and not as agents to the emulator."""
+        return self.program.kind == "zenoh" and self.run.pacing == "realtime"
+
+    def options_of(self, node: str) -> dict[str, Any]:
+        """Return the options of a node's program: those of the scenario, or what a Zenoh program is run with."""
+        program, sessions = self.program.of(node), self.program.sessions
+        if self.program.kind != "zenoh":
+            return program.options
+        commands = [list(words) for words in program.commands]
+        own = {"command": commands, "query_s": sessions.query_s, "liveliness_s": sessions.liveliness_s}
+        return own | ({} if self.radio.keys is None else {"keys": list(self.radio.keys)})
 
     @property
     def driven(self) -> Driven:

@@ -1,1 +1,1 @@
-"""Zenoh programs as vehicles: what of their traffic crosses the radio, and how."""
+"""Zenoh programs as vehicles: the messages that cross the radio, and their frames."""

@@ -1,4 +1,4 @@
-"""What Zenoh programs say to each other over the radio, and the frames that carry it.
+"""The messages of Zenoh programs on the radio, and the frames that carry them.
 
 A sample, a query, a reply or a liveliness token is encoded with msgpack and cut into as many frames as the radio's
 payload asks for. Both sides of the wall read them: gateways and emulated sessions, and the emulator's records.
@@ -90,10 +90,15 @@ class Fragment(msgspec.Struct, array_like=True, frozen=True):
 
 
 _encode = msgspec.msgpack.Encoder().encode
-decode_message = msgspec.msgpack.Decoder(Message).decode
-"""Decode a whole message. Raises msgspec.MsgspecError for what is none."""
+_decode_message = msgspec.msgpack.Decoder(Message).decode
 decode_fragment = msgspec.msgpack.Decoder(Fragment).decode
 """Decode a frame's payload. Raises msgspec.MsgspecError for what is none."""
+
+
+def decode_message(content: bytes) -> Message:
+    """Decode a whole message. Raises msgspec.MsgspecError for what is none."""
+    message: Message = _decode_message(content)
+    return message
 
 
 class TooLargeError(Exception):

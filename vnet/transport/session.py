@@ -120,6 +120,21 @@ def _closed_at_end(session: zenoh.Session) -> Iterator[zenoh.Session]:
             session.close()  # type: ignore[no-untyped-call]
 
 
+def open_local_router(listen: str, settings: dict[str, Any]) -> zenoh.Session:
+    """Open a router that listens at `listen`, and seeks nobody; `settings` are added to its configuration.
+
+    The caller closes it. Raise TransportError if it cannot listen there.
+    """
+    config = {
+        "mode": "router",
+        "listen": {"endpoints": [listen]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+        "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+        **settings,
+    }
+    return _open(config, f"cannot listen at {listen}")
+
+
 def router_endpoint(session: zenoh.Session) -> str:
     """Return the locator at which an embedded router listens, with the port that the system chose for port 0."""
     for reply in session.get(f"@/{session.zid()}/router"):

@@ -153,6 +153,10 @@ class Fleet:
         """The last lines of a process's log, as far as they have come."""
         return self._log_tails.get(name, "")
 
+    def takes_end(self, name: str, how: Exit) -> bool:
+        """Agents on hosts are their hosts' children."""
+        return False
+
     def look(self, time_ns: int) -> None:
         """Have CPU time and memory of the processes measured."""
         for host in self._hosts.values():

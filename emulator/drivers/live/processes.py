@@ -8,6 +8,7 @@ they return, hands their yields and frames to the loop of the pacing, and does t
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import math
 import time
 from collections import Counter, deque
@@ -22,6 +23,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.join import Membership, split_into_processes
 from emulator.drivers.launch import Exit, Launcher
 from emulator.drivers.live.fleet import Fleet
+from emulator.drivers.live.gateways import Gateways
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ChangeSignal, ProcessState, Supervisor
 from emulator.drivers.processes import Heard, Processes, ProtocolError, Stalled, check_ownership, check_yield
 from emulator.drivers.realtime import RealTime, take_what_comes
@@ -91,15 +93,23 @@ class LiveProcesses(Processes):
             "ended": lambda process_id, how: self.supervisor.child_ends(process_id, how),
             "lost": lambda how, process_ids: self.supervisor.host_lost(process_ids, how),
             "memory": self._take_memory,
+            "local": self._take_decoded,
+            "gateway": lambda what, item: None if self.gateways is None else self.gateways.take(what, item),
         }
         self.time_ns: Callable[[], int] = lambda: 0
         """Emulated time, for events."""
         self.changes = ChangeSignal()
         later = [node for node, up in emulation.up.items() if not up]
         self.members = Membership(node_ids, later, emulation.world.has_traffic)
-        self.attachment = attach(options, node_ids, _lease_ms(emulation), self._realtime, self.hear)
+        has_gateways = emulation.scenario.has_gateways
+        self.attachment = attach(
+            options, node_ids, _lease_ms(emulation), self._realtime, self.hear, not has_gateways
+        )
         self.fleet = self._make_fleet() if options.access.hosts else None
-        self._agents = self.fleet or launcher
+        self.gateways = self._make_gateways() if has_gateways else None
+        if self.gateways is not None:
+            self._options = options = dataclasses.replace(options, launch=True)  # gateways, if not their programs
+        self._agents = self.gateways or self.fleet or launcher
         self.supervisor = Supervisor(
             emulation,
             options,
@@ -148,6 +158,10 @@ class LiveProcesses(Processes):
             self.changes,
         )
 
+    def _make_gateways(self) -> Gateways:
+        launcher, starts = self._launcher, self._options.launch
+        return Gateways(self._emulation, launcher, starts, self.hear, self.take, self._now, self.changes)
+
     def _now(self) -> int:
         return self.time_ns()
 
@@ -175,27 +189,30 @@ class LiveProcesses(Processes):
 
     def _take_message(self, node: str, payload: bytes) -> None:
         try:
-            message = wire.decode_tx(payload)
-            # A hello introduces its nonce; Membership judges it.
-            if type(message) is not wire.Hello and not self.members.speaks_for(node, message.nonce):
-                raise ProtocolError("a message without the nonce of its process")
-            match message:
-                case wire.Yield() if self._expected is wire.Yield:
-                    self._take_yield(node, message)
-                    self._reasons.pop(node, None)
-                case wire.Frames() if self._expected is wire.Frames:
-                    self._take_frames(node, message)
-                case wire.Hello():
-                    self._take_hello(node, message)
-                case wire.Final():
-                    self._take_final(node, message)
-                case wire.StackDump():
-                    self._stacks[node] = message
-                case _:
-                    raise ProtocolError(f"an unexpected {type(message).__name__}")
+            self._take_decoded(node, wire.decode_tx(payload))
         except (WireError, ProtocolError) as error:
             self._refuse(keys.node_tx(self._options.access.run, node), node, str(error))
             self._reasons[node] = str(error)
+
+    def _take_decoded(self, node: str, message: wire.AgentMessage) -> None:
+        """Take a message on the key of a node, or of its gateway. Raises ProtocolError."""
+        # A hello introduces its nonce; Membership judges it.
+        if type(message) is not wire.Hello and not self.members.speaks_for(node, message.nonce):
+            raise ProtocolError("a message without the nonce of its process")
+        match message:
+            case wire.Yield() if self._expected is wire.Yield:
+                self._take_yield(node, message)
+                self._reasons.pop(node, None)
+            case wire.Frames() if self._expected is wire.Frames:
+                self._take_frames(node, message)
+            case wire.Hello():
+                self._take_hello(node, message)
+            case wire.Final():
+                self._take_final(node, message)
+            case wire.StackDump():
+                self._stacks[node] = message
+            case _:
+                raise ProtocolError(f"an unexpected {type(message).__name__}")
 
     def _take_backbone(self, unit: str, payload: bytes) -> None:
         try:
@@ -279,6 +296,8 @@ class LiveProcesses(Processes):
                 raise failure
             if time.monotonic() > deadline:
                 absent, total = self.members.missing or ["the recorder"], len(self._emulation.world.node_ids)
+                if self.gateways is not None and self.members.missing:
+                    raise TransportError(self.gateways.missed(absent, timeout_s))
                 raise TransportError(
                     f"{len(absent)} of {total} nodes have not joined within {timeout_s:g} s: {first_names(absent)}"
                 )
@@ -297,7 +316,10 @@ class LiveProcesses(Processes):
         if hosts:
             self._start_hosts(endpoint)
             on_state(f"listening at {endpoint}; waiting for {counted(len(hosts), 'host')}: {first_names(hosts)}")
-        if self._options.launch:
+        if self.gateways is not None:
+            on_state(f"opening {counted(len(groups), 'endpoint')} for Zenoh programs")
+            self.supervisor.launch(groups)
+        elif self._options.launch:
             await self._agents_prepared(deadline)
             where = f" on {counted(len(hosts), 'host')}" if hosts else ""
             on_state(f"listening at {endpoint}; starting {len(groups)} agent processes{where}")
@@ -355,7 +377,7 @@ class LiveProcesses(Processes):
 
     def say(self, node: str, message: wire.EmulatorMessage) -> None:
         """Say something to a node, having put the messages of units in it on their keys."""
-        way = self.fleet or self.attachment
+        way = self.gateways or self.fleet or self.attachment
         if isinstance(message, wire.Grant | wire.Batch) and message.messages:
             message, contents = backbone_keys.split_grant(message)
             for unit, content in contents:

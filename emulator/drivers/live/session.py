@@ -93,7 +93,7 @@ async def run_live(
 
 def _zygote(scenario: Scenario) -> Zygote | None:
     """The process from which agents are forked, if they are to be, and this system can."""
-    if scenario.run.start == "spawn" or sys.platform != "linux":
+    if scenario.run.start == "spawn" or sys.platform != "linux" or scenario.has_gateways:
         return None
     return Zygote([entry.partition(":")[0] for entry in entries_of(scenario)], _agent_environment(scenario))
 
@@ -232,6 +232,8 @@ class LiveSession:
         processes.attachment.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if completed else PATIENCE_S)
+        if processes.gateways is not None:
+            await processes.gateways.close()
         ends = self._launcher.stop(patience_s)
         for node, details in processes.last_deaths(ends).items() if completed else ():
             self._emulation.folder.event(self._emulation.duration_ns, EventKind.died, node, **details)

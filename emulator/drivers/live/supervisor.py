@@ -272,7 +272,8 @@ class Supervisor:
 
     def _children_ended(self) -> None:
         for name, how in self._launcher.ended().items():
-            self.child_ends(name, how)
+            if not self._agents.takes_end(name, how):
+                self.child_ends(name, how)
 
     def child_ends(self, name: str, how: Exit) -> None:
         """Take note that a process has just ended: its last messages may still arrive."""

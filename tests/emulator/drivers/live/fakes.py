@@ -89,6 +89,9 @@ class FakeLauncher:
         self.pids.pop(name, None)
         return lambda patience_s: self.done.append(("wait for", name))
 
+    def takes_end(self, name: str, how: Exit) -> bool:
+        return False
+
     def request_stack(self, name: str) -> None:
         self.done.append(("stack", name))
 

@@ -1,0 +1,384 @@
+"""The gateway of one vehicle whose programs speak Zenoh: the router of their sessions, between them and the radio.
+
+What its programs put, ask, reply and declare is sent by its radio; what the radio delivers is put at them.
+The gateway is in the emulator's process, in real time (docs/how-to/zenoh.md).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import secrets
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zenoh
+
+from emulator.drivers.agent_keys import Hear
+from emulator.scenario.program import ZenohSessions
+from vnet.errors import TransportError
+from vnet.gateway.frames import (
+    CrossingQuery,
+    CrossingReply,
+    CrossingSample,
+    CrossingTokens,
+    Message,
+    Reassembly,
+)
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY
+from vnet.transport.session import open_local_router, router_endpoint
+from vnet.transport.wire import WireFix
+
+MOST_SOURCES = 100_000
+"""Instances of `SourceInfo` that are kept for samples on their way."""
+TOKEN_PERIODS = 3
+"""Times `liveliness_s` without word of a vehicle's tokens after which they are gone."""
+REMOTE = zenoh.Locality.REMOTE
+
+_sources: OrderedDict[int, zenoh.SourceInfo] = OrderedDict()
+_source_numbers = count()
+_encode = msgspec.msgpack.Encoder().encode
+
+
+class Gateway:
+    """One incarnation of a vehicle's gateway. Methods are for the run's loop, except `open` and `close`.
+
+    `keys` cross the radio. `hear` takes on any thread "gateway", what programs do ("message", which is to be sent,
+    "query", "token", "report", "session"), and the gateway with what belongs to it.
+    """
+
+    def __init__(self, node: str, keys: Sequence[str], settings: ZenohSessions, hear: Hear) -> None:
+        self.node = node
+        self._keys, self._settings, self._hear = keys, settings, hear
+        self._session: zenoh.Session | None = None
+        self._watches: list[Any] = []
+        self._queries: dict[int, zenoh.Query] = {}
+        self._query_numbers = count()
+        self._reassembly = Reassembly()
+        self._declared: dict[str, zenoh.LivelinessToken] = {}
+        """Tokens of other vehicles, which are declared at this one's programs."""
+        self._heard_tokens: dict[str, tuple[int, frozenset[str]]] = {}
+        """Emulated time (ns) of the last word of each sender's tokens, and its tokens."""
+        self.tokens: set[str] = set()
+        """Tokens of this vehicle's own programs that cross the radio."""
+        self.sessions: set[str] = set()
+        """Ids of the sessions that are connected."""
+
+    # Threads of the caller's own: both take a while.
+
+    def open(self, listen: str) -> str:
+        """Open the vehicle's router at an endpoint; returns it with its port. Raises TransportError."""
+        session = open_local_router(listen, self._router_settings())
+        self._session = session
+        endpoint = router_endpoint(session)
+        for key in self._keys:
+            session.declare_subscriber(key, self._put, allowed_origin=REMOTE)
+            session.declare_queryable(key, self._asked, allowed_origin=REMOTE)
+            watch = session.liveliness().declare_subscriber(key, self._token, history=True)
+            self._watches.append(watch)
+        session.declare_subscriber(REPORT_KEY, self._reported, allowed_origin=REMOTE)
+        info = session.info
+        self._watches.append(info.declare_transport_events_listener(self._connected, history=True))
+        return endpoint
+
+    def _router_settings(self) -> dict[str, Any]:
+        link: dict[str, Any] = {}
+        settings = self._settings
+        if settings.certificate is not None:
+            link["tls"] = {
+                "listen_certificate": str(settings.certificate),
+                "listen_private_key": str(settings.private_key),
+            }
+        auth = {} if settings.users is None else {"auth": {"usrpwd": {"dictionary_file": str(settings.users)}}}
+        return {"transport": {**({"link": link} if link else {}), **auth}}
+
+    def close(self) -> None:
+        """Close the router, with all that is connected to it."""
+        session, self._session = self._session, None
+        if session is not None:
+            with suppress(zenoh.ZError):
+                session.close()  # type: ignore[no-untyped-call]
+
+    # Threads of Zenoh's.
+
+    def _tell(self, what: str, item: Any) -> None:
+        self._hear("gateway", what, (self, item))
+
+    def _put(self, sample: zenoh.Sample) -> None:
+        if not str(sample.key_expr).startswith(OWN_KEYS):
+            self._tell("message", crossing_of(sample))
+
+    def _asked(self, query: zenoh.Query) -> None:
+        if str(query.key_expr).startswith(OWN_KEYS):
+            query.drop()  # type: ignore[no-untyped-call]
+        else:
+            self._tell("query", query)
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        self._tell("token", (str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+
+    def _reported(self, sample: zenoh.Sample) -> None:
+        self._tell("report", sample.payload.to_bytes())
+
+    def _connected(self, event: zenoh.TransportEvent) -> None:
+        who = f"{event.transport.zid} ({_name_of(event.transport.whatami)})"
+        self._tell("session", (who, event.kind == zenoh.SampleKind.PUT))
+
+    # The run's loop: from the programs.
+
+    def take_session(self, who: str, is_there: bool) -> None:
+        """Take note that a session has connected or is gone."""
+        (self.sessions.add if is_there else self.sessions.discard)(who)
+
+    def take_token(self, key: str, is_there: bool) -> bool:
+        """Take a token that has appeared or is gone; returns whether it is of this vehicle, and changes its own."""
+        if key in self._declared or key.startswith(OWN_KEYS) or (key in self.tokens) == is_there:
+            return False
+        (self.tokens.add if is_there else self.tokens.discard)(key)
+        return True
+
+    def question(self, query: zenoh.Query) -> tuple[int, CrossingQuery]:
+        """Keep a query until `conclude`; returns its number, and what crosses the radio."""
+        number = next(self._query_numbers)
+        self._queries[number] = query
+        encoding = None if query.encoding is None else str(query.encoding)
+        crossing = CrossingQuery(
+            number, str(query.selector), _bytes(query.payload), encoding, _bytes(query.attachment)
+        )
+        return number, crossing
+
+    def conclude(self, number: int) -> None:
+        """End a query: further replies are not awaited."""
+        self._queries.pop(number).drop()  # type: ignore[no-untyped-call]
+
+    # The run's loop: to the programs.
+
+    def receive(self, sender: str, payload: bytes, time_ns: int) -> None:
+        """Give the programs what a frame carries. Raises ValueError for bytes that a fault has changed."""
+        if self._session is None:
+            return
+        try:
+            message = self._reassembly.take(sender, payload)
+            if message is not None:
+                self._give(sender, message, time_ns)
+        except (msgspec.MsgspecError, zenoh.ZError, LookupError, OverflowError) as error:
+            raise ValueError(str(error)) from None
+
+    def _give(self, sender: str, message: Message, time_ns: int) -> None:
+        match message:
+            case CrossingSample():
+                self._show(message)
+            case CrossingQuery():
+                self._pass_on(sender, message)
+            case CrossingReply():
+                self._reply(message)
+            case CrossingTokens():
+                self._heard_tokens[sender] = time_ns, frozenset(message.keys)
+                self.renew_tokens(time_ns)
+
+    def show_fix(self, fix: WireFix) -> None:
+        """Put a fix of the vehicle's receiver at its programs."""
+        if self._session is not None:
+            self._session.put(FIX_KEY, _encode(fix_fields(fix)), allowed_destination=REMOTE)
+
+    def _show(self, sample: CrossingSample) -> None:
+        assert self._session is not None
+        options: dict[str, Any] = {**_options(sample), "allowed_destination": REMOTE}
+        if sample.is_delete:
+            self._session.delete(sample.key, **options)
+        else:
+            self._session.put(sample.key, sample.payload, encoding=sample.encoding, **options)
+
+    def _pass_on(self, asker: str, query: CrossingQuery) -> None:
+        """Ask the programs of this vehicle; their replies are messages to the asker."""
+        assert self._session is not None
+
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answer = CrossingReply(asker, query.number, crossing_of(reply.ok))
+            else:
+                assert reply.err is not None
+                error = reply.err.payload.to_bytes(), str(reply.err.encoding)
+                answer = CrossingReply(asker, query.number, None, error)
+            self._tell("message", answer)
+
+        self._session.get(
+            query.selector,
+            answered,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=self._settings.query_s,
+            payload=query.payload,
+            encoding=query.encoding,
+            attachment=query.attachment,
+            allowed_destination=REMOTE,
+        )
+
+    def _reply(self, answer: CrossingReply) -> None:
+        """Give a reply to the program that has asked, if it still waits."""
+        query = self._queries.get(answer.number) if answer.to == self.node else None
+        if query is None:
+            return
+        if answer.sample is None:
+            assert answer.error is not None
+            query.reply_err(answer.error[0], encoding=answer.error[1])
+            return
+        sample, options = answer.sample, _options(answer.sample)
+        if "source_info" in options:  # which Python cannot give a reply, and advanced subscribers need
+            self._show(sample)
+            return
+        kept = {name: options[name] for name in ("attachment", "express", "timestamp") if name in options}
+        if sample.is_delete:
+            query.reply_del(sample.key, **kept)
+        else:
+            query.reply(sample.key, sample.payload, encoding=sample.encoding, **kept)
+
+    def renew_tokens(self, time_ns: int) -> None:
+        """Declare the tokens of which other vehicles have told lately, and no others."""
+        if self._session is None:
+            return
+        oldest_ns = time_ns - math.ceil(TOKEN_PERIODS * self._settings.liveliness_s * 1e9)
+        self._heard_tokens = {
+            sender: told for sender, told in self._heard_tokens.items() if told[1] and told[0] > oldest_ns
+        }
+        there = {key for _, keys in self._heard_tokens.values() for key in keys} - self.tokens
+        for key in self._declared.keys() - there:
+            self._declared.pop(key).undeclare()  # type: ignore[no-untyped-call]
+        for key in sorted(there - self._declared.keys()):
+            # Before the declaration, whose echo comes at once and must not count as a token of this vehicle's own.
+            self._declared[key] = _PENDING
+            self._declared[key] = self._session.liveliness().declare_token(key)
+
+
+class _Pending:
+    def undeclare(self) -> None:
+        """Stand for a token whose declaration was refused."""
+
+
+_PENDING: Any = _Pending()
+
+
+def session_environment(
+    node: str, endpoint: str, settings: ZenohSessions, folder: Path, inherited: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the environment in which an unmodified program connects to its vehicle's router alone.
+
+    `ZENOH_CONFIG`, a file in `folder`, is read by `Config.from_env`, and `ZENOH_CONFIG_OVERRIDE` by rmw_zenoh
+    and its clients.
+    """
+    client: dict[str, Any] = {
+        "mode": "client",
+        "connect": {"endpoints": [endpoint]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+    }
+    transport: dict[str, Any] = {}
+    if settings.authority is not None:
+        transport["link"] = {"tls": {"root_ca_certificate": str(settings.authority)}}
+    if settings.users is not None:
+        user, _, password = settings.users.read_text().partition("\n")[0].partition(":")
+        transport["auth"] = {"usrpwd": {"user": user, "password": password}}
+    if transport:
+        client["transport"] = transport
+    config = folder / f"{node}.json5"
+    config.write_text(json.dumps(client))
+    config.chmod(0o600)
+    override = ";".join(f"{key}={json.dumps(value)}" for key, value in _leaves(client))
+    own = {"ZENOH_CONFIG": str(config), "ZENOH_CONFIG_OVERRIDE": override, "VNET_ENDPOINT": endpoint}
+    return {**inherited, **own, "VNET_NODE": node}
+
+
+def _leaves(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
+    """Return the values of a nested table, with keys as Zenoh writes them, `connect/endpoints`."""
+    leaves: list[tuple[str, Any]] = []
+    for key, value in table.items():
+        name = f"{path}/{key}" if path else key
+        leaves += _leaves(value, name) if isinstance(value, dict) else [(name, value)]
+    return leaves
+
+
+def fix_fields(fix: WireFix) -> dict[str, Any]:
+    """Return what programs are told of a fix, under `vnet/fix`."""
+    a, b, c, d = fix.covariance_m2
+    return {
+        "time_ns": fix.time_ns,
+        "position_m": fix.position_m,
+        "covariance_m2": ((a, b), (c, d)),
+        "heading_rad": fix.heading_rad,
+        "speed_m_s": fix.speed_m_s,
+    }
+
+
+def check_keys(keys: Sequence[str]) -> None:
+    """Raise TransportError for what is no key expression, and for two of which a sample could be sent twice."""
+    for number, key in enumerate(keys):
+        try:
+            expression = zenoh.KeyExpr(key)
+        except zenoh.ZError:
+            raise TransportError(f"radio.keys: {key!r} is no key expression of Zenoh") from None
+        for other in keys[:number]:
+            if expression.intersects(other):
+                raise TransportError(f"radio.keys: {other!r} and {key!r} overlap")
+
+
+def crossing_of(sample: zenoh.Sample) -> CrossingSample:
+    """Return what of a sample crosses the radio."""
+    stamp = sample.timestamp
+    time = None
+    if stamp is not None:
+        ntp = stamp.get_time_as_ntp64()
+        time = ntp.as_secs(), ntp.subsec_nanos(), bytes(stamp.get_id())
+    return CrossingSample(
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        str(sample.encoding),
+        sample.kind == zenoh.SampleKind.DELETE,
+        _bytes(sample.attachment),
+        _name_of(sample.priority),
+        _name_of(sample.congestion_control),
+        sample.express,
+        time,
+        None if sample.source_info is None else (_this_process(), _number_of(sample.source_info)),
+    )
+
+
+def _options(sample: CrossingSample) -> dict[str, Any]:
+    """Return the arguments with which a sample is put, deleted or replied."""
+    options: dict[str, Any] = {
+        "attachment": sample.attachment,
+        "priority": getattr(zenoh.Priority, sample.priority),
+        "congestion_control": getattr(zenoh.CongestionControl, sample.congestion),
+        "express": sample.express,
+    }
+    if sample.time is not None:
+        options["timestamp"] = zenoh.Timestamp(zenoh.NTP64(*sample.time[:2]), sample.time[2])
+    if sample.source is not None and sample.source[0] == _this_process() and sample.source[1] in _sources:
+        options["source_info"] = _sources[sample.source[1]]
+    return options
+
+
+def _bytes(content: zenoh.ZBytes | None) -> bytes | None:
+    return None if content is None else content.to_bytes()
+
+
+def _name_of(member: Any) -> Any:
+    return str(member).rpartition(".")[2]
+
+
+@cache
+def _this_process() -> int:
+    """Return a number that no process on any host shares."""
+    return secrets.randbits(62)
+
+
+def _number_of(source: zenoh.SourceInfo) -> int:
+    number = next(_source_numbers)
+    _sources[number] = source
+    if len(_sources) > MOST_SOURCES:
+        _sources.popitem(last=False)
+    return number

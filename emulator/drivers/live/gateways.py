@@ -1,0 +1,451 @@
+"""Vehicles whose programs speak Zenoh: their gateways, in the place of agents, and the commands that vnet starts.
+
+`Gateways` says to the run what an agent would say (it joins, sends frames, acknowledges batches) and does to the
+vehicles' commands what faults do. All gateways are in this process, so that a sample makes no further hop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.launch import Exit, Launcher
+from emulator.drivers.live.gateway import Gateway, check_keys, session_environment
+from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
+from emulator.records.events import EventKind
+from vnet.errors import ProgramError, VnetError, first_names, shown
+from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
+from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY
+from vnet.reports import Report, Reporter
+from vnet.runtime.die_with_parent import STARTED_BY_VNET
+from vnet.transport import wire
+from vnet.transport.access import Access
+from vnet.transport.session import RUNTIME_VARIABLE
+from vnet.units import NS_PER_S
+
+ENDPOINTS = "endpoints.json"
+"""File of a run's folder with the endpoint of each vehicle."""
+PYTHON = ("python", "python3")
+"""First words of a command that stand for the interpreter of vnet."""
+HIGHEST_PORT = 65_535
+
+
+@dataclass
+class _Vehicle:
+    """A vehicle whose gateway is open, or is being opened."""
+
+    gateway: Gateway
+    reporter: Reporter
+    nice: int
+    names: list[str] = field(default_factory=list)
+    """Names of the processes of its commands that have not ended, as the launcher has them."""
+    fragments: Fragments | None = None
+    acknowledges: bool = False
+    is_ready: bool = False
+    on_air: bool = False
+    """True from time 0, or from its return, on: what programs put before stays in the vehicle."""
+    outbox: list[wire.Frame] = field(default_factory=list)
+    reports: list[Report] = field(default_factory=list)
+    notes: list[wire.Note] = field(default_factory=list)
+    endings: list[wire.Ending] = field(default_factory=list)
+    seq: int = 0
+    received_seq: int = 0
+    unicasts: int = 0
+    lateness: list[int] = field(default_factory=lambda: [0] * wire.LATENESS_BINS)
+    late: list[tuple[int, int]] = field(default_factory=list)
+    is_due: bool = False
+
+
+class Gateways:
+    """In the place of a launcher of agents and of their keys; see the module's text.
+
+    `hear` takes on any thread what is for the run's loop, `tell` takes on the loop what an agent would have said.
+    With `starts` the commands of the scenario are started; else others start programs.
+    """
+
+    def __init__(
+        self,
+        emulation: Emulation,
+        launcher: Launcher,
+        starts: bool,
+        hear: Callable[[str, str, Any], None],
+        tell: Callable[[str, str, Any], None],
+        time_ns: Callable[[], int],
+        changes: ChangeSignal,
+    ) -> None:
+        scenario = emulation.scenario
+        self._emulation, self._launcher, self._starts = emulation, launcher, starts
+        self._program, self._settings = scenario.program, scenario.program.sessions
+        self._keys = scenario.radio.keys or RADIO_KEYS
+        check_keys(self._keys)
+        self._hear, self._tell, self._time_ns, self._changes = hear, tell, time_ns, changes
+        self._loop = asyncio.get_running_loop()
+        self._folder = tempfile.TemporaryDirectory(prefix="vnet-")
+        self._vehicles: dict[str, _Vehicle] = {}
+        self._closing: dict[str, asyncio.Task[None]] = {}
+        """Gateways that are being closed, whose endpoints the next of their vehicles needs."""
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._vehicle_of: dict[str, str] = {}
+        """Vehicle of each process of a command."""
+        self.endpoints: dict[str, str] = {}
+        """The endpoint of each vehicle, which it keeps."""
+
+    # In the place of a launcher.
+
+    @property
+    def pids(self) -> Mapping[str, int]:
+        """Numbers that tell incarnations of a vehicle apart, of those that should be there."""
+        return {node: id(vehicle) for node, vehicle in self._vehicles.items()}
+
+    def is_prepared(self) -> bool:
+        """Gateways need no preparation."""
+        return True
+
+    @property
+    def missing(self) -> Sequence[str]:
+        """Nothing is awaited."""
+        return ()
+
+    def start_agents(self, endpoint: str, access: Access, groups: Sequence[Sequence[str]], nice: int = 0) -> None:
+        """Open the gateways of these vehicles, and start their commands."""
+        for (node,) in groups:
+            vehicle = self._vehicles[node] = _Vehicle(
+                Gateway(node, self._keys, self._settings, self._hear), Reporter(node), nice
+            )
+            self._spawn(self._open(node, vehicle))
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _open(self, node: str, vehicle: _Vehicle) -> None:
+        if node in self._closing:
+            await self._closing[node]
+        try:
+            self.endpoints[node] = await asyncio.to_thread(vehicle.gateway.open, self._listen(node))
+        except VnetError as error:
+            self._say_hello(node, failure=str(error))
+            return
+        if self._vehicles.get(node) is not vehicle:  # a fault was faster
+            await asyncio.to_thread(vehicle.gateway.close)
+            return
+        self._write_endpoints()
+        self._say_hello(node)
+
+    def _listen(self, node: str) -> str:
+        """Return the endpoint of a vehicle: that which it has had, or its place in the range of ports."""
+        if node in self.endpoints:
+            return self.endpoints[node]
+        address, _, port = self._settings.listen.rpartition(":")
+        number = int(port) and int(port) + self._emulation.number[node]
+        if number > HIGHEST_PORT:
+            raise ProgramError(f"program.zenoh.listen = {shown(self._settings.listen)}: no port is left for {node}")
+        return f"{address}:{number}"
+
+    def _write_endpoints(self) -> None:
+        path = self._emulation.folder.path
+        if path is not None and len(self.endpoints) == len(self._emulation.world.node_ids):
+            (path / ENDPOINTS).write_text(json.dumps(self.endpoints, indent=1) + "\n")
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to the commands of a vehicle."""
+        for process in self._names_of(name):
+            self._launcher.signal_group(process, number)
+
+    def kill(self, name: str) -> None:
+        """End a vehicle's commands and its gateway at once."""
+        for process in self._forget_commands(name):
+            self._launcher.kill(process)
+        self._close(name)
+
+    def detach(self, name: str) -> Callable[[float], None]:
+        """Have a vehicle's commands end; returns what waits so many seconds for it, and kills them then."""
+        processes = self._forget_commands(name)
+        for process in processes:
+            self._launcher.signal_group(process, signal.SIGTERM)
+        waits = [self._launcher.detach(process) for process in processes]
+        self._close(name)
+
+        def wait_or_kill(patience_s: float) -> None:
+            for wait in waits:
+                wait(patience_s)
+
+        return wait_or_kill
+
+    def request_stack(self, name: str) -> None:
+        """Have the commands' stacks written to their log: those that are Python may be asked, others would end."""
+
+    def log_tail(self, name: str) -> str:
+        """Return the last lines of a vehicle's log."""
+        return self._launcher.log_tail(name)
+
+    def takes_end(self, name: str, how: Exit) -> bool:
+        """Take the end of a command; it is the end of its vehicle if its status says that it has failed."""
+        node = self._vehicle_of.pop(name, None)
+        vehicle = None if node is None else self._vehicles.get(node)
+        if node is None or vehicle is None or name not in vehicle.names:
+            return node is not None
+        vehicle.names.remove(name)
+        if how.status != 0:
+            self._spawn(self._end(node))
+            self._tell("ended", node, how)
+        elif not vehicle.names:
+            vehicle.endings.append(wire.Ending(node, "finished"))
+            self._flush_soon(vehicle)
+        return True
+
+    async def _end(self, node: str) -> None:
+        await asyncio.to_thread(self.detach(node), SHUT_DOWN_S)
+
+    def _names_of(self, node: str) -> list[str]:
+        vehicle = self._vehicles.get(node)
+        return [] if vehicle is None else list(vehicle.names)
+
+    def _forget_commands(self, node: str) -> list[str]:
+        names = self._names_of(node)
+        for name in names:
+            self._vehicle_of.pop(name, None)
+        return names
+
+    def _close(self, node: str) -> None:
+        vehicle = self._vehicles.pop(node, None)
+        if vehicle is not None:
+            vehicle.on_air = False
+            self._closing[node] = asyncio.ensure_future(asyncio.to_thread(vehicle.gateway.close))
+
+    async def close(self) -> None:
+        """Close all gateways, and wait for what was told to end."""
+        waits = [asyncio.to_thread(self.detach(node), SHUT_DOWN_S) for node in list(self._vehicles)]
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*waits, *self._closing.values(), *self._tasks, return_exceptions=True)
+        self._folder.cleanup()
+
+    # In the place of an agent: what it is told.
+
+    def send(self, node: str, message: wire.EmulatorMessage) -> None:
+        """Say something to a vehicle."""
+        vehicle = self._vehicles.get(node)
+        if vehicle is None:
+            return
+        match message:
+            case wire.Welcome():
+                vehicle.fragments = Fragments(message.max_payload)
+                vehicle.acknowledges = message.acknowledges
+                self._start_commands(node, vehicle)
+                self._look_at_sessions(vehicle)
+            case wire.Batch():
+                self._take_batch(vehicle, message)
+            case wire.StackRequest():
+                self._tell("local", node, wire.StackDump(self._nonce(node), "", max(self._time_ns(), 0)))
+            case wire.End(refused=False):
+                self._flush(vehicle, final=True)
+                self._spawn(self._end(node))
+
+    def send_content(self, unit: str, payload: bytes) -> None:
+        """Zenoh programs of roadside units have no way to the backbone."""
+
+    def _start_commands(self, node: str, vehicle: _Vehicle) -> None:
+        commands = self._program.of(node).commands if self._starts else ()
+        folder, endpoint = Path(self._folder.name), self.endpoints[node]
+        inherited = {name: value for name, value in os.environ.items() if name != RUNTIME_VARIABLE}
+        environment = session_environment(node, endpoint, self._settings, folder, inherited)
+        environment |= {STARTED_BY_VNET: "1", "PYTHONUNBUFFERED": "1"}
+        filled = {"{id}": node, "{endpoint}": endpoint, "{port}": endpoint.rpartition(":")[2]}
+        try:
+            for number, words in enumerate(commands, start=1):
+                name = node if number == 1 else f"{node}~{number}"
+                self._launcher.start_command(name, self._located(words, filled), environment, vehicle.nice)
+                vehicle.names.append(name)
+                self._vehicle_of[name] = node
+        except VnetError as error:
+            self._say_hello(node, failure=str(error))
+
+    def _located(self, words: Sequence[str], filled: Mapping[str, str]) -> list[str]:
+        """Return the words of a command with all filled in, and its files where they are."""
+        located = []
+        for index, word in enumerate(words):
+            for name, value in filled.items():
+                word = word.replace(name, value)
+            if index < 2:
+                places = [folder / word for folder in self._program.folders]
+                word = next((str(place) for place in places if place.is_file()), word)
+            located.append(word)
+        found = sys.executable if located[0] in PYTHON else shutil.which(located[0])
+        if found is None:
+            raise ProgramError(f"program.command: {shown(located[0])} is no command")
+        return [found, *located[1:]]
+
+    def _take_batch(self, vehicle: _Vehicle, batch: wire.Batch) -> None:
+        now_ns = max(self._time_ns(), 0)
+        vehicle.received_seq = batch.seq + 1
+        if batch.origin_ns is not None and not vehicle.on_air:
+            delay_s = max(batch.origin_ns + batch.start_ns - time.monotonic_ns(), 0) / NS_PER_S
+            self._loop.call_later(delay_s, self._go_on_air, vehicle)
+        late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
+        for each_ns in late_ns:
+            vehicle.lateness[wire.lateness_bin(each_ns)] += 1
+        if max(late_ns, default=0) >= wire.LATENESS_LIMIT_NS:
+            vehicle.late.append((batch.seq, now_ns))
+        for fix in batch.fixes:
+            vehicle.gateway.show_fix(fix)
+        for packet in batch.packets:
+            try:
+                vehicle.gateway.receive(packet.sender, packet.payload, now_ns)
+            except ValueError as error:  # bytes that a fault has changed
+                self._note(vehicle, "debug", f"a frame of {packet.sender} is no sample: {error}")
+
+    def _go_on_air(self, vehicle: _Vehicle) -> None:
+        """Begin to send what the programs put, and their tokens, and to acknowledge once a second."""
+        vehicle.on_air = True
+        self._acknowledge(vehicle)
+        self._renew_tokens(vehicle)
+
+    def _acknowledge(self, vehicle: _Vehicle) -> None:
+        if self._is_there(vehicle):
+            self._flush(vehicle)
+            self._loop.call_later(1.0, self._acknowledge, vehicle)
+
+    def _renew_tokens(self, vehicle: _Vehicle) -> None:
+        if self._is_there(vehicle):
+            vehicle.gateway.renew_tokens(max(self._time_ns(), 0))
+            if vehicle.gateway.tokens:
+                self._tell_tokens(vehicle)
+            self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)
+
+    def _is_there(self, vehicle: _Vehicle) -> bool:
+        return self._vehicles.get(vehicle.gateway.node) is vehicle and vehicle.on_air
+
+    # In the place of an agent: what it says.
+
+    def _say_hello(self, node: str, ready: bool = False, failure: str | None = None) -> None:
+        pid, host = os.getpid(), socket.gethostname()
+        self._tell(
+            "local", node, wire.Hello(node, node, self._nonce(node), pid, host, ready, failure, wire.VERSION)
+        )
+
+    def _nonce(self, node: str) -> bytes:
+        return str(self.pids.get(node, "")).encode()
+
+    def take(self, what: str, item: tuple[Gateway, Any]) -> None:
+        """Take what a gateway has told, on the loop."""
+        gateway, told = item
+        vehicle = self._vehicles.get(gateway.node)
+        if vehicle is None or vehicle.gateway is not gateway:  # it is gone
+            return
+        match what:
+            case "session":
+                gateway.take_session(*told)
+                self._look_at_sessions(vehicle)
+            case "token":
+                if gateway.take_token(*told) and vehicle.on_air:
+                    self._tell_tokens(vehicle)
+            case _ if not vehicle.on_air:
+                if what == "query":
+                    told.drop()
+            case "message":
+                self._transmit(vehicle, told)
+            case "query":
+                number, question = gateway.question(told)
+                self._loop.call_later(self._settings.query_s, gateway.conclude, number)
+                self._transmit(vehicle, question)
+            case "report":
+                self._take_report(vehicle, told)
+
+    def _tell_tokens(self, vehicle: _Vehicle) -> None:
+        self._transmit(vehicle, CrossingTokens(tuple(sorted(vehicle.gateway.tokens))))
+
+    def _transmit(self, vehicle: _Vehicle, message: Message) -> None:
+        """Send a message by the vehicle's radio: a reply to one vehicle, if the MAC repeats what is lost."""
+        assert vehicle.fragments is not None
+        node, to = vehicle.gateway.node, None
+        if isinstance(message, CrossingReply) and vehicle.acknowledges:
+            to = message.to
+        try:
+            for payload in vehicle.fragments.of(message):
+                vehicle.outbox.append(wire.Frame(node, payload, to=to, number=vehicle.unicasts))
+                vehicle.unicasts += to is not None
+        except TooLargeError as error:
+            self._note(vehicle, "error", str(error))
+        self._flush_soon(vehicle)
+
+    def _take_report(self, vehicle: _Vehicle, content: bytes) -> None:
+        try:
+            values = msgspec.msgpack.decode(content, type=dict[str, Any])
+            estimate, covariance = values.pop("estimate_m", None), values.pop("covariance_m2", None)
+            report = vehicle.reporter.report(max(self._time_ns(), 0), estimate, covariance, values)
+        except (msgspec.MsgspecError, TypeError, ValueError) as error:
+            self._note(vehicle, "warning", f"{REPORT_KEY}: {error}")
+        else:
+            vehicle.reports.append(report)
+            self._flush_soon(vehicle)
+
+    def _note(self, vehicle: _Vehicle, level: str, text: str) -> None:
+        time_ns = max(self._time_ns(), 0)
+        vehicle.notes.append(wire.Note(vehicle.gateway.node, time_ns, "log", level, text))  # type: ignore[arg-type]
+        self._flush_soon(vehicle)
+
+    def _flush_soon(self, vehicle: _Vehicle) -> None:
+        if not vehicle.is_due:
+            vehicle.is_due = True
+            self._loop.call_soon(self._flush, vehicle)
+
+    def _flush(self, vehicle: _Vehicle, final: bool = False) -> None:
+        """Say what the vehicle sends, and acknowledge what it has been told."""
+        vehicle.is_due = False
+        if not self._is_there(vehicle):
+            return
+        traffic = wire.Traffic(vehicle.outbox, vehicle.reports, vehicle.endings, notes=vehicle.notes)
+        vehicle.outbox, vehicle.reports, vehicle.endings, vehicle.notes = [], [], [], []
+        lateness, late = wire.Lateness(list(vehicle.lateness)), vehicle.late
+        nonce = self._nonce(vehicle.gateway.node)
+        frames = wire.Frames(nonce, vehicle.seq, vehicle.received_seq, (), traffic, lateness, final, (), late)
+        vehicle.late = []
+        vehicle.seq += 1
+        self._tell("local", vehicle.gateway.node, frames)
+
+    # Sessions.
+
+    def _look_at_sessions(self, vehicle: _Vehicle) -> None:
+        """Say that a vehicle is ready once its programs have connected; tell of sessions that are too many."""
+        node, connected = vehicle.gateway.node, vehicle.gateway.sessions
+        commands = len(self._program.of(node).commands) if self._starts else 0
+        if not vehicle.is_ready and vehicle.fragments is not None and len(connected) >= max(commands, 1):
+            vehicle.is_ready = True
+            self._say_hello(node, ready=True)
+        most = self._settings.sessions or commands or None
+        if most is not None and len(connected) > most:
+            self._emulation.folder.event(
+                max(self._time_ns(), 0),
+                EventKind.extra_session,
+                node,
+                count=len(connected),
+                limit=most,
+                which=", ".join(sorted(connected)),
+            )
+        self._changes.set()
+
+    def missed(self, nodes: Sequence[str], timeout_s: float) -> str:
+        """Say in one line which programs have not connected in time."""
+        where = [f"{node} at {self.endpoints[node]}" for node in nodes if node in self.endpoints]
+        total = len(self._emulation.world.node_ids)
+        if not where:
+            return f"{len(nodes)} of {total} endpoints do not listen within {timeout_s:g} s: {first_names(nodes)}"
+        return f"programs of {len(where)} of {total} vehicles have not connected within {timeout_s:g} s: " + (
+            first_names(where)
+        )
