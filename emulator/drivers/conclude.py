@@ -34,7 +34,7 @@ from emulator.records.run_folder import (
     RunFolder,
     write_text,
 )
-from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, TABLES, busy_table
+from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, SAMPLES, TABLES, busy_table
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised
 from emulator.scenario.own_functions import declared_checks
@@ -69,6 +69,7 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
             BACKBONE: emulation.backbone.table(),
             BACKGROUND: emulation.driving.background(),
             PAYLOADS: None if emulation.payloads is None else emulation.payloads.to_table(),
+            SAMPLES: None if emulation.samples is None else emulation.samples.to_table(),
         },
     )
 

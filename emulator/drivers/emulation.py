@@ -32,6 +32,7 @@ from emulator.records.driven_table import driven_table
 from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
 from emulator.records.run_folder import RunFolder
+from emulator.records.samples import SampleRecorder
 from emulator.records.tables import PayloadRecorder, background_table
 from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.program import Program, RoadsideUnit
@@ -379,8 +380,8 @@ class Emulation:
             scenario.run.order_grid,
         )
         self.payloads = PayloadRecorder(world.node_ids) if scenario.run.keep_payloads else None
-        if self.payloads is not None:
-            self.engine.on_payload = self.payloads.add
+        self.samples = SampleRecorder(world.node_ids) if scenario.program.kind == "zenoh" else None
+        self.engine.on_payload = [each.add for each in (self.payloads, self.samples) if each is not None]
         self._placed = 0  # the period in which vehicles are where the engine has them
         nodes_at = self._nodes_at if self._topology_changes else None
         self.faults = FaultPlan(scenario, self._nodes_at(0), nodes_at)

@@ -124,7 +124,7 @@ class Engine:
         self._next_seq = [0] * len(node_ids)
         self._number = {node: number for number, node in enumerate(node_ids)}
         self._in_flight = InFlight(len(node_ids))
-        self.on_payload: Callable[[int, int, int, bytes], None] | None = None
+        self.on_payload: Sequence[Callable[[int, int, int, bytes], None]] = ()
         """Called with time in ns, node, number and payload of each frame that a program sends."""
 
     @property
@@ -195,8 +195,8 @@ class Engine:
                     continue
                 frame = chosen
             self._next_seq[node] += 1
-            if self.on_payload is not None:
-                self.on_payload(time_ns, node, frame.seq, payload)
+            for take in self.on_payload:
+                take(time_ns, node, frame.seq, payload)
             if not self._senders.misbehave:
                 self._enqueue(frame)
                 continue

@@ -239,8 +239,21 @@ PAYLOADS = Table(
     },
     which=", with `run.keep_payloads`", is_due=None, about="No hash depends on it.",
 )
+SAMPLES = Table(
+    "samples", "a row for each message of a Zenoh program that was sent by radio",
+    {
+        "time_ns": Column(INT, "when it was handed to the radio"),
+        "sender": Column(TEXT, ID),
+        "seq": Column(INT, "number of its first frame, as in the trace"),
+        "frames": Column(pa.int32(), "number of its frames"),
+        "kind": Column(TEXT, "put, delete, query, reply, error, or tokens"),
+        "key": Column(TEXT, "its key, a query's selector, or the keys of tokens"),
+        "payload_bytes": Column(INT, "bytes of its payload"),
+    },
+    which=', with `program.kind = "zenoh"`', is_due=None, about="No hash depends on it.",
+)
 # fmt: on
-TABLES = [TRACE, STATES, BUSY, DRIVEN, BACKBONE, BACKGROUND, METRICS, PAYLOADS]
+TABLES = [TRACE, STATES, BUSY, DRIVEN, BACKBONE, BACKGROUND, METRICS, PAYLOADS, SAMPLES]
 
 
 def background_table(background: Background | None) -> pa.Table | None:

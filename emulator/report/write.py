@@ -17,6 +17,7 @@ from emulator.pages.page import Table, put_page, render, table
 from emulator.records.costs import HEADS
 from emulator.records.events import SAID, SAMPLES, Event
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE
+from emulator.records.samples import key_figures as sample_figures
 from emulator.records.tables import on_backbone
 from emulator.records.verdicts import CheckResult, Record, Verdict
 from emulator.report.figures import draw
@@ -36,6 +37,8 @@ MOST_ROWS = 50
 """Rows of a check's figures that are shown."""
 MOST_TEXTS = 3
 """Texts of several lines, as tracebacks, that are shown of a check's rows."""
+MOST_KEYS = 100
+"""Keys of Zenoh programs that are shown."""
 SLOWEST = 10
 """Vehicles in the table of what a run cost."""
 WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
@@ -76,6 +79,7 @@ def report_page(source: Source) -> str:
         charts=draw(source),
         timeline=maybe(lambda: timeline(source)),
         radio=radio_section(source),
+        keys=_keys(source),
         cost=_cost(record) if record else None,
         events=_events(source),
         log=_log(source),
@@ -94,7 +98,7 @@ def _facts(source: Source, record: Record | None) -> Iterator[str]:
         emulated = f"{record.emulated_s:g} of " if record and record.emulated_s != scenario.run.duration_s else ""
         yield f"{emulated}{scenario.run.duration_s:g} s emulated"
         yield {"lockstep": "in lockstep", "realtime": "in real time"}[scenario.run.pacing]
-        yield scenario.program.entry
+        yield scenario.program.title
         yield f"seed {scenario.run.seed}"
     yield f"{source.when:%Y-%m-%d %H:%M}"
 
@@ -204,6 +208,26 @@ def _reported(record: Record) -> Table | None:
     heads = ("figure", "mean", "5 – 95 %", "at the end")
     rows = [dict(zip(heads, figure.words(name), strict=True)) for name, figure in record.reported.items()]
     return table(rows, "all reports of all vehicles; at the end: the mean of each vehicle's last") if rows else None
+
+
+def _keys(source: Source) -> dict[str, Any] | None:
+    """The number of keys of Zenoh programs and the figures of those with the most messages; None without any."""
+    found = maybe(lambda: sample_figures(source))
+    if not found:
+        return None
+    rows = [
+        {
+            "key": each.key,
+            "kind": each.kind,
+            "messages": f"{each.messages:,}",
+            "frames": f"{each.frames:,}",
+            "payload": f"{each.payload_bytes:,} bytes",
+            "arrived": f"{each.arrived:,}",
+            "lost": ", ".join(f"{count:,} {outcome}" for outcome, count in each.lost.most_common()) or "0",
+        }
+        for each in found[:MOST_KEYS]
+    ]
+    return {"count": len(found), "rows": table(rows, "arrived and lost: at each receiver in range")}
 
 
 def _cost(record: Record) -> dict[str, Any] | None:

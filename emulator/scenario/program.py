@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -167,6 +168,11 @@ class Program(OneProgram):
         if twice := sorted(node for node, count in named.items() if count > 1):
             raise ValueError(f"node {shown(twice[0])} is in two exceptions")
         return self
+
+    @property
+    def title(self) -> str:
+        """What the vehicles run, for people: the entry, or the commands."""
+        return self.entry if self.kind == "vnet" else "; ".join(map(shlex.join, self.commands)) or "Zenoh programs"
 
     @property
     def sessions(self) -> ZenohSessions:

@@ -149,3 +149,14 @@ class Reassembly:
         if len(unfinished) > MOST_UNFINISHED:
             unfinished.popitem(last=False)
         return None
+
+
+def describe(payload: bytes) -> str:
+    """Return in words what a frame carries: `vnet trace RUN --decode vnet.gateway.frames:describe`.
+
+    Raises msgspec.MsgspecError for what is no frame of a Zenoh program.
+    """
+    fragment = decode_fragment(payload)
+    if fragment.parts > 1:
+        return f"part {fragment.index + 1} of {fragment.parts} of message {fragment.number}"
+    return str(decode_message(fragment.content))

@@ -6,6 +6,7 @@ The gateway is in the emulator's process, in real time (docs/how-to/zenoh.md).
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import secrets
@@ -49,8 +50,8 @@ _encode = msgspec.msgpack.Encoder().encode
 class Gateway:
     """One incarnation of a vehicle's gateway. Methods are for the run's loop, except `open` and `close`.
 
-    `keys` cross the radio. `hear` takes on any thread "gateway", what programs do ("message", which is to be sent,
-    "query", "token", "report", "session"), and the gateway with what belongs to it.
+    `keys` cross the radio. `hear` takes on any thread "gateway", what programs do ("message", "query", "token",
+    "session", "report"), and the gateway with what belongs to it: `take` then takes that on the run's loop.
     """
 
     def __init__(self, node: str, keys: Sequence[str], settings: ZenohSessions, hear: Hear) -> None:
@@ -65,7 +66,7 @@ class Gateway:
         """Tokens of other vehicles, which are declared at this one's programs."""
         self._heard_tokens: dict[str, tuple[int, frozenset[str]]] = {}
         """Emulated time (ns) of the last word of each sender's tokens, and its tokens."""
-        self.tokens: set[str] = set()
+        self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
         self.sessions: set[str] = set()
         """Ids of the sessions that are connected."""
@@ -132,30 +133,43 @@ class Gateway:
 
     # The run's loop: from the programs.
 
-    def take_session(self, who: str, is_there: bool) -> None:
-        """Take note that a session has connected or is gone."""
-        (self.sessions.add if is_there else self.sessions.discard)(who)
+    def take(self, what: str, item: Any) -> Message | None:
+        """Take what `hear` was told, but for reports; returns the message that is to be sent, if any."""
+        match what:
+            case "message":
+                message: Message = item
+                return message
+            case "query":
+                return self._question(item)
+            case "token":
+                return self._take_token(*item)
+            case "session":
+                who, is_there = item
+                (self.sessions.add if is_there else self.sessions.discard)(who)
+        return None
 
-    def take_token(self, key: str, is_there: bool) -> bool:
-        """Take a token that has appeared or is gone; returns whether it is of this vehicle, and changes its own."""
-        if key in self._declared or key.startswith(OWN_KEYS) or (key in self.tokens) == is_there:
-            return False
-        (self.tokens.add if is_there else self.tokens.discard)(key)
-        return True
-
-    def question(self, query: zenoh.Query) -> tuple[int, CrossingQuery]:
-        """Keep a query until `conclude`; returns its number, and what crosses the radio."""
+    def _question(self, query: zenoh.Query) -> CrossingQuery:
+        """Keep a query for as long as replies are awaited; returns what crosses the radio."""
         number = next(self._query_numbers)
         self._queries[number] = query
+        asyncio.get_running_loop().call_later(self._settings.query_s, self._conclude, number)
         encoding = None if query.encoding is None else str(query.encoding)
-        crossing = CrossingQuery(
-            number, str(query.selector), _bytes(query.payload), encoding, _bytes(query.attachment)
-        )
-        return number, crossing
+        payload, attachment = _bytes(query.payload), _bytes(query.attachment)
+        return CrossingQuery(number, str(query.selector), payload, encoding, attachment)
 
-    def conclude(self, number: int) -> None:
-        """End a query: further replies are not awaited."""
+    def _conclude(self, number: int) -> None:
         self._queries.pop(number).drop()  # type: ignore[no-untyped-call]
+
+    def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
+        """Take a token that has appeared or is gone; those that other vehicles have told of are echoes."""
+        if key in self._declared or key.startswith(OWN_KEYS) or (key in self._tokens) == is_there:
+            return None
+        (self._tokens.add if is_there else self._tokens.discard)(key)
+        return CrossingTokens(tuple(sorted(self._tokens)))
+
+    def tokens(self) -> CrossingTokens | None:
+        """Return the tokens of the vehicle's programs, to be told again, if there are any."""
+        return CrossingTokens(tuple(sorted(self._tokens))) if self._tokens else None
 
     # The run's loop: to the programs.
 
@@ -247,7 +261,7 @@ class Gateway:
         self._heard_tokens = {
             sender: told for sender, told in self._heard_tokens.items() if told[1] and told[0] > oldest_ns
         }
-        there = {key for _, keys in self._heard_tokens.values() for key in keys} - self.tokens
+        there = {key for _, keys in self._heard_tokens.values() for key in keys} - self._tokens
         for key in self._declared.keys() - there:
             self._declared.pop(key).undeclare()  # type: ignore[no-untyped-call]
         for key in sorted(there - self._declared.keys()):

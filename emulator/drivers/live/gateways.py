@@ -28,7 +28,7 @@ from emulator.drivers.live.gateway import Gateway, check_keys, session_environme
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from vnet.errors import ProgramError, VnetError, first_names, shown
-from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
+from vnet.gateway.frames import CrossingReply, Fragments, Message, TooLargeError
 from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY
 from vnet.reports import Report, Reporter
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
@@ -324,8 +324,8 @@ class Gateways:
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
             vehicle.gateway.renew_tokens(max(self._time_ns(), 0))
-            if vehicle.gateway.tokens:
-                self._tell_tokens(vehicle)
+            if (tokens := vehicle.gateway.tokens()) is not None:
+                self._transmit(vehicle, tokens)
             self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)
 
     def _is_there(self, vehicle: _Vehicle) -> bool:
@@ -348,27 +348,14 @@ class Gateways:
         vehicle = self._vehicles.get(gateway.node)
         if vehicle is None or vehicle.gateway is not gateway:  # it is gone
             return
-        match what:
-            case "session":
-                gateway.take_session(*told)
-                self._look_at_sessions(vehicle)
-            case "token":
-                if gateway.take_token(*told) and vehicle.on_air:
-                    self._tell_tokens(vehicle)
-            case _ if not vehicle.on_air:
-                if what == "query":
-                    told.drop()
-            case "message":
-                self._transmit(vehicle, told)
-            case "query":
-                number, question = gateway.question(told)
-                self._loop.call_later(self._settings.query_s, gateway.conclude, number)
-                self._transmit(vehicle, question)
-            case "report":
-                self._take_report(vehicle, told)
-
-    def _tell_tokens(self, vehicle: _Vehicle) -> None:
-        self._transmit(vehicle, CrossingTokens(tuple(sorted(vehicle.gateway.tokens))))
+        if what == "report":
+            self._take_report(vehicle, told)
+        elif what == "query" and not vehicle.on_air:
+            told.drop()
+        elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
+            self._transmit(vehicle, message)
+        elif what == "session":
+            self._look_at_sessions(vehicle)
 
     def _transmit(self, vehicle: _Vehicle, message: Message) -> None:
         """Send a message by the vehicle's radio: a reply to one vehicle, if the MAC repeats what is lost."""

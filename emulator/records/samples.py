@@ -1,0 +1,129 @@
+"""What Zenoh programs said by radio: the table of their messages, and what became of them by key.
+
+A message is as many frames as the radio's payload asks for. At a receiver it has arrived if each of them has, and
+is lost by the outcome of the first that has not.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+
+from emulator.radio.outcomes import Outcome
+from emulator.records.recorded_run import OpenedRun
+from emulator.records.tables import SAMPLES
+from vnet.gateway.frames import (
+    CrossingQuery,
+    CrossingReply,
+    CrossingSample,
+    Message,
+    Reassembly,
+    decode_fragment,
+)
+from vnet.types import IntArray
+
+DELIVERED = Outcome.delivered.name
+
+
+class SampleRecorder:
+    """Collects the messages of a run's frames. Nodes have the numbers 0 … N-1 in the order of `node_ids`."""
+
+    def __init__(self, node_ids: Sequence[str]) -> None:
+        self._node_ids = node_ids
+        self._reassembly = Reassembly()
+        self._first: dict[int, tuple[int, int]] = {}
+        self._rows: list[tuple[int, str, int, int, str, str, int]] = []
+
+    def add(self, time_ns: int, node: int, seq: int, payload: bytes) -> None:
+        """Take a frame as it is sent; programs that have the radio's bytes in hand may send what is no message."""
+        sender = self._node_ids[node]
+        try:
+            fragment = decode_fragment(payload)
+            if fragment.index == 0:
+                self._first[node] = time_ns, seq
+            message = self._reassembly.take(sender, payload)
+        except (msgspec.MsgspecError, LookupError):
+            return
+        if message is not None and node in self._first:
+            sent_ns, first = self._first.pop(node)
+            self._rows.append((sent_ns, sender, first, seq - first + 1, *described(message)))
+
+    def to_table(self) -> pa.Table:
+        """Return the rows of `samples.parquet`."""
+        columns = zip(*self._rows, strict=True) if self._rows else [()] * len(SAMPLES.columns)
+        return pa.table(list(map(list, columns)), schema=SAMPLES.schema)
+
+
+def described(message: Message) -> tuple[str, str, int]:
+    """Return kind, key and payload's bytes of a message; the key of tokens is all of theirs."""
+    match message:
+        case CrossingSample():
+            return ("delete" if message.is_delete else "put"), message.key, len(message.payload)
+        case CrossingQuery():
+            return "query", message.selector, len(message.payload or b"")
+        case CrossingReply(sample=CrossingSample() as sample):
+            return "reply", sample.key, len(sample.payload)
+        case CrossingReply():
+            return "error", f"to query {message.number} of {message.to}", len((message.error or (b"",))[0])
+    return "tokens", " ".join(message.keys), 0
+
+
+@dataclass
+class KeyFigures:
+    """What was said under one key, and what became of it at the receivers in range."""
+
+    key: str
+    kind: str
+    messages: int = 0
+    frames: int = 0
+    payload_bytes: int = 0
+    arrived: int = 0
+    """Messages of which every frame has arrived, each receiver counted."""
+    lost: Counter[str] = field(default_factory=Counter)
+    """Messages that have not, by the outcome of the first frame that was lost."""
+
+
+def key_figures(recorded: OpenedRun) -> list[KeyFigures]:
+    """Return figures by kind and key, the most messages first; none without Zenoh programs."""
+    table = recorded.table(SAMPLES)
+    if table is None or not len(table):
+        return []
+    found: dict[tuple[str, str], KeyFigures] = {}
+    rows = table.to_pylist()
+    for row in rows:
+        figures = found.setdefault((row["kind"], row["key"]), KeyFigures(row["key"], row["kind"]))
+        figures.messages += 1
+        figures.frames += row["frames"]
+        figures.payload_bytes += row["payload_bytes"]
+    for sample, outcome in _outcomes(recorded, rows):
+        figures = found[rows[sample]["kind"], rows[sample]["key"]]
+        if outcome == DELIVERED:
+            figures.arrived += 1
+        else:
+            figures.lost[outcome] += 1
+    return sorted(found.values(), key=lambda each: (-each.messages, each.key, each.kind))
+
+
+def _outcomes(recorded: OpenedRun, rows: Sequence[dict[str, object]]) -> Iterator[tuple[int, str]]:
+    """Yield the number of a message and what became of it, for each receiver in range of its first frame."""
+    sample_of = {
+        (recorded.number[str(row["sender"])], int(str(row["seq"])) + offset): number
+        for number, row in enumerate(rows)
+        for offset in range(int(str(row["frames"])))
+    }
+    first = np.flatnonzero(recorded.copy == 0)
+    first = first[np.lexsort((recorded.seq[first], recorded.receiver[first], recorded.sender[first]))]
+    pairs = zip(recorded.sender[first].tolist(), recorded.seq[first].tolist(), strict=True)
+    sample: IntArray = np.array([sample_of.get(pair, -1) for pair in pairs], dtype=np.int64)
+    outcome = recorded.trace["outcome"].cast(pa.string()).take(pa.array(first)).to_pylist()
+    worst: dict[tuple[int, int], str] = {}
+    for number, receiver, each in zip(sample.tolist(), recorded.receiver[first].tolist(), outcome, strict=True):
+        if number >= 0 and worst.get((number, receiver), DELIVERED) == DELIVERED:
+            worst[number, receiver] = each
+    for (number, _), each in worst.items():
+        yield number, each

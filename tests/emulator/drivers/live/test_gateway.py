@@ -1,0 +1,329 @@
+"""The gateway of a vehicle: real Zenoh sessions on both sides of a radio that the test plays."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+
+from emulator.drivers.live.gateway import Gateway, check_keys
+from emulator.scenario.program import ZenohSessions
+from vnet.errors import TransportError
+from vnet.gateway.frames import CrossingTokens, Fragments
+from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY
+from vnet.transport.wire import WireFix
+from vnet.units import NS_PER_S
+
+PATIENCE_S = 60.0
+QUIET = ZenohSessions()
+
+
+class Vehicle:
+    """A gateway and its radio: frames reach all of `others`, unless `is_lost` says so of their number."""
+
+    def __init__(self, name: str, keys: tuple[str, ...], max_payload: int) -> None:
+        self.gateway = Gateway(name, keys, QUIET, self._hear)
+        self.others: list[Vehicle] = []
+        self.is_lost: Callable[[int], bool] = lambda number: False
+        self.frames: list[bytes] = []
+        self.unread: list[str] = []
+        """Complaints about frames that were no samples."""
+        self.told: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+        """Reports, and changes of sessions and tokens."""
+        self.time_ns = 0
+        self._fragments = Fragments(max_payload)
+        self._loop = asyncio.get_running_loop()
+
+    def _hear(self, kind: str, what: str, item: tuple[Gateway, Any]) -> None:
+        self._loop.call_soon_threadsafe(self._take, what, item[1])
+
+    def _take(self, what: str, told: Any) -> None:
+        if what in ("report", "session", "token"):
+            self.told.put_nowait((what, told))
+        message = self.gateway.take(what, told)
+        for payload in [] if message is None else self._fragments.of(message):
+            self.broadcast(payload)
+
+    def broadcast(self, payload: bytes) -> None:
+        self.frames.append(payload)
+        if not self.is_lost(len(self.frames) - 1):
+            for other in self.others:
+                try:
+                    other.gateway.receive(self.gateway.node, payload, other.time_ns)
+                except ValueError as error:
+                    other.unread.append(str(error))
+
+
+@contextmanager
+def connected(endpoint: str) -> Iterator[zenoh.Session]:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    session = zenoh.open(config)
+    try:
+        yield session
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def settle(session: zenoh.Session) -> None:
+    """Return once the router has all that the session has declared: it answers after it."""
+    for _ in session.get("@/*/router"):
+        pass
+
+
+def listen(session: zenoh.Session, key: str) -> asyncio.Queue[zenoh.Sample]:
+    """Subscribe, and return what comes once the router has the subscription."""
+    loop, heard = asyncio.get_running_loop(), asyncio.Queue[zenoh.Sample]()
+    session.declare_subscriber(key, lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample))
+    settle(session)
+    return heard
+
+
+def watch(session: zenoh.Session, key: str) -> asyncio.Queue[tuple[str, bool]]:
+    """Return the tokens that appear (True) and go."""
+    loop, seen = asyncio.get_running_loop(), asyncio.Queue[tuple[str, bool]]()
+
+    def take(sample: zenoh.Sample) -> None:
+        is_there = sample.kind == zenoh.SampleKind.PUT
+        loop.call_soon_threadsafe(seen.put_nowait, (str(sample.key_expr), is_there))
+
+    session.liveliness().declare_subscriber(key, take, history=True)
+    return seen
+
+
+def two(
+    test: Callable[[list[Vehicle], list[zenoh.Session]], Coroutine[Any, Any, None]],
+    keys: tuple[str, ...] = ("**",),
+    max_payload: int = 2000,
+) -> None:
+    """Run a test with two vehicles in range, and a client of each."""
+
+    async def run() -> None:
+        first, second = vehicles = [Vehicle(name, keys, max_payload) for name in ("v01", "v02")]
+        first.others, second.others = [second], [first]
+        try:
+            endpoints = [await asyncio.to_thread(each.gateway.open, QUIET.listen) for each in vehicles]
+            with connected(endpoints[0]) as one, connected(endpoints[1]) as other:
+                await asyncio.wait_for(test(vehicles, [one, other]), PATIENCE_S)
+        finally:
+            for vehicle in vehicles:
+                vehicle.gateway.close()
+
+    asyncio.run(run())
+
+
+def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        own, heard = listen(sessions[0], "**"), listen(sessions[1], "**")
+        stamp = sessions[0].new_timestamp()
+        for number in range(3):
+            sessions[0].put(
+                f"car/{number}",
+                b"here",
+                encoding=zenoh.Encoding.APPLICATION_JSON,
+                attachment=b"extra",
+                timestamp=stamp,
+                priority=zenoh.Priority.REAL_TIME,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                express=True,
+            )
+        sessions[0].delete("car/0")
+        samples = [await heard.get() for _ in range(4)]
+        assert [str(each.key_expr) for each in samples] == ["car/0", "car/1", "car/2", "car/0"]
+        assert [each.kind for each in samples] == [zenoh.SampleKind.PUT] * 3 + [zenoh.SampleKind.DELETE]
+        put = samples[0]
+        assert (put.payload.to_bytes(), put.encoding) == (b"here", zenoh.Encoding.APPLICATION_JSON)
+        assert put.attachment is not None and put.attachment.to_bytes() == b"extra"
+        assert (put.timestamp, put.priority, put.express) == (stamp, zenoh.Priority.REAL_TIME, True)
+        assert put.congestion_control == zenoh.CongestionControl.BLOCK
+        assert len(vehicles[0].frames) == 4
+        assert vehicles[1].frames == []
+        assert own.qsize() == 4  # past the radio, and not again by it
+
+    two(test)
+
+
+def test_a_sample_larger_than_a_frame_is_put_together_or_lost_by_one_of_its_frames() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        heard = listen(sessions[1], "**")
+        vehicles[0].is_lost = lambda number: number == 4
+        contents = [bytes([number]) * 1000 for number in range(3)]
+        for content in contents:
+            sessions[0].put("large", content)
+        assert (await heard.get()).payload.to_bytes() == contents[0]
+        assert (await heard.get()).payload.to_bytes() == contents[2]
+        assert len(vehicles[0].frames) % 3 == 0
+        assert all(len(frame) <= 300 for frame in vehicles[0].frames)
+
+    two(test, max_payload=300)
+
+
+def test_only_radio_keys_cross_and_none_of_vnet() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        heard = listen(sessions[1], "**")
+        for key in ("lidar/points", FIX_KEY, "radio/a"):
+            sessions[0].put(key, b"x")
+        assert str((await heard.get()).key_expr) == "radio/a"
+        assert len(vehicles[0].frames) == 1
+
+    two(test, keys=("radio/**", "vnet/**"))
+
+
+def test_an_advanced_subscriber_finds_exactly_the_samples_that_the_radio_has_lost() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        loop, missed = asyncio.get_running_loop(), asyncio.Queue[int]()
+        heard: asyncio.Queue[bytes] = asyncio.Queue()
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            sessions[1],
+            "pose",
+            lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample.payload.to_bytes()),
+        )
+        subscriber.sample_miss_listener(lambda miss: loop.call_soon_threadsafe(missed.put_nowait, miss.nb))
+        listen(sessions[1], "other")
+        vehicles[0].is_lost = lambda number: number in (2, 5, 6)
+        publisher = zenoh.ext.declare_advanced_publisher(
+            sessions[0],
+            "pose",
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+        )
+        for number in range(10):
+            publisher.put(bytes([number]))
+        assert [(await heard.get())[0] for _ in range(7)] == [0, 1, 3, 4, 7, 8, 9]
+        assert [await missed.get() for _ in range(2)] == [1, 2]
+
+    two(test)
+
+
+def test_an_advanced_subscriber_recovers_what_the_radio_has_lost_from_the_publishers_cache() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        loop, heard = asyncio.get_running_loop(), asyncio.Queue[int]()
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            sessions[1],
+            "pose",
+            lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample.payload.to_bytes()[0]),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+        listen(sessions[1], "other")
+        vehicles[0].is_lost = lambda number: number in (2, 5, 6)
+        publisher = zenoh.ext.declare_advanced_publisher(
+            sessions[0],
+            "pose",
+            cache=zenoh.ext.CacheConfig(10),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None),
+        )
+        for number in range(10):
+            publisher.put(bytes([number]))
+        assert [await heard.get() for _ in range(10)] == list(range(10))
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    two(test, keys=RADIO_KEYS)
+
+
+def test_a_query_is_answered_by_the_programs_of_another_vehicle_with_samples_and_errors() -> None:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            asked = b"" if query.payload is None else query.payload.to_bytes()
+            if query.parameters.get("fails"):
+                query.reply_err(b"no")
+            else:
+                query.reply(query.key_expr, asked + b"!", attachment=b"extra", encoding="text/plain")
+
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        sessions[1].declare_queryable("service", reply)
+        listen(sessions[1], "other")
+        answers = await asyncio.to_thread(lambda: list(sessions[0].get("service", payload=b"hello")))
+        ok = answers[0].ok
+        assert ok is not None and ok.attachment is not None
+        assert (ok.payload.to_bytes(), ok.attachment.to_bytes()) == (b"hello!", b"extra")
+        assert len(answers) == 1
+        answers = await asyncio.to_thread(lambda: list(sessions[0].get("service?fails=1")))
+        assert answers[0].err is not None and answers[0].err.payload.to_bytes() == b"no"
+        assert len(vehicles[0].frames) == len(vehicles[1].frames) == 2
+
+    two(test)
+
+
+def test_tokens_of_a_vehicle_are_seen_by_those_in_range_late_ones_too_and_are_gone_without_word() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        first, second = vehicles
+        token = sessions[0].liveliness().declare_token("car/a")
+        while not first.frames:
+            await first.told.get()
+        early = watch(sessions[1], "car/*")
+        assert await early.get() == ("car/a", True)
+        late = watch(sessions[1], "car/*")  # history
+        assert await late.get() == ("car/a", True)
+        second.time_ns = 4 * NS_PER_S  # nothing was heard for longer than three times liveliness_s
+        second.gateway.renew_tokens(second.time_ns)
+        assert await early.get() == ("car/a", False)
+        told = first.gateway.tokens()
+        assert told == CrossingTokens(("car/a",))
+        for payload in Fragments(2000).of(told):
+            first.broadcast(payload)
+        assert await early.get() == ("car/a", True)
+        token.undeclare()  # type: ignore[no-untyped-call]
+        assert await early.get() == ("car/a", False)
+        assert second.frames == [], "an echo of another vehicle's token is no token of this one"
+        assert first.gateway.tokens() is None
+
+    two(test)
+
+
+def test_bytes_that_a_fault_has_changed_harm_nobody() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        heard = listen(sessions[1], "last")
+        first = listen(sessions[1], "car")
+        sessions[0].put("car", b"here", attachment=b"extra", timestamp=sessions[0].new_timestamp())
+        await first.get()
+        frame = vehicles[0].frames[0]
+        for content in (b"", b"\xc1", msgspec.msgpack.encode([0, 0, 1, b"\x90"])):
+            vehicles[0].broadcast(content)
+        for place in range(len(frame)):
+            for change in (0x01, 0x40, 0x80, 0xFF):
+                changed = bytearray(frame)
+                changed[place] ^= change
+                vehicles[0].broadcast(bytes(changed))
+        sessions[0].put("last", b"x")
+        assert str((await heard.get()).key_expr) == "last"
+        assert len(vehicles[1].unread) > len(frame)
+
+    two(test)
+
+
+def test_a_program_hears_its_fixes_and_reports_by_keys_of_vnet() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        fixes = listen(sessions[0], FIX_KEY)
+        vehicles[0].gateway.show_fix(WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None, 3.0))
+        fix = msgspec.msgpack.decode((await fixes.get()).payload.to_bytes())
+        assert (fix["position_m"], fix["covariance_m2"], fix["speed_m_s"]) == ([1, 2], [[1, 0], [0, 1]], 3)
+        content = msgspec.msgpack.encode({"speed": 3.0})
+        sessions[0].put(REPORT_KEY, content)
+        while (told := await vehicles[0].told.get())[0] != "report":
+            pass
+        assert told == ("report", content)
+        assert vehicles[0].frames == []
+
+    two(test)
+
+
+def test_sessions_are_counted_by_who_they_are() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        gateway = vehicles[0].gateway
+        while len(gateway.sessions) < 1:
+            await vehicles[0].told.get()
+        assert gateway.sessions == {f"{sessions[0].zid()} (client)"}
+        sessions[0].close()  # type: ignore[no-untyped-call]
+        while gateway.sessions:
+            await vehicles[0].told.get()
+
+    two(test)
+
+
+@pytest.mark.parametrize(("keys", "named"), [(("a//b",), "a//b"), (("a/**", "a/b"), "overlap")])
+def test_keys_that_cannot_be_are_named(keys: tuple[str, ...], named: str) -> None:
+    with pytest.raises(TransportError, match=named):
+        check_keys(keys)
