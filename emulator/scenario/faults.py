@@ -23,7 +23,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, cast, get_args
 
@@ -767,6 +767,12 @@ def _validate(data: object) -> Fault:
 
 AnyFault = Annotated[SerializeAsAny[Fault], PlainValidator(_validate)]
 """A fault of any kind, as the type of a scenario's key."""
+
+
+def refuse_router_restart(faults: Iterable[Fault]) -> None:
+    """Raise ScenarioError for the fault `router_restart`, where there is no router of its own."""
+    if any(fault.kind == "router_restart" for fault in faults):
+        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
 def parse_fault(data: object) -> Fault:
