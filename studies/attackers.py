@@ -21,8 +21,7 @@ from studies.measure import study_cell
 from studies.paper import Labels
 from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
-from studies.statistics import shown_interval
-from studies.tables import MISSING, markdown_table, paired_ratio, with_error
+from studies.tables import MISSING, markdown_table, paired_ratio, shown_interval, with_error
 from vnet.counted import counted
 
 ATTACKER = "agents.cooperative.attacker:main"

@@ -254,16 +254,16 @@ def draw_figures(
     / "table2",
 ) -> None:
     """The paper's pictures: degrees, road angles, graphs; RMSE and deviation against time on N2 and N3."""
-    from studies import network_figures
+    from studies import result_figures
 
     with one_line_errors():
         folder = _folder(out, "figures")
         sections = paper.network_sections(networks)
         found = {name.upper(): paper.load_positions(section) for name, section in sections.items()}
         for draw in (
-            network_figures.degree_histogram,
-            network_figures.road_angle_histogram,
-            network_figures.graphs,
+            result_figures.degree_histogram,
+            result_figures.road_angle_histogram,
+            result_figures.graphs,
         ):
             print(draw(found, folder / draw.__name__))
         cells = paper.table2_cells({n: sections[n] for n in ("n2", "n3")}, range(1, seeds + 1), sides=(1,))

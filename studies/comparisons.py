@@ -23,8 +23,7 @@ from studies.paper import BOUND, BOUND_POSITION, Labels, counted_from
 from studies.paper_values import PAPER_RANGE_M
 from studies.reports import Result, column, select, unique
 from studies.result_figures import against_time
-from studies.statistics import paired_tests, shown_interval
-from studies.tables import MISSING, markdown_table, paired_ratio
+from studies.tables import MISSING, markdown_table, paired_ratio, paired_tests, shown_interval
 from vnet.counted import counted
 from vnet.errors import VnetError
 

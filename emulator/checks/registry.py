@@ -21,10 +21,10 @@ from emulator.checks.channel import (
     check_peer_cap,
     check_range,
 )
-from emulator.checks.fault_effects import check_fault_effects
 from emulator.checks.faults import (
     check_causes,
     check_down_respected,
+    check_fault_effects,
     check_fault_loss,
     check_outage_respected,
     check_partition_respected,

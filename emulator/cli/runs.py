@@ -46,12 +46,13 @@ from emulator.cli.options import (
     load,
 )
 from emulator.cli.own_child import OwnChild, may_fork
+from emulator.scenario.faults import refuse_router_restart
 from emulator.scenario.loading import find_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, one_line_errors, say_first
 from emulator.terminal.standard_output import result_only
 from emulator.viewer.sinks import choose_sinks
-from vnet.errors import ScenarioError, VnetError
+from vnet.errors import VnetError
 from vnet.extras import require
 from vnet.runtime.interrupts import ended_at_once
 
@@ -103,7 +104,8 @@ def run(
         loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
         if check_determinism is not None and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
-        _check_restarts(loaded, router is RouterKind.SEPARATE)
+        if router is not RouterKind.SEPARATE:
+            refuse_router_restart(loaded.fault)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         if debug is not None and hosts is not None:
             raise VnetError("--debug and --hosts exclude each other")
@@ -207,7 +209,7 @@ def emulator(
             raise VnetError("--listen and --connect exclude each other")
         order_asked = OrderOptions(order, order_seed, tape)
         loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
-        _check_restarts(loaded, own_router=False)
+        refuse_router_restart(loaded.fault)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         _announce(loaded, asked)
         with ended_at_once():
@@ -222,13 +224,6 @@ def _announce(scenario: Scenario, asked: OutputOptions) -> None:
     run = scenario.run
     if not asked.only_the_result:
         say_first(f"{run.name}: {run.pacing}, seed {run.seed}, {run.duration_s:g} s of emulated time")
-
-
-def _check_restarts(scenario: Scenario, own_router: bool) -> None:
-    """Only a router that the run itself has started can be restarted."""
-    kinds = {fault.kind for fault in scenario.fault}
-    if "router_restart" in kinds and not own_router:
-        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
 def demo(duration: DurationOption = None, out: OutOption = None) -> None:

@@ -19,7 +19,7 @@ import zenoh
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.status import Course, fault_state
-from emulator.scenario.faults import OwnRule, parse_fault
+from emulator.scenario.faults import OwnRule, parse_fault, refuse_router_restart
 from emulator.viewer.sinks import ServeAt, Sinks
 from vnet.errors import ScenarioError, TransportError, VnetError
 from vnet.transport import keys
@@ -43,8 +43,8 @@ def answer(
             return asdict(course.snapshot(now_ns))
         case "inject":
             fault = parse_fault(_json(payload))
-            if fault.kind == "router_restart" and not own_router:
-                raise ScenarioError("router_restart: needs a router of its own: vnet run --router separate")
+            if not own_router:
+                refuse_router_restart([fault])
             if isinstance(fault, OwnRule):
                 raise ScenarioError(f"{fault.kind}: a rule is part of the scenario: write it as [[fault]] there")
             return asdict(fault_state(emulation.inject(fault, now_ns), emulation, now_ns))

@@ -33,9 +33,10 @@ from emulator.drivers.simulate import ProcessCount, process_count, simulate
 from emulator.drivers.zygote import AGENT_ENVIRONMENT
 from emulator.records.code_digest import entries_of
 from emulator.records.run_folder import RunFolder
+from emulator.scenario.faults import refuse_router_restart
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world
-from vnet.errors import ProgramError, ScenarioError
+from vnet.errors import ProgramError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.environment import SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
@@ -57,19 +58,13 @@ class Local:
     apart: str | None = None
 
 
-def refuse_router_restart(scenario: Scenario) -> None:
-    """Raise ScenarioError for the fault `router_restart`, where there is no router of its own."""
-    if any(fault.kind == "router_restart" for fault in scenario.fault):
-        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
-
-
 def over_zenoh(emulation: Emulation) -> LiveOptions:
     """Return the options of a run with a process for each vehicle, or each group of them, on this machine.
 
     Raises ScenarioError for a fault that this cannot show.
     """
     scenario = emulation.scenario
-    refuse_router_restart(scenario)
+    refuse_router_restart(scenario.fault)
     groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
     return LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
 

@@ -11,8 +11,8 @@ follows. CONTRIBUTING.md shows an example. The layers above act on families:
 | `LossFault`, `DelayFault` | `radio/faults.py` by the kind's law | `checks/faults.py`, `checks/latency.py` |
 | `SenderFault` | `radio/faults.py` | `checks/senders.py` |
 | `OwnRule` | `radio/own_rules.py` | `checks/own_rules.py` |
-| `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/senders.py`, `checks/fault_effects.py` |
-| `Infrastructure` | `drivers/live/reconnection.py` | `checks/fault_effects.py` |
+| `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/senders.py`, `checks/faults.py` |
+| `Infrastructure` | `drivers/live/reconnection.py` | `checks/faults.py` |
 
 The same tables stand in a scenario (`[[fault]]`) and behind the live command (`vnet fault inject`). Every fault
 ends by itself.
@@ -23,7 +23,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, cast, get_args
 
@@ -767,6 +767,12 @@ def _validate(data: object) -> Fault:
 
 AnyFault = Annotated[SerializeAsAny[Fault], PlainValidator(_validate)]
 """A fault of any kind, as the type of a scenario's key."""
+
+
+def refuse_router_restart(faults: Iterable[Fault]) -> None:
+    """Raise ScenarioError for the fault `router_restart`, where there is no router of its own."""
+    if any(fault.kind == "router_restart" for fault in faults):
+        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
 def parse_fault(data: object) -> Fault:

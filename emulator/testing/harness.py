@@ -25,13 +25,13 @@ from emulator.checks.judge import CheckResult, Judgement, Verdict
 from emulator.checks.own import PREFIX, Result, finding_of, load_checks
 from emulator.checks.properties import ANY, PERIOD, Effect, Predicate, always, eventually, leads_to, never
 from emulator.drivers.conclude import judge_further
-from emulator.drivers.session import Local, Session, over_zenoh, refuse_router_restart
+from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.faults.plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.events import Event
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE
-from emulator.scenario.faults import LONGEST_S, Fault, OwnRule, parse_fault
+from emulator.scenario.faults import LONGEST_S, Fault, OwnRule, parse_fault, refuse_router_restart
 from emulator.scenario.loading import with_rules
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError, VnetError
@@ -47,7 +47,7 @@ class RunHarness:
     def __init__(self, scenario: Scenario, folder: Path, live: bool = False) -> None:
         if scenario.run.pacing != "lockstep":
             raise ScenarioError("run.pacing = 'realtime': a test steps a run in lockstep; for real time: vnet run")
-        refuse_router_restart(scenario)
+        refuse_router_restart(scenario.fault)
         load_checks(scenario.program)
         load_rules(scenario.fault, scenario.program)
         self.folder = folder

@@ -11,8 +11,8 @@ import rerun.blueprint as rrb
 
 from emulator.records.period_figures import Estimate, ProgramFigures
 from emulator.viewer.drawing import POSITION, TIMELINE, Period
-from emulator.viewer.program_scene import entity, titled
 from emulator.viewer.radio_scene import WINDOW_S
+from emulator.viewer.vehicle_scene import entity, titled
 
 T = TypeVar("T")
 SAME_M = 1e-3

@@ -22,10 +22,9 @@ from emulator.scenario.loading import parse_recorded_scenario
 from emulator.viewer.blueprints import Content, blueprint
 from emulator.viewer.drawing import Canvas, Period
 from emulator.viewer.overview_scene import OverviewScene
-from emulator.viewer.program_scene import ProgramScene
 from emulator.viewer.radio_scene import RadioScene
 from emulator.viewer.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
-from emulator.viewer.vehicle_scene import VehicleScene
+from emulator.viewer.vehicle_scene import ProgramScene, VehicleScene
 from vnet.errors import VnetError, first_names
 
 DRAWN_TOGETHER_S = 1.0

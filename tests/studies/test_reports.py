@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from studies import network_figures, reports, result_figures
+from studies import reports, result_figures
 from studies.paper import ALPHAS, load_positions
 from studies.paper_values import PAPER_VEHICLES
 from studies.tables import with_error
@@ -27,7 +27,7 @@ def is_picture(path: Path) -> bool:
 
 @pytest.mark.parametrize("networks", [NETWORK, LONELY])
 @pytest.mark.parametrize(
-    "draw", [network_figures.degree_histogram, network_figures.road_angle_histogram, network_figures.graphs]
+    "draw", [result_figures.degree_histogram, result_figures.road_angle_histogram, result_figures.graphs]
 )
 def test_networks_are_drawn_also_without_edges(tmp_path: Path, draw, networks) -> None:  # type: ignore[no-untyped-def]
     assert is_picture(draw(networks, tmp_path / "picture"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.statistics import holm, interval_95, paired_tests, shown_interval
+from studies.tables import holm, interval_95, paired_tests, shown_interval
 
 
 def test_an_interval_is_students() -> None:

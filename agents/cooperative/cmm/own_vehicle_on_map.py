@@ -10,8 +10,7 @@ import numpy as np
 
 from agents.cooperative.cmm.information import NOTHING, Five, Information, gained
 from agents.cooperative.cmm.kalman_bound import common_step
-from agents.cooperative.cmm.map_evidence import MAX_GATE_M, MIN_GATE_M, STAND_M
-from agents.cooperative.cmm.map_matching import MAX_LANES
+from agents.cooperative.cmm.map_matching import MAX_GATE_M, MAX_LANES, MIN_GATE_M, STAND_M
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
 from agents.cooperative.cmm.road_hypotheses import OFFSET, Candidates, RoadHypotheses
 from agents.cooperative.cmm.tracks import transition, white_acceleration

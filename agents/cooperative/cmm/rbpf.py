@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.cmm.common_error import CommonErrorParticles, systematic
-from agents.cooperative.cmm.map_evidence import MapEvidence
-from agents.cooperative.cmm.map_matching import matcher
+from agents.cooperative.cmm.map_matching import MapEvidence, matcher
 from agents.cooperative.cmm.tracks import (
     SAME_TIME_S,
     Rows,

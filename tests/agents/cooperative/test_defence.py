@@ -12,8 +12,7 @@ from msgspec import structs
 
 from agents.cooperative.admission import FORGET_PERIODS, MAX_SENDERS, Admission
 from agents.cooperative.attacker import Attack, Attacker
-from agents.cooperative.estimator import Estimator, usable
-from agents.cooperative.fix_table import CAPACITY, FixTable
+from agents.cooperative.estimator import CAPACITY, Estimator, FixTable, usable
 from agents.cooperative.frame import RELAYED, CooperativeFrame, decode, encode, short_name
 from agents.cooperative.options import Options
 from emulator.drivers.simulate import simulate

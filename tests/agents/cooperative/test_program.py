@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.cooperative.estimator import Estimator
-from agents.cooperative.fix_table import CAPACITY, FixTable
+from agents.cooperative.estimator import CAPACITY, Estimator, FixTable
 from agents.cooperative.frame import RELAYED, CooperativeFrame, FrameError, decode, encode, room, short_name
 from agents.cooperative.options import Options
 from agents.cooperative.program import listening_share

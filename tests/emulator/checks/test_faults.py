@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator.checks.fault_effects import _wrong_fixes
+from emulator.checks.faults import _wrong_fixes
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
 from emulator.records.events import Event
 from emulator.records.tables import STATES

@@ -12,7 +12,7 @@ import pytest
 from emulator.api import simulate_into
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reference import reference_series
-from emulator.report.network_figures import degrees
+from emulator.report.figures import degrees
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import scene_message

@@ -15,8 +15,8 @@ from emulator.records.radio_metrics import radio_metrics, unicast_figures
 from emulator.records.recorded_run import RecordedRun
 from emulator.report import radio_figures
 from emulator.report.comparison import Comparison, _delivered
+from emulator.report.figures import links
 from emulator.report.index import index_page
-from emulator.report.network_figures import links
 from emulator.report.radio_figures import radio_section
 from emulator.report.source import Source
 from emulator.report.write import report_page

@@ -5,8 +5,8 @@ from typing import Any
 
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
+from emulator.testing.campaign import Explanation, explain
 from emulator.testing.campaign_plan import with_seed
-from emulator.testing.explanation import Explanation, explain
 from emulator.testing.trial import Trial, TrialPool, run_trial
 
 

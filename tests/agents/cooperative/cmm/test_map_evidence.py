@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from agents.cooperative.cmm.common_error import CommonErrorParticles
-from agents.cooperative.cmm.map_evidence import MAP_UPDATE_S, MapEvidence
-from agents.cooperative.cmm.map_matching import MIN_MAP_LOG_LIKELIHOOD, log_on_lane, matcher
+from agents.cooperative.cmm.map_matching import (
+    MAP_UPDATE_S,
+    MIN_MAP_LOG_LIKELIHOOD,
+    MapEvidence,
+    log_on_lane,
+    matcher,
+)
 from agents.cooperative.cmm.tracks import Tracks
 from vnet.roads.lanes import LaneMap
 
