@@ -38,7 +38,8 @@ interpret payloads: [lies in them](../faults.md#in-a-scenario) are a program for
 ([`[[program.exceptions]]`](scenario.md#program)).
 """
 INFRASTRUCTURE = """
-For live runs only. `router_restart` needs `vnet run --router separate`.
+For live runs only. `router_restart` needs `vnet run --router separate`, unless programs
+speak Zenoh.
 """
 DRAWN = f"""
 `vnet campaign`, and the strategy `faults` of property tests, draw faults of these kinds. A run of a campaign has

@@ -277,15 +277,15 @@ def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, 
 
 
 def check_isolation(recorded: RecordedRun) -> Finding:
-    """Check that every arrival was sent, byte for byte, and that programs report no more than arrived."""
+    """Check that arrivals were sent, byte for byte, that programs report no more, and pass by no other way."""
     name = "isolation"
     refused = sum(int(event.details.get("count", 0)) for event in recorded.event(EventKind.refused_total))
     arrived = int(recorded.arrived.sum())
-    if not arrived:
+    strangers_at = sorted({event.node or "" for event in recorded.event(EventKind.extra_session)})
+    if not arrived and not strangers_at:
         return nothing_seen(name, recorded, "nothing arrived")
     foreign = _foreign(recorded)
     claims = _claims_beyond(recorded)
-    strangers_at = sorted({event.node or "" for event in recorded.event(EventKind.extra_session)})
     broken = int(foreign.sum()) + len(claims) + len(strangers_at)
     reporting = int(np.isfinite(recorded.value("heard")).any(axis=0).sum())
     text = f"{counted(arrived, 'arrival')} as they were sent"

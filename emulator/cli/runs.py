@@ -104,7 +104,7 @@ def run(
         loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
         if check_determinism is not None and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
-        if router is not RouterKind.SEPARATE:
+        if router is not RouterKind.SEPARATE and not loaded.has_gateways:
             refuse_router_restart(loaded.fault)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         if debug is not None and hosts is not None:
@@ -209,7 +209,8 @@ def emulator(
             raise VnetError("--listen and --connect exclude each other")
         order_asked = OrderOptions(order, order_seed, tape)
         loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
-        refuse_router_restart(loaded.fault)
+        if not loaded.has_gateways:
+            refuse_router_restart(loaded.fault)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         _announce(loaded, asked)
         with ended_at_once():

@@ -64,7 +64,8 @@ def over_zenoh(emulation: Emulation) -> LiveOptions:
     Raises ScenarioError for a fault that this cannot show.
     """
     scenario = emulation.scenario
-    refuse_router_restart(scenario.fault)
+    if not scenario.has_gateways:
+        refuse_router_restart(scenario.fault)
     groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
     return LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
 

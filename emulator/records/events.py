@@ -153,7 +153,8 @@ class EventKind(StrEnum):
     judged_by_test = (
         "judged_by_test", "", "checks", "which properties of a test have judged the run, beside its scenario")
     emulator_restarted = "emulator_restarted", "", "down_s", "the emulator's connection is back", CHANGE
-    router_restarted = "router_restarted", "", "down_s", "the separate router is back", CHANGE
+    router_restarted = (
+        "router_restarted", "", "down_s", "the separate router, or that of each vehicle, is back", CHANGE)
     refused = "refused", "vehicle", "key reason", "the first message on this key that was not believed", WARNING
     refused_total = "refused_total", "", "key count", "how many there were", NOTE, MEASURED
     extra_session = (

@@ -743,7 +743,8 @@ class EmulatorRestart(Infrastructure):
 
 
 class RouterRestart(Infrastructure):
-    """The separate router is ended and started again; agents are told first."""
+    """The separate router is ended and started again; agents are told first. Of Zenoh programs each vehicle's own
+    router is."""
 
     kind: Literal["router_restart"]
 
@@ -770,7 +771,7 @@ AnyFault = Annotated[SerializeAsAny[Fault], PlainValidator(_validate)]
 
 
 def refuse_router_restart(faults: Iterable[Fault]) -> None:
-    """Raise ScenarioError for the fault `router_restart`, where there is no router of its own."""
+    """Raise ScenarioError for the fault `router_restart`, where there is no router beside the emulator's own."""
     if any(fault.kind == "router_restart" for fault in faults):
         raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 

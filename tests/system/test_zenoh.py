@@ -1,50 +1,147 @@
-"""Unmodified Zenoh programs as vehicles of a live run."""
+"""Unmodified Zenoh programs as vehicles of a run in real time."""
 
+import json
 import re
+import socket
 from collections import Counter
 from pathlib import Path
 
+import pyarrow.parquet as pq
+import pytest
+
 from tests.support.paths import ROOT
-from tests.system.conftest import Vnet
+from tests.system.conftest import Finished, Vnet
 
 PAGE = (ROOT / "docs/how-to/zenoh.md").read_text()
+WAITS = (
+    "import sys, time, zenoh; session = zenoh.open(zenoh.Config.from_env()); name = sys.argv[1]; {}; time.sleep({})"
+)
+"""A program of one line: what it does after it has connected, and for how long it stays."""
+SLOW = (0, 3)
+"""Exit statuses of a run that is as it should be: a slow machine makes one in real time unknown."""
 
 
-def scenario(folder: Path, command: str) -> str:
-    """Write the page's scenario, without a loss and with other commands; returns its path."""
+def scenario(folder: Path, *changes: tuple[str, str]) -> str:
+    """Write the page's scenario and program, with texts changed; returns the path."""
     blocks = dict(re.findall(r"```\w+\n# (\S+)\n(.*?)```", PAGE, re.DOTALL))
     (folder / "talker.py").write_text(blocks["talker.py"])
-    text = blocks["talkers.toml"].replace('["python", "talker.py", "{id}"]', command)
+    text = blocks["talkers.toml"]
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
     (folder / "talkers.toml").write_text(text)
     return str(folder / "talkers.toml")
+
+
+def command(does: str, stays_s: float = 100.0) -> tuple[str, str]:
+    words = ["python", "-c", WAITS.format(does, stays_s), "{id}"]
+    return '["python", "talker.py", "{id}"]', json.dumps(words)
+
+
+def heard(done: Finished, node: str) -> Counter[str]:
+    return Counter(re.findall(r"heard car/(\w+)/pose", (done.folder / f"logs/{node}.log").read_text()))
 
 
 def test_a_program_hears_of_other_vehicles_what_the_radio_has_delivered_and_no_more(
     vnet: Vnet, tmp_path: Path
 ) -> None:
-    path = scenario(tmp_path, f'["python", "{tmp_path}/talker.py", "{{id}}"]')
-    done = vnet("run", path)
-    assert done.status in (0, 3), "a slow machine makes a run in real time unknown"
+    done = vnet("run", scenario(tmp_path), "--report")
+    assert done.status in SLOW
     assert done.check("conservation")["verdict"] == "valid"
+    assert done.check("isolation")["verdict"] == "valid"
     assert done.check("partition_respected")["verdict"] != "invalid"
     delivered = Counter((row["receiver"], row["sender"]) for row in done.trace() if row["outcome"] == "delivered")
     for node in ("v01", "v02", "v03", "v04"):
-        heard = Counter(re.findall(r"heard car/(\w+)/pose", (done.folder / f"logs/{node}.log").read_text()))
-        assert node in heard, "programs of one vehicle talk past the radio"
-        for other in heard.keys() - {node}:
-            assert heard[other] <= delivered[node, other]
+        told = heard(done, node)
+        assert node in told, "programs of one vehicle talk past the radio"
+        for other in told.keys() - {node}:
+            assert told[other] <= delivered[node, other]
     assert sum(delivered.values()) > 0
+    sent = Counter(row["sender"] for row in pq.read_table(done.folder / "samples.parquet").to_pylist())
+    offered = {(row["sender"], row["seq"]) for row in done.trace()}
+    assert sent == Counter(sender for sender, _ in offered)
+    assert "car/v01/pose" in (done.folder / "report.html").read_text()
+
+
+def test_faults_end_pause_and_start_the_commands_with_their_vehicle(vnet: Vnet, tmp_path: Path) -> None:
+    """A killed vehicle's program is started again at the same endpoint, as are all after a restart of routers."""
+    faults = "".join(
+        f'\n[[fault]]\nkind = "{kind}"\nat_s = {at_s}\n{more}\n'
+        for kind, at_s, more in [
+            ("kill", 1.0, 'duration_s = 1.0\nnodes = { ids = ["v01"] }'),
+            ("pause", 1.0, 'duration_s = 1.0\nnodes = { ids = ["v02"] }'),
+            ("router_restart", 4.0, "down_s = 0.5"),
+        ]
+    )
+    old = PAGE[PAGE.index('[[fault]]\nkind = "partition"') : PAGE.index('"v04"]]\n') + len('"v04"]]\n')]
+    done = vnet("run", scenario(tmp_path, (old, faults)))
+    assert done.status in SLOW
+    assert [event["node"] for event in done.events_of("restarted")] == ["v01"]
+    assert done.events_of("router_restarted")
+    assert not done.events_of("died")
+    last = max(row["sent_ns"] for row in done.trace() if row["sender"] == "v01" and row["outcome"] == "delivered")
+    assert last > 4_500_000_000, "programs find their router again by themselves"
+    silent = [row["sender"] for row in done.trace() if 1.1e9 < row["sent_ns"] < 1.9e9]
+    assert not {"v01", "v02"} & set(silent)
 
 
 def test_a_command_that_fails_is_a_crash_of_its_vehicle_alone(vnet: Vnet, tmp_path: Path) -> None:
-    fails = '["python", "-c", "import sys; sys.exit(3 if sys.argv[1] == \'v02\' else 0)", "{id}"]'
-    done = vnet("run", scenario(tmp_path, fails))
-    (crash,) = done.events_of("crashed")
-    assert (done.status, crash["node"]) == (1, "v02")
-    assert "ended with status 3" in crash["error"]
+    fails = command("time.sleep(1); sys.exit(3 if name == 'v02' else 0)")
+    done = vnet("run", scenario(tmp_path, fails, ("duration_s = 8.0", "duration_s = 4.0")))
+    (death,) = done.events_of("died")
+    assert (done.status, death["node"]) == (1, "v02")
+    assert "status 3" in death["how"]
+    assert sorted(event["node"] for event in done.events_of("finished")) == ["v01", "v03", "v04"]
 
 
-def test_lockstep_is_refused_by_name(vnet: Vnet, tmp_path: Path) -> None:
-    done = vnet("simulate", scenario(tmp_path, "[]"))
+def test_a_session_at_another_vehicles_endpoint_is_no_isolation(vnet: Vnet, tmp_path: Path) -> None:
+    """The cheater finds the endpoint of another vehicle in the run's folder, and puts a sample there."""
+    (tmp_path / "cheater.py").write_text(
+        "import json, pathlib, sys, time\n"
+        "import zenoh\n"
+        "own = zenoh.open(zenoh.Config.from_env())\n"
+        "if sys.argv[1] == 'v01':\n"
+        "    while not (found := list(pathlib.Path(sys.argv[2]).rglob('endpoints.json'))):\n"
+        "        time.sleep(0.1)\n"
+        "    config = zenoh.Config()\n"
+        "    config.insert_json5('mode', '\"client\"')\n"
+        "    config.insert_json5('connect/endpoints', json.dumps([json.loads(found[0].read_text())['v02']]))\n"
+        "    other = zenoh.open(config)\n"
+        "    other.put('car/x/pose', b'past the radio')\n"
+        "time.sleep(100)\n"
+    )
+    words = json.dumps(["python", "cheater.py", "{id}", str(tmp_path)])
+    done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words)))
     assert done.status == 1
-    assert "run.pacing" in done.events_of("crashed")[0]["error"]
+    assert {event["node"] for event in done.events_of("extra_session")} == {"v02"}
+    assert done.check("isolation")["verdict"] == "invalid"
+
+
+def test_a_program_that_never_connects_and_a_port_that_is_taken_are_named(vnet: Vnet, tmp_path: Path) -> None:
+    sleeps = ('["python", "talker.py", "{id}"]', '["sleep", "100"]')
+    done = vnet("run", scenario(tmp_path, sleeps), "--set", "run.join_timeout_s=1")
+    assert done.status == 2
+    assert "v01 at tcp/127.0.0.1:" in done.stderr
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = vnet("run", scenario(tmp_path), "--set", f"program.zenoh.listen={endpoint}")
+    assert done.status == 2
+    assert f"v01: cannot listen at {endpoint}" in done.stderr
+
+
+@pytest.mark.parametrize("program", ["sh", "talker.py"])
+def test_users_and_several_commands_of_one_vehicle(vnet: Vnet, tmp_path: Path, program: str) -> None:
+    """A command has the first user's password; one without it is not let in."""
+    (tmp_path / "users.txt").write_text("car:secret\n")
+    secured = ('kind = "zenoh"', 'kind = "zenoh"\nzenoh = { users = "users.txt" }')
+    both = '[["python", "talker.py", "{id}"], ["python", "talker.py", "{id}"]]'
+    alone = '["sh", "-c", "unset ZENOH_CONFIG; exec sleep 100"]'
+    words = both if program == "talker.py" else alone
+    limit = [] if words == both else ["--set", "run.join_timeout_s=1"]
+    done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words), secured), *limit)
+    assert done.status in (SLOW if words == both else (2,))
+    if words == both:
+        assert heard(done, "v01")["v01"] > 0
+        assert (done.folder / "logs/v01~2.log").read_text()

@@ -48,7 +48,7 @@ _encode = msgspec.msgpack.Encoder().encode
 
 
 class Gateway:
-    """One incarnation of a vehicle's gateway. Methods are for the run's loop, except `open` and `close`.
+    """One incarnation of a vehicle's gateway. Methods are for the run's loop, except `open`.
 
     `keys` cross the radio. `hear` takes on any thread "gateway", what programs do ("message", "query", "token",
     "session", "report"), and the gateway with what belongs to it: `take` then takes that on the run's loop.
@@ -71,10 +71,11 @@ class Gateway:
         self.sessions: set[str] = set()
         """Ids of the sessions that are connected."""
 
-    # Threads of the caller's own: both take a while.
-
     def open(self, listen: str) -> str:
-        """Open the vehicle's router at an endpoint; returns it with its port. Raises TransportError."""
+        """Open the vehicle's router at an endpoint; returns it with its port. Raises TransportError.
+
+        For a thread of its own: it takes a while.
+        """
         session = open_local_router(listen, self._router_settings())
         self._session = session
         endpoint = router_endpoint(session)
@@ -98,13 +99,6 @@ class Gateway:
             }
         auth = {} if settings.users is None else {"auth": {"usrpwd": {"dictionary_file": str(settings.users)}}}
         return {"transport": {**({"link": link} if link else {}), **auth}}
-
-    def close(self) -> None:
-        """Close the router, with all that is connected to it."""
-        session, self._session = self._session, None
-        if session is not None:
-            with suppress(zenoh.ZError):
-                session.close()  # type: ignore[no-untyped-call]
 
     # Threads of Zenoh's.
 
@@ -131,7 +125,17 @@ class Gateway:
         who = f"{event.transport.zid} ({_name_of(event.transport.whatami)})"
         self._tell("session", (who, event.kind == zenoh.SampleKind.PUT))
 
-    # The run's loop: from the programs.
+    # The run's loop.
+
+    async def close(self) -> None:
+        """Close the router, with all that is connected to it."""
+        session, self._session = self._session, None
+        self._declared, self._watches = {}, []
+        if session is not None:
+            with suppress(zenoh.ZError):
+                await asyncio.to_thread(session.close)
+
+    # From the programs.
 
     def take(self, what: str, item: Any) -> Message | None:
         """Take what `hear` was told, but for reports; returns the message that is to be sent, if any."""
@@ -171,7 +175,7 @@ class Gateway:
         """Return the tokens of the vehicle's programs, to be told again, if there are any."""
         return CrossingTokens(tuple(sorted(self._tokens))) if self._tokens else None
 
-    # The run's loop: to the programs.
+    # To the programs.
 
     def receive(self, sender: str, payload: bytes, time_ns: int) -> None:
         """Give the programs what a frame carries. Raises ValueError for bytes that a fault has changed."""

@@ -142,7 +142,7 @@ class Gateways:
             self._say_hello(node, failure=str(error))
             return
         if self._vehicles.get(node) is not vehicle:  # a fault was faster
-            await asyncio.to_thread(vehicle.gateway.close)
+            await vehicle.gateway.close()
             return
         self._write_endpoints()
         self._say_hello(node)
@@ -226,7 +226,29 @@ class Gateways:
         vehicle = self._vehicles.pop(node, None)
         if vehicle is not None:
             vehicle.on_air = False
-            self._closing[node] = asyncio.ensure_future(asyncio.to_thread(vehicle.gateway.close))
+            self._closing[node] = asyncio.ensure_future(vehicle.gateway.close())
+
+    def restart_endpoints(self, down_s: float) -> None:
+        """Close the routers of all vehicles, and open them again at their endpoints after so long."""
+        self._spawn(self._restart_endpoints(down_s))
+
+    async def _restart_endpoints(self, down_s: float) -> None:
+        gateways = {node: vehicle.gateway for node, vehicle in self._vehicles.items()}
+        await asyncio.gather(*(gateway.close() for gateway in gateways.values()))
+        await asyncio.sleep(down_s)
+        for node, gateway in gateways.items():
+            if self._gateway_of(node) is not gateway:  # a fault has ended it meanwhile
+                continue
+            try:
+                await asyncio.to_thread(gateway.open, self.endpoints[node])
+            except VnetError as error:
+                self._tell("ended", node, Exit(1, str(error)))
+        time_ns = max(self._time_ns(), 0)
+        self._emulation.folder.event(time_ns, EventKind.router_restarted, None, down_s=down_s)
+
+    def _gateway_of(self, node: str) -> Gateway | None:
+        vehicle = self._vehicles.get(node)
+        return None if vehicle is None else vehicle.gateway
 
     async def close(self) -> None:
         """Close all gateways, and wait for what was told to end."""

@@ -547,6 +547,9 @@ class LiveProcesses(Processes):
 
     async def _restart(self, fault: Infrastructure) -> None:
         """Announce a restart of the emulator or its router, restart, and wait until all have answered."""
+        if self.gateways is not None and not isinstance(fault, EmulatorRestart):
+            self.gateways.restart_endpoints(fault.down_s)
+            return
         patience_s = fault.down_s + self._emulation.scenario.run.join_timeout_s
         for node in self._connected_nodes():
             self.say(node, wire.Await(patience_s))

@@ -245,7 +245,7 @@ class LiveSession:
     def _answer(self, verb: str, query: zenoh.Query) -> None:
         """Answer an operator, with an error in one line if need be."""
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        own_router = self._options.router is not None
+        own_router = self._options.router is not None or self._processes.gateways is not None
         decided_ns = self._pacing.decided_ns if isinstance(self._pacing, Lockstep) else self._time_ns()
         with query:
             try:

@@ -111,7 +111,7 @@ def two(
                 await asyncio.wait_for(test(vehicles, [one, other]), PATIENCE_S)
         finally:
             for vehicle in vehicles:
-                vehicle.gateway.close()
+                await vehicle.gateway.close()
 
     asyncio.run(run())
 
