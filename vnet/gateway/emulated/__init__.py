@@ -82,7 +82,7 @@ async def main(node: Node) -> None:
         raise ProgramError('vnet.gateway.emulated needs run.pacing = "lockstep": in real time Zenoh itself runs')
     options = Options.of(node.options)
     vehicle = Vehicle(node, options.keys, options.query_s)
-    background = [Task(each, loop=loop) for each in (vehicle.receive(), vehicle.tell_fixes())]
+    background = [Task(each, loop=loop) for each in vehicle.tasks()]
     programs = [[word.replace("{id}", node.id) for word in words] for words in options.commands]
     try:
         if len(programs) == 1:

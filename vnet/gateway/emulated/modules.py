@@ -121,10 +121,16 @@ class ProgramModules:
         self.modules["__main__"] = main
         code, file, package = self._find_main(words)
         vars(main).update(__builtins__=self._builtins, __file__=file, __package__=package)
-        exec(code, vars(main))
+        leave: SystemExit | None = None
+        try:
+            exec(code, vars(main))
+        except SystemExit as raised:
+            leave = raised
         self.load("threading")._shutdown()
         for function in reversed(self.at_exit):
             function()
+        if leave is not None:
+            raise leave
 
     def _find_main(self, words: Sequence[str]) -> tuple[Any, str, str | None]:
         """Return code, file and package of the program, and set `sys.argv` and `sys.path` for it."""
@@ -305,31 +311,32 @@ class ProgramModules:
             return time.gmtime(unix() if at is None else at)
 
         clocks = {time.CLOCK_REALTIME: unix_ns}
-        return Facade(
-            time,
-            time=unix,
-            time_ns=unix_ns,
-            monotonic=seconds,
-            monotonic_ns=ns,
-            perf_counter=seconds,
-            perf_counter_ns=ns,
-            process_time=lambda: 0.0,  # computing costs no emulated time
-            process_time_ns=lambda: 0,
-            thread_time=lambda: 0.0,
-            thread_time_ns=lambda: 0,
-            clock_gettime=lambda clock: clocks.get(clock, ns)() / NS_PER_S,
-            clock_gettime_ns=lambda clock: clocks.get(clock, ns)(),
-            sleep=sleep,
-            gmtime=utc,
-            localtime=utc,
-            ctime=lambda at=None: time.asctime(utc(at)),
-            asctime=lambda at=None: time.asctime(at or utc()),
-            strftime=lambda form, at=None: time.strftime(form, at or utc()),
-            timezone=0,
-            altzone=0,
-            daylight=0,
-            tzname=("UTC", "UTC"),
-        )
+        own: dict[str, Any] = {
+            "time": unix,
+            "time_ns": unix_ns,
+            "monotonic": seconds,
+            "monotonic_ns": ns,
+            "perf_counter": seconds,
+            "perf_counter_ns": ns,
+            "process_time": lambda: 0.0,  # computing costs no emulated time
+            "process_time_ns": lambda: 0,
+            "thread_time": lambda: 0.0,
+            "thread_time_ns": lambda: 0,
+            "clock_gettime": lambda clock: clocks.get(clock, ns)() / NS_PER_S,
+            "clock_gettime_ns": lambda clock: clocks.get(clock, ns)(),
+            "sleep": sleep,
+            "gmtime": utc,
+            "localtime": utc,
+            "ctime": lambda at=None: time.asctime(utc(at)),
+            "asctime": lambda at=None: time.asctime(at or utc()),
+            "strftime": lambda form, at=None: time.strftime(form, at or utc()),
+            "timezone": 0,
+            "altzone": 0,
+            "daylight": 0,
+            "tzname": ("UTC", "UTC"),
+        }
+        # As those of `time`, they make no methods of classes that have them.
+        return Facade(time, **{name: partial(each) if callable(each) else each for name, each in own.items()})
 
     def _datetime(self) -> ModuleType:
         node = self.node

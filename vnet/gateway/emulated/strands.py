@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
+import threading
 import traceback
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
@@ -303,6 +304,8 @@ class Threads:
             get_ident=number_of_thread,
             get_native_id=number_of_thread,
             stack_size=lambda size=0: 0,
+            _excepthook=_thread_failed,
+            _ExceptHookArgs=threading.ExceptHookArgs,
             exit=sys.exit,
             interrupt_main=lambda signum=2: None,
             _count=lambda: self._alive,
@@ -322,6 +325,12 @@ def number_of_thread() -> int:
     """Return the number of the present strand, 0 in a callback of the event loop."""
     strand = current_strand()
     return 0 if strand is None else strand.number
+
+
+def _thread_failed(failed: threading.ExceptHookArgs) -> None:
+    """Stand for `threading.excepthook`; a strand that is ended leaves no message."""
+    if isinstance(failed.exc_value, Exception):
+        fail(failed.exc_value)
 
 
 def fail(error: Exception, place: str = "in a thread") -> None:

@@ -7,7 +7,7 @@ matches the keys of the radio is sent by it, too, in the frames of `vnet/gateway
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -36,7 +36,7 @@ from vnet.gateway.frames import (
     CrossingQuery,
     CrossingReply,
     CrossingSample,
-    CrossingToken,
+    CrossingTokens,
     Fragments,
     Message,
     Reassembly,
@@ -44,7 +44,9 @@ from vnet.gateway.frames import (
     decode_fragment,
     decode_message,
 )
+from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
 from vnet.node import Fix, Node
+from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:
     from vnet.gateway.emulated.sessions import Query, Session
@@ -95,8 +97,8 @@ class Vehicle:
         self._tokens: list[Entity] = []
         self._watchers: list[Entity] = []
         """Subscribers of tokens."""
-        self._heard_tokens: dict[tuple[str, str], zenoh.KeyExpr] = {}
-        """Tokens of other vehicles, by vehicle and key."""
+        self._heard_tokens = HeardTokens(TOKEN_PERIODS * node.period_ns)
+        self._has_tokens = asyncio.Event()
         self._takers: dict[str, list[Entity]] = {}
         self._crossing: dict[str, bool] = {}
         self._queries: dict[int, Asking] = {}
@@ -287,17 +289,18 @@ class Vehicle:
 
     def tokens(self, key: zenoh.KeyExpr) -> list[zenoh.KeyExpr]:
         """Return the keys of tokens that are there, each once: this vehicle's first."""
-        keys = [each.key for each in self._tokens] + list(self._heard_tokens.values())
-        return [each for text, each in {str(each): each for each in keys}.items() if each.intersects(key)]
+        keys = dict.fromkeys(str(each.key) for each in self._tokens) | self._heard_tokens.keys
+        return [key_of(each) for each in keys if key_of(each).intersects(key)]
 
     def _token_changed(self, key: zenoh.KeyExpr, alive: bool) -> None:
         if self.crosses(str(key)):
-            self._send(CrossingToken(str(key), alive))
+            self._send_tokens()
+            self._has_tokens.set()
         self._tell_watchers(key, alive)
 
     def _tell_watchers(self, key: zenoh.KeyExpr, alive: bool) -> None:
         text = str(key)
-        if not alive and self.tokens(key) and any(str(each) == text for each in self.tokens(key)):
+        if not alive and text in map(str, self.tokens(key)):
             return  # another of its name is there
         for watcher in self._watchers:
             if watcher.key.intersects(key) and alive != (text in watcher.live):
@@ -305,13 +308,29 @@ class Vehicle:
                 if watcher.sink is not None:
                     watcher.sink.push(token_sample(key, alive))
 
-    def _hear_token(self, sender: str, token: CrossingToken) -> None:
-        key = key_of(token.key)
-        if token.alive:
-            self._heard_tokens[sender, token.key] = key
-        elif self._heard_tokens.pop((sender, token.key), None) is None:
-            return
-        self._tell_watchers(key, token.alive)
+    async def tell_tokens(self) -> None:
+        """Tell the tokens once a period while there are any, and forget those of vehicles that are not heard."""
+        period_s = self.node.period_ns / NS_PER_S
+        while True:
+            await self._has_tokens.wait()
+            await asyncio.sleep(period_s)
+            for key, _ in self._heard_tokens.expire(self.node.now_ns):
+                self._tell_watchers(key_of(key), alive=False)
+            if any(self.crosses(str(each.key)) for each in self._tokens):
+                self._send_tokens()
+            elif not self._heard_tokens.keys:
+                self._has_tokens.clear()
+
+    def _send_tokens(self) -> None:
+        keys = dict.fromkeys(str(each.key) for each in self._tokens)
+        self._send(CrossingTokens(tuple(key for key in keys if self.crosses(key))))
+
+    def _hear_tokens(self, sender: str, tokens: CrossingTokens) -> None:
+        for text in tokens.keys:
+            key_of(text)  # which raises for what is no key
+        for text, alive in self._heard_tokens.hear(sender, tokens.keys, self.node.now_ns):
+            self._tell_watchers(key_of(text), alive)
+        self._has_tokens.set()
 
     # The radio.
 
@@ -331,6 +350,10 @@ class Vehicle:
             for packet in self.node.radio.drain():
                 self._hear(packet.sender, packet.payload, only_tokens=True)
             self._hears.set()
+
+    def tasks(self) -> list[Coroutine[Any, Any, None]]:
+        """Return what is to run beside the programs."""
+        return [self.receive(), self.tell_fixes(), self.tell_tokens()]
 
     async def receive(self) -> None:
         """Take what the radio delivers to the sessions, from the first entity on that could take it."""
@@ -354,8 +377,8 @@ class Vehicle:
                 for entity in self._takers_of(str(sample.key_expr)):
                     if entity.is_remote and entity.sink is not None:
                         entity.sink.push(sample)
-            elif isinstance(message, CrossingToken):
-                self._hear_token(sender, message)
+            elif isinstance(message, CrossingTokens):
+                self._hear_tokens(sender, message)
             elif isinstance(message, CrossingQuery) and not only_tokens:
                 self._answer(sender, message)
             elif isinstance(message, CrossingReply):
