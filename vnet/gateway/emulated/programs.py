@@ -12,7 +12,7 @@ import zenoh.ext
 import zenoh.handlers
 
 from vnet.errors import ProgramError
-from vnet.gateway.emulated import sessions, values
+from vnet.gateway.emulated import advanced, sessions, values
 from vnet.gateway.emulated.modules import ProgramModules
 from vnet.gateway.emulated.strands import run_strand
 from vnet.gateway.emulated.values import Outlet, refused
@@ -71,6 +71,20 @@ EMULATED = (
     *(sessions.Scout, sessions.Session, sessions.SessionInfo, values.SourceInfo, sessions.Subscriber),
     values.ZenohId,
 )
+EXTENDED = (
+    "AdvancedPublisher",
+    "AdvancedSubscriber",
+    "CacheConfig",
+    "HistoryConfig",
+    "Miss",
+    "MissDetectionConfig",
+    "RecoveryConfig",
+    "RepliesConfig",
+    "SampleMissListener",
+    "declare_advanced_publisher",
+    "declare_advanced_subscriber",
+)
+"""Names of `zenoh.ext` that are emulated; the others of it are Zenoh's own."""
 
 
 def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, ModuleType]:
@@ -93,19 +107,23 @@ def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, 
         Handler=values.Handler,
         RingChannel=values.RingChannel,
     )
+    ext = ModuleType("zenoh.ext")
+    vars(ext).update({name: value for name, value in vars(zenoh.ext).items() if not name.startswith("_")})
+    vars(ext).update({name: getattr(advanced, name) for name in EXTENDED})
     package = ModuleType("zenoh")
     vars(package).update({name: getattr(zenoh, name) for name in ZENOHS_OWN})
     vars(package).update({each.__name__: each for each in EMULATED})
     vars(package).update({name: refused(name, reason) for name, reason in REFUSED.items()})
     vars(package).update(
         __path__=[],
+        ext=ext,
         handlers=handlers,
         open=open_session,
         scout=scout,
         try_init_log_from_env=lambda: None,
         init_log_from_env_or=lambda level: None,
     )
-    return {"zenoh": package, "zenoh.handlers": handlers}
+    return {"zenoh": package, "zenoh.ext": ext, "zenoh.handlers": handlers}
 
 
 async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:

@@ -75,6 +75,11 @@ class Declared:
         self._is_declared = False
         self._end()
 
+    def undeclare_if_declared(self) -> None:
+        """Undeclare it unless it has been."""
+        if self._is_declared:
+            self.undeclare()
+
     def _end(self) -> None:
         """Do what undeclaring is."""
 
@@ -162,10 +167,7 @@ class Watcher(Subscriber):
 
     def __init__(self, session: Session, key: Any, handler: Any, history: bool) -> None:
         super().__init__(session, key, handler, None)
-        for token in session.vehicle.tokens(self._entity.key):
-            self._entity.live.add(str(token))
-            if history and self._entity.sink is not None:
-                self._entity.sink.push(token_sample(token, alive=True))
+        session.vehicle.tell_present(self._entity, history)
 
 
 class LivelinessToken(Declared):

@@ -292,6 +292,13 @@ class Vehicle:
         keys = dict.fromkeys(str(each.key) for each in self._tokens) | self._heard_tokens.keys
         return [key_of(each) for each in keys if key_of(each).intersects(key)]
 
+    def tell_present(self, watcher: Entity, history: bool = True) -> None:
+        """Tell a new subscriber of tokens which are there, or have it take them as told."""
+        for token in self.tokens(watcher.key):
+            watcher.live.add(str(token))
+            if history and watcher.sink is not None:
+                watcher.sink.push(token_sample(token, alive=True))
+
     def _token_changed(self, key: zenoh.KeyExpr, alive: bool) -> None:
         if self.crosses(str(key)):
             self._send_tokens()
