@@ -18,8 +18,8 @@ from tests.support.zenoh_steps import Step, interpret
 from vnet.transport.session import router_endpoint
 
 SESSIONS = 3
-TIMEOUT_S = 30.0
-"""Only against hanging for ever."""
+REPEAT_S = 1.0
+"""Wait for an answer before the question is repeated."""
 
 PROGRAM = f"""
 import json, sys, time, zenoh
@@ -37,21 +37,25 @@ class Network:
     """Sessions of Zenoh itself at one router, on loopback."""
 
     def __init__(self) -> None:
+        patient = {"drop": {"wait_before_drop": 10_000_000}}  # in µs: a slow machine loses nothing
+        transport = {"link": {"tx": {"queue": {"congestion_control": patient}}}}
         config = {
             "mode": "router",
+            "transport": transport,
             "listen": {"endpoints": ["tcp/127.0.0.1:0"]},
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
             "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
         }
         self._router = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
-        client = {"mode": "client", "connect": {"endpoints": [router_endpoint(self._router)]}}
+        client: dict[str, Any] = {"mode": "client", "connect": {"endpoints": [router_endpoint(self._router)]}}
+        client["transport"] = transport
         client["scouting"] = {"multicast": {"enabled": False}}
         self.sessions = [zenoh.open(zenoh.Config.from_json5(json.dumps(client))) for _ in range(SESSIONS)]
         self._numbers = count()
         self._arrived = threading.Condition()
         self._seen: dict[str, int] = {}
         for receiver, session in enumerate(self.sessions):
-            session.declare_subscriber("barrier/*", lambda sample, receiver=receiver: self._see(receiver, sample))
+            session.declare_subscriber("@barrier/*", lambda sample, receiver=receiver: self._see(receiver, sample))
         self._reach()
 
     def _see(self, receiver: int, sample: zenoh.Sample) -> None:
@@ -62,12 +66,16 @@ class Network:
     def _reach(self) -> None:
         """Wait until each session is heard by each."""
         number = next(self._numbers)
-        wanted = {f"{receiver} barrier/{sender}" for sender in range(SESSIONS) for receiver in range(SESSIONS)}
+        wanted = {f"{receiver} @barrier/{sender}" for sender in range(SESSIONS) for receiver in range(SESSIONS)}
+
+        def reached() -> bool:
+            return all(self._seen.get(each, -1) >= number for each in wanted)
+
         with self._arrived:
-            while not all(self._seen.get(each, -1) >= number for each in wanted):
+            while not reached():  # the first time before all have heard of the subscribers
                 for sender, session in enumerate(self.sessions):
-                    session.put(f"barrier/{sender}", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
-                assert self._arrived.wait(TIMEOUT_S)
+                    session.put(f"@barrier/{sender}", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+                self._arrived.wait_for(reached, REPEAT_S)
 
     def settle(self) -> None:
         """Wait until what was done has taken effect at all sessions: it goes before what follows on each link."""

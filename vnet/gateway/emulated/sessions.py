@@ -167,7 +167,8 @@ class Watcher(Subscriber):
 
     def __init__(self, session: Session, key: Any, handler: Any, history: bool) -> None:
         super().__init__(session, key, handler, None)
-        session.vehicle.tell_present(self._entity, history)
+        if history:
+            session.vehicle.tell_present(self._entity)
 
 
 class LivelinessToken(Declared):

@@ -76,8 +76,8 @@ class Entity:
     """Whether it takes what comes from elsewhere."""
     is_complete: bool = False
     eid: int = 0
-    live: set[str] = field(default_factory=set)
-    """Keys of the tokens that a subscriber of tokens has been told of."""
+    told: set[str] = field(default_factory=set)
+    """Keys of living tokens of which a subscriber of tokens has been told."""
 
 
 class Vehicle:
@@ -192,7 +192,7 @@ class Vehicle:
         takers = self._takers_of(key)
         if to_others:
             stamped = sample
-            if sample.timestamp is None:
+            if sample.timestamp is None and sample.kind == zenoh.SampleKind.PUT:  # as routers do
                 stamped = msgspec.structs.replace(sample, timestamp=self.new_timestamp(self.zid))
             if self.crosses(key):
                 self._send(crossing_of(stamped))
@@ -292,11 +292,11 @@ class Vehicle:
         keys = dict.fromkeys(str(each.key) for each in self._tokens) | self._heard_tokens.keys
         return [key_of(each) for each in keys if key_of(each).intersects(key)]
 
-    def tell_present(self, watcher: Entity, history: bool = True) -> None:
-        """Tell a new subscriber of tokens which are there, or have it take them as told."""
+    def tell_present(self, watcher: Entity) -> None:
+        """Tell a new subscriber of tokens which are there."""
         for token in self.tokens(watcher.key):
-            watcher.live.add(str(token))
-            if history and watcher.sink is not None:
+            watcher.told.add(str(token))
+            if watcher.sink is not None:
                 watcher.sink.push(token_sample(token, alive=True))
 
     def _token_changed(self, key: zenoh.KeyExpr, alive: bool) -> None:
@@ -310,8 +310,8 @@ class Vehicle:
         if not alive and text in map(str, self.tokens(key)):
             return  # another of its name is there
         for watcher in self._watchers:
-            if watcher.key.intersects(key) and alive != (text in watcher.live):
-                (watcher.live.add if alive else watcher.live.discard)(text)
+            if watcher.key.intersects(key) and not (alive and text in watcher.told):
+                (watcher.told.add if alive else watcher.told.discard)(text)
                 if watcher.sink is not None:
                     watcher.sink.push(token_sample(key, alive))
 
