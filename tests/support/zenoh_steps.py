@@ -108,8 +108,8 @@ class _Interpreter:
         session.delete(key, allowed_destination=self._locality(destination))
 
     def _publish(self, session: Any, key: str, payload: str) -> None:
-        # At a key of its own: Zenoh 1.10.2 loses what a session puts at the key of a publisher that it has undeclared,
-        # at subscribers that come later.
+        # At a key of its own: what a session puts at the key of a publisher that it has undeclared is lost by
+        # Zenoh 1.10.2 at subscribers that come later.
         with session.declare_publisher(f"published/{key}", encoding="text/json") as publisher:
             self._settle()
             publisher.put(payload)

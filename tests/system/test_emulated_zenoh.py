@@ -3,9 +3,11 @@
 import json
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 import zenoh
@@ -55,7 +57,7 @@ class Network:
         self._arrived = threading.Condition()
         self._seen: dict[str, int] = {}
         for receiver, session in enumerate(self.sessions):
-            session.declare_subscriber("@barrier/*", lambda sample, receiver=receiver: self._see(receiver, sample))
+            session.declare_subscriber("@barrier/*", partial(self._see, receiver))
         self._reach()
 
     def _see(self, receiver: int, sample: zenoh.Sample) -> None:
@@ -84,7 +86,7 @@ class Network:
 
     def close(self) -> None:
         for session in (*self.sessions, self._router):
-            session.close()
+            session.close()  # type: ignore[no-untyped-call]
 
 
 @pytest.fixture(scope="module")
