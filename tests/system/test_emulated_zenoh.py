@@ -106,10 +106,8 @@ def emulated(steps: Sequence[Step]) -> list[str]:
         scenario = {
             "run": {"duration_s": 60.0, "settle_s": 0.0},
             "network": {"vehicles": 1},
-            "program": {
-                "entry": "vnet.gateway.emulated:main",
-                "options": {"command": command, "keys": ["none"]},
-            },
+            "radio": {"keys": ["none"]},
+            "program": {"kind": "zenoh", "command": command},
         }
         run = emulator.simulate(scenario, out=folder / "run")
         lines = (run.folder / "logs/v01.log").read_text().splitlines()

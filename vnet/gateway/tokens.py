@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-TOKEN_PERIODS = 5
-"""Periods after which the tokens of a vehicle that has not been heard are gone."""
+TOKEN_PERIODS = 3
+"""Times `liveliness_s` without word of a vehicle's tokens after which they are gone."""
 
 
 class HeardTokens:

@@ -24,12 +24,11 @@ def drive(tmp_path: Path) -> Drive:
             path = tmp_path / f"program{index}.py"
             path.write_text(dedent(text))
             commands.append(["python", str(path), "{id}"])
-        options = {"command": commands, **more.pop("options", {})}
         scenario = {
             "run": {"duration_s": duration_s, "settle_s": 0.0, "seed": 1, **more.pop("run", {})},
             "network": {"vehicles": vehicles},
             "radio": {"range_m": 1e5, "loss": loss, **more.pop("radio", {})},
-            "program": {"entry": "vnet.gateway.emulated:main", "options": options},
+            "program": {"kind": "zenoh", "command": commands, **more.pop("program", {})},
             **more,
         }
         return emulator.simulate(scenario, out=tmp_path / f"run{len(list(tmp_path.iterdir()))}")

@@ -7,7 +7,7 @@ matches the keys of the radio is sent by it, too, in the frames of `vnet/gateway
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -44,16 +44,15 @@ from vnet.gateway.frames import (
     decode_fragment,
     decode_message,
 )
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY
 from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
 from vnet.node import Fix, Node
+from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:
     from vnet.gateway.emulated.sessions import Query, Session
 
-OWN_KEYS = "vnet/"
-"""Prefix of keys that never cross the radio."""
-FIX_KEY, REPORT_KEY = f"{OWN_KEYS}fix", f"{OWN_KEYS}report"
 MOST_KEYS = 4096
 """Keys of samples for which it is remembered where they go."""
 LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
@@ -83,12 +82,12 @@ class Entity:
 class Vehicle:
     """The sessions of one vehicle, and its radio."""
 
-    def __init__(self, node: Node, keys: tuple[str, ...], query_s: float) -> None:
+    def __init__(self, node: Node, keys: Sequence[str], query_s: float, liveliness_s: float) -> None:
         self.node = node
         self.zid = ZenohId.of(node.id, node.incarnation, "router")
         self.sessions: list[Session] = []
         self._keys = [zenoh.KeyExpr(key) for key in keys]
-        self._query_s = query_s
+        self._query_s, self._liveliness_s = query_s, liveliness_s
         self._loop = asyncio.get_running_loop()
         self._fragments = Fragments(node.radio.max_payload)
         self._reassembly = Reassembly()
@@ -97,7 +96,7 @@ class Vehicle:
         self._tokens: list[Entity] = []
         self._watchers: list[Entity] = []
         """Subscribers of tokens."""
-        self._heard_tokens = HeardTokens(TOKEN_PERIODS * node.period_ns)
+        self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * liveliness_s * NS_PER_S))
         self._has_tokens = asyncio.Event()
         self._takers: dict[str, list[Entity]] = {}
         self._crossing: dict[str, bool] = {}
@@ -316,11 +315,10 @@ class Vehicle:
                     watcher.sink.push(token_sample(key, alive))
 
     async def tell_tokens(self) -> None:
-        """Tell the tokens once a period while there are any, and forget those of vehicles that are not heard."""
-        period_s = self.node.period_ns / NS_PER_S
+        """Tell the tokens again while there are any, and forget those of vehicles that are not heard."""
         while True:
             await self._has_tokens.wait()
-            await asyncio.sleep(period_s)
+            await asyncio.sleep(self._liveliness_s)
             for key, _ in self._heard_tokens.expire(self.node.now_ns):
                 self._tell_watchers(key_of(key), alive=False)
             if any(self.crosses(str(each.key)) for each in self._tokens):
@@ -329,8 +327,8 @@ class Vehicle:
                 self._has_tokens.clear()
 
     def _send_tokens(self) -> None:
-        keys = dict.fromkeys(str(each.key) for each in self._tokens)
-        self._send(CrossingTokens(tuple(key for key in keys if self.crosses(key))))
+        keys = {str(each.key) for each in self._tokens}
+        self._send(CrossingTokens(tuple(sorted(key for key in keys if self.crosses(key)))))
 
     def _hear_tokens(self, sender: str, tokens: CrossingTokens) -> None:
         for text in tokens.keys:
@@ -347,9 +345,13 @@ class Vehicle:
         except TooLargeError as error:
             self.node.log(str(error), "error")
             return
+        radio = self.node.radio
         for payload in payloads:
-            with suppress(StopIteration):
-                self.node.radio.broadcast(payload).send(None)  # which never waits
+            if isinstance(message, CrossingReply) and radio.acknowledges and message.to != self.node.id:
+                Task(radio.send(message.to, payload), loop=self._loop)
+            else:
+                with suppress(StopIteration):
+                    radio.broadcast(payload).send(None)  # which never waits
 
     def _listen(self) -> None:
         """Have the radio's packets wake this vehicle from now on; of what it has heard before tokens count."""
