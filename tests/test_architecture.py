@@ -41,6 +41,7 @@ VNET_LAYERS = (
     ("vnet.node",),
     ("vnet.transport",),
     ("vnet.runtime",),
+    ("vnet.gateway",),
 )
 BASIS = ("vnet.errors", "vnet.types", "vnet.units", "vnet.bounded")
 MOST_LINES = 1000

@@ -11,6 +11,7 @@ EXTRA_OF = {
     "cvxpy": "sdp",
     "daqp": "cooperative",
     "distributed": "dask",
+    "greenlet": "zenoh-sim",
     "gymnasium": "rl",
     "hypothesis": "hypothesis",
     "libsumo": "sumo",

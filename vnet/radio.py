@@ -93,6 +93,7 @@ class Radio:
         max_payload: largest payload of a frame in bytes.
         max_power_dbm: largest transmit power in dBm, which is the default; None where the radio has no powers.
         rates_mbps: bit rates in Mbit/s that a frame may have; none where they cannot be chosen.
+        acknowledges: whether frames to a single vehicle are acknowledged, as `send` needs it.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class Radio:
         self.max_power_dbm = abilities.max_power_dbm
         self.rates_mbps = tuple(abilities.rates_mbps)
         self.inbox: Mailbox[Packet] = Mailbox()
-        self._acknowledges = abilities.acknowledges
+        self.acknowledges = abilities.acknowledges
         self._next_send = 0
         self._sends: dict[int, asyncio.Future[SendResult]] = {}
         self._unknown: set[int] = set()
@@ -136,7 +137,7 @@ class Radio:
         arguments and exceptions are those of `broadcast`; raise ValueError also without `[radio.mac]`, and for a
         `to` that is no other vehicle's name. A name that no vehicle has is not acknowledged, with 0 attempts.
         """
-        if not self._acknowledges:
+        if not self.acknowledges:
             raise ValueError(
                 f"send({shown(to)}, …): only with [radio.mac] a frame is acknowledged; use broadcast()"
             )

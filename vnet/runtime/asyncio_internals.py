@@ -33,6 +33,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
 from types import CoroutineType, FrameType
 from typing import Any, cast
+from weakref import WeakKeyDictionary
 
 MOST_CLOSINGS = 10
 """Times that a coroutine is told to close that awaits something in answer."""
@@ -225,12 +226,24 @@ def _private(owner: object) -> Any:
     return owner
 
 
+_greenlets: WeakKeyDictionary[asyncio.Task[Any], Any] = WeakKeyDictionary()
+"""The greenlet that a task drives, of tasks that are threads of a program."""
+
+
+def note_greenlet(greenlet: object) -> None:
+    """Note that the present task drives `greenlet`: where the greenlet is suspended, the task is."""
+    if (task := asyncio.current_task()) is not None:
+        _greenlets[task] = greenlet
+
+
 def suspended_in(task: asyncio.Task[Any]) -> Iterator[FrameType]:
     """Yield the frames in which a suspended task waits, from its outermost coroutine inwards."""
     coroutine: Any = task.get_coro()
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
         yield frame
         coroutine = coroutine.cr_await
+    frame = getattr(_greenlets.get(task), "gr_frame", None)
+    yield from reversed([each for each, _ in traceback.walk_stack(frame)] if frame else [])
 
 
 def stacks_of(tasks: Sequence[asyncio.Task[Any]]) -> str:

@@ -248,6 +248,11 @@ def _thread_failed(failed: threading.ExceptHookArgs) -> None:
         _before[1](failed)
 
 
+def tell_failed_thread(owner: Node | None, error: BaseException, place: str) -> None:
+    """Tell of an exception of `owner` that has ended one of its threads, which is none of the interpreter's."""
+    _taken(owner, error, place)
+
+
 def _taken(owner: Node | None, error: BaseException, place: str, job: Job | None = None) -> bool:
     reference = None if owner is None else _takers.get(owner)
     taker = None if reference is None else reference()

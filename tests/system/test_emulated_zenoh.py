@@ -1,0 +1,165 @@
+"""Zenoh on virtual time against Zenoh: the same programs are told the same."""
+
+import json
+import threading
+from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+import zenoh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import emulator
+from tests.support.paths import ROOT
+from tests.support.zenoh_steps import Step, interpret
+from vnet.transport.session import router_endpoint
+
+SESSIONS = 3
+REPEAT_S = 1.0
+"""Wait for an answer before the question is repeated."""
+
+PROGRAM = f"""
+import json, sys, time, zenoh
+sys.path.insert(0, {str(ROOT)!r})
+from tests.support.zenoh_steps import interpret
+with open(sys.argv[1]) as file:
+    steps = json.load(file)
+sessions = [zenoh.open(zenoh.Config()) for _ in range({SESSIONS})]
+for line in interpret(zenoh, sessions, steps, lambda: time.sleep(0.01)):
+    print("told", repr(line))
+"""
+
+
+class Network:
+    """Sessions of Zenoh itself at one router, on loopback."""
+
+    def __init__(self) -> None:
+        patient = {"drop": {"wait_before_drop": 10_000_000}}  # in µs: a slow machine loses nothing
+        transport = {"link": {"tx": {"queue": {"congestion_control": patient}}}}
+        config = {
+            "mode": "router",
+            "transport": transport,
+            "listen": {"endpoints": ["tcp/127.0.0.1:0"]},
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+            "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+        }
+        self._router = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        client: dict[str, Any] = {"mode": "client", "connect": {"endpoints": [router_endpoint(self._router)]}}
+        client["transport"] = transport
+        client["scouting"] = {"multicast": {"enabled": False}}
+        self.sessions = [zenoh.open(zenoh.Config.from_json5(json.dumps(client))) for _ in range(SESSIONS)]
+        self._numbers = count()
+        self._arrived = threading.Condition()
+        self._seen: dict[str, int] = {}
+        for receiver, session in enumerate(self.sessions):
+            session.declare_subscriber("@barrier/*", partial(self._see, receiver))
+        self._reach()
+
+    def _see(self, receiver: int, sample: zenoh.Sample) -> None:
+        with self._arrived:
+            self._seen[f"{receiver} {sample.key_expr}"] = int(bytes(sample.payload))
+            self._arrived.notify_all()
+
+    def _reach(self) -> None:
+        """Wait until each session is heard by each."""
+        number = next(self._numbers)
+        wanted = {f"{receiver} @barrier/{sender}" for sender in range(SESSIONS) for receiver in range(SESSIONS)}
+
+        def reached() -> bool:
+            return all(self._seen.get(each, -1) >= number for each in wanted)
+
+        with self._arrived:
+            while not reached():  # the first time before all have heard of the subscribers
+                for sender, session in enumerate(self.sessions):
+                    session.put(f"@barrier/{sender}", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+                self._arrived.wait_for(reached, REPEAT_S)
+
+    def settle(self) -> None:
+        """Wait until what was done has taken effect at all sessions: it goes before what follows on each link."""
+        for _ in range(3):
+            self._reach()
+
+    def close(self) -> None:
+        for session in (*self.sessions, self._router):
+            session.close()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture(scope="module")
+def network() -> Iterator[Network]:
+    network = Network()
+    yield network
+    network.close()
+
+
+def emulated(steps: Sequence[Step]) -> list[str]:
+    """Return what the sessions of one vehicle are told."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "program.py").write_text(PROGRAM)
+        (folder / "steps.json").write_text(json.dumps(steps))
+        command = ["python", str(folder / "program.py"), str(folder / "steps.json")]
+        scenario = {
+            "run": {"duration_s": 60.0, "settle_s": 0.0},
+            "network": {"vehicles": 1},
+            "radio": {"keys": ["none"]},
+            "program": {"kind": "zenoh", "command": command},
+        }
+        run = emulator.simulate(scenario, out=folder / "run")
+        lines = (run.folder / "logs/v01.log").read_text().splitlines()
+        assert "v01 finished" in lines, lines
+        return [line.removeprefix("told ") for line in lines if line.startswith("told ")]
+
+
+KEYS = st.sampled_from(["a", "a/b", "a/b/c", "a/c", "b/c", "b/@x/c"])
+EXPRESSIONS = st.sampled_from(
+    ["a", "a/b", "a/*", "a/**", "**", "*/b", "**/c", "a/b*/c", "b/@x/*", "b/@x/**", "a/$*c"]
+)
+SESSION = st.integers(0, SESSIONS - 1)
+ORIGINS = st.sampled_from(["ANY", "SESSION_LOCAL", "REMOTE"])
+NAMES = st.sampled_from(["one", "two", "three"])
+TEXTS = st.sampled_from(["", "x", "payload"])
+STEPS = st.one_of(
+    st.tuples(st.just("subscribe"), SESSION, NAMES.map("sub {}".format), EXPRESSIONS, ORIGINS),
+    st.tuples(
+        st.just("queryable"),
+        SESSION,
+        NAMES.map("queryable {}".format),
+        EXPRESSIONS,
+        st.booleans(),
+        ORIGINS,
+        st.lists(KEYS, max_size=3, unique=True),
+    ),
+    st.tuples(st.just("token"), SESSION, NAMES.map("token {}".format), KEYS),
+    st.tuples(st.just("watch"), SESSION, NAMES.map("watch {}".format), EXPRESSIONS, st.booleans()),
+    st.tuples(
+        st.just("undeclare"),
+        SESSION,
+        st.tuples(st.sampled_from(["sub", "queryable", "token", "watch"]), NAMES).map(" ".join),
+    ),
+    st.tuples(st.just("put"), SESSION, KEYS | EXPRESSIONS, TEXTS, ORIGINS, st.booleans()),
+    st.tuples(st.just("delete"), SESSION, KEYS, ORIGINS),
+    st.tuples(st.just("publish"), SESSION, KEYS, TEXTS),
+    st.tuples(
+        st.just("get"),
+        SESSION,
+        EXPRESSIONS | KEYS.map("{}?x=1;y".format),
+        st.sampled_from(["BEST_MATCHING", "ALL", "ALL_COMPLETE"]),
+        st.sampled_from(["AUTO", "NONE", "MONOTONIC", "LATEST"]),
+        ORIGINS,
+        st.none() | TEXTS,
+    ),
+    st.tuples(st.just("tokens"), SESSION, EXPRESSIONS),
+)
+
+
+@given(st.lists(STEPS, max_size=12))
+@settings(max_examples=40, deadline=None, derandomize=True)
+def test_sessions_are_told_the_same(network: Network, steps: list[Step]) -> None:
+    told = [repr(line) for line in interpret(zenoh, network.sessions, steps, network.settle)]
+    network.settle()
+    assert emulated(steps) == told

@@ -1,0 +1,303 @@
+"""Threads, clocks and chance of programs on virtual time."""
+
+import re
+from pathlib import Path
+
+from tests.vnet.gateway.conftest import Drive, events, log
+
+
+def test_threads_wait_on_emulated_time_for_queues_locks_events_and_each_other(drive: Drive) -> None:
+    run = drive(
+        """
+        import queue, threading, time
+        started = time.monotonic()
+        items, lock, over = queue.Queue(maxsize=1), threading.RLock(), threading.Event()
+
+        def produce():
+            for number in range(3):
+                time.sleep(0.25)
+                items.put(number)
+            over.set()
+
+        def consume():
+            while not (over.is_set() and items.empty()):
+                try:
+                    with lock, lock:
+                        print(items.get(timeout=0.2), f"{time.monotonic() - started:.2f}")
+                except queue.Empty:
+                    print("nothing", f"{time.monotonic() - started:.2f}")
+
+        threads = [threading.Thread(target=each, name=each.__name__) for each in (produce, consume)]
+        for thread in threads:
+            thread.start()
+        print([thread.name for thread in threading.enumerate()])
+        for thread in threads:
+            thread.join()
+        print("joined", f"{time.monotonic() - started:.2f}", threading.active_count())
+        """
+    )
+    assert run.verdict == "valid"
+    assert log(run)[:-1] == [
+        "['MainThread', 'produce', 'consume']",
+        "nothing 0.20",
+        "0 0.25",
+        "nothing 0.45",
+        "1 0.50",
+        "nothing 0.70",
+        "2 0.75",
+        "joined 0.75 1",
+    ]
+    assert "finished" in log(run)[-1]
+
+
+def test_conditions_barriers_semaphores_timers_locals_and_pools_work(drive: Drive) -> None:
+    run = drive(
+        """
+        import concurrent.futures, threading, time
+        barrier, condition, local = threading.Barrier(3), threading.Condition(), threading.local()
+        slots, order = threading.BoundedSemaphore(2), []
+
+        def work(number):
+            local.number = number
+            with slots:
+                time.sleep(0.1)
+            barrier.wait()
+            with condition:
+                order.append(local.number)
+                condition.notify_all()
+            return number * number
+
+        with concurrent.futures.ThreadPoolExecutor(3) as pool:
+            jobs = [pool.submit(work, number) for number in range(3)]
+            with condition:
+                condition.wait_for(lambda: len(order) == 3)
+            print(sorted(order), [job.result() for job in jobs], hasattr(local, "number"))
+        print(list(concurrent.futures.ThreadPoolExecutor().map(work, range(3))), round(time.perf_counter(), 3))
+        timer = threading.Timer(0.3, print, ["timer"])
+        timer.start()
+        """
+    )
+    assert log(run)[:-1] == ["[0, 1, 2] [0, 1, 4] False", "[0, 1, 4] 0.4", "timer"]
+
+
+def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -> None:
+    run = drive(
+        """
+        import asyncio, time
+
+        async def tick(name, period):
+            for number in range(2):
+                await asyncio.sleep(period)
+                print(name, number, round(asyncio.get_running_loop().time(), 2))
+
+        async def main():
+            loop = asyncio.get_running_loop()
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(tick("a", 0.1))
+                tasks.create_task(tick("b", 0.15))
+                await asyncio.to_thread(time.sleep, 0.05)
+                print("slept", round(loop.time(), 2))
+            queue = asyncio.Queue()
+            await loop.run_in_executor(None, lambda: loop.call_soon_threadsafe(queue.put_nowait, "put"))
+            print(await queue.get())
+            try:
+                await asyncio.wait_for(queue.get(), 0.5)
+            except TimeoutError:
+                print("timeout", round(loop.time(), 2))
+            time.sleep(0.1)
+            endless = asyncio.create_task(asyncio.sleep(1e6))
+            print(len(asyncio.all_tasks()))
+            return endless
+
+        left = asyncio.run(main())
+        print(left.cancelled(), round(time.monotonic(), 2))
+        loop = asyncio.new_event_loop()
+        print(loop.run_until_complete(asyncio.sleep(0.1, "slept")))
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError as error:
+            print(error)
+        """
+    )
+    assert log(run)[:-1] == [
+        "slept 0.05",
+        "a 0 0.1",
+        "b 0 0.15",
+        "a 1 0.2",
+        "b 1 0.3",
+        "put",
+        "timeout 0.8",
+        "2",
+        "True 0.9",
+        "slept",
+        "no running event loop",
+    ]
+
+
+CHANCE = """
+    import datetime, logging, os, random, secrets, sys, time, uuid
+    print(random.random(), random.Random().random(), random.SystemRandom().random(), random.Random(1).random())
+    print(uuid.uuid4(), uuid.uuid1(), os.urandom(4), secrets.token_hex(4))
+    print(time.time(), datetime.datetime.now(), datetime.date.today(), time.strftime("%H:%M:%S"), time.ctime())
+    print(isinstance(datetime.datetime.now(), datetime.datetime), sys.argv[1:], __name__, os.getpid())
+    logging.basicConfig(format="%(asctime)s %(name)s %(message)s", level=logging.INFO)
+    time.sleep(0.5)
+    logging.getLogger("car").info("moves")
+    """
+
+
+def test_chance_is_the_vehicles_own_and_replays(drive: Drive) -> None:
+    first, again = (drive(CHANCE, vehicles=2) for _ in range(2))
+    lines = log(first)
+    assert lines == log(again)
+    assert all(mine != its for mine, its in zip(lines[:2], log(first, "v02")[:2], strict=True))
+    assert lines[0].endswith("0.13436424411240122"), "a seed of one's own is kept"
+    assert lines[2].startswith("1735689600.0 2025-01-01 00:00:00 2025-01-01 00:00:00 Wed Jan  1 00:00:00 2025")
+    assert lines[3] == "True ['v01'] __main__ 1"
+    assert lines[4] == "2025-01-01 00:00:00,500 car moves"
+
+
+def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path: Path) -> None:
+    package = tmp_path / "cars"
+    package.mkdir()
+    (package / "__init__.py").write_text("from . import parts\nfrom .parts import *\nname = None\n")
+    (package / "parts.py").write_text(
+        "from __future__ import annotations\n"
+        "import time, dataclasses\nfrom typing import ClassVar, get_type_hints\n"
+        "__all__ = ['Wheel', 'wait']\n"
+        "@dataclasses.dataclass\nclass Wheel:\n    size: int\n    kind: ClassVar[str] = 'round'\n"
+        "def wait():\n    time.sleep(0.5)\n    return get_type_hints(Wheel)['size']\n"
+    )
+    run = drive(
+        """
+        import importlib, sys
+        import cars.parts
+        assert cars.name is None
+        cars.name = sys.argv[1]
+        print(cars.wait(), importlib.import_module("cars").name, cars.Wheel(3), "cars.parts" in sys.modules)
+        """,
+        vehicles=2,
+    )
+    assert log(run)[0] == "<class 'int'> v01 Wheel(size=3) True"
+    assert log(run, "v02")[0] == "<class 'int'> v02 Wheel(size=3) True"
+
+
+def test_sys_exit_finishes_or_crashes_by_its_status(drive: Drive) -> None:
+    text = "import atexit, sys\natexit.register(print, 'bye')\nsys.exit(int(sys.argv[1] == 'v02') * 3)"
+    run = drive(text, vehicles=2)
+    (crash,) = events(run, "crashed")
+    assert crash["node"] == "v02"
+    assert "3" in crash["error"]
+    assert log(run)[0] == "bye"
+
+
+def test_crash_of_main_is_a_crash_of_its_vehicle_with_its_line(drive: Drive) -> None:
+    run = drive("import time\ntime.sleep(0.5)\n1 / 0\n")
+    (crash,) = events(run, "crashed")
+    assert (crash["node"], crash["place"]) == ("v01", "program0.py:3")
+    assert "ZeroDivisionError" in crash["error"]
+    assert any("program0.py" in line for line in log(run))
+
+
+def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None:
+    run = drive(
+        """
+        import threading, time
+        threading.Thread(target=lambda: 1 / 0).start()
+        time.sleep(0.5)
+        print("goes on")
+        """
+    )
+    (told,) = events(run, "exception")
+    assert "ZeroDivisionError" in told["error"]
+    assert "in a thread" in told["place"]
+    assert "goes on" in log(run)
+
+
+def test_deadlock_of_threads_is_found_with_their_lines(drive: Drive) -> None:
+    run = drive(
+        """
+        import threading, time
+        locks = threading.Lock(), threading.Lock()
+
+        def take(first, second):
+            with first:
+                time.sleep(0.1)
+                with second:
+                    pass
+
+        threads = [threading.Thread(target=take, args=pair) for pair in (locks, locks[::-1])]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        """
+    )
+    (told,) = events(run, "exception")
+    assert "DeadlockError" in told["error"]
+    assert "program0.py:8" in told["place"]
+
+
+def test_program_that_does_not_let_time_advance_is_ended(drive: Drive) -> None:
+    run = drive("import time\nwhile True:\n    time.sleep(0)\n")
+    assert [event["node"] for event in events(run, "spun")] == ["v01"]
+
+
+def test_end_of_the_run_leaves_with_blocks_and_runs_finally(drive: Drive) -> None:
+    run = drive(
+        """
+        import threading, time, zenoh
+
+        def wait():
+            try:
+                time.sleep(1e6)
+            except Exception:
+                print("never")
+            finally:
+                print("thread over")
+
+        thread = threading.Thread(target=wait)
+        thread.start()
+        with zenoh.open(zenoh.Config()) as session:
+            try:
+                while True:
+                    try:
+                        time.sleep(1e3)
+                    except Exception:
+                        print("never")
+            finally:
+                print("main over")
+                thread.join()
+        """
+    )
+    assert run.verdict == "valid"
+    assert log(run) == ["thread over", "main over"] or log(run) == ["main over", "thread over"]
+
+
+def test_kill_pause_and_restart_of_a_vehicle(drive: Drive) -> None:
+    text = """
+    import threading, time
+    def tick(name):
+        try:
+            while True:
+                print(name, round(time.time() % 100, 2), flush=True)
+                time.sleep(0.5)
+        finally:
+            print("never")
+    threading.Thread(target=tick, args=("thread",), daemon=True).start()
+    tick("main")
+    """
+    faults = [
+        {"kind": "kill", "at_s": 0.7, "duration_s": 1.0, "nodes": ["v01"]},
+        {"kind": "pause", "at_s": 2.4, "duration_s": 1.0, "nodes": ["v01"]},
+    ]
+    run = drive(text, duration_s=4.0, fault=faults)
+    times = [float(found[1]) for line in log(run) if (found := re.match(r"main (\S+)", line))]
+    assert times == [0.0, 0.5, 1.7, 2.2, 3.4, 3.9]
+    assert log(run).count("never") == 2, "a killed program does nothing more; the last one is ended"
+
+
+def test_clock_error_of_a_vehicle_is_that_of_its_program(drive: Drive) -> None:
+    faults = [{"kind": "skew", "at_s": 0.0, "duration_s": 1.0, "nodes": ["v01"], "offset_ms": 250.0}]
+    run = drive("import time\ntime.sleep(0.5)\nprint(round(time.time() % 100, 3))", fault=faults)
+    assert log(run)[0] == "0.75"

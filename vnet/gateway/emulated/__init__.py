@@ -1,0 +1,70 @@
+"""Python programs that `import zenoh`, unmodified, as vehicles on virtual time.
+
+`main` is the program of a vehicle that runs others: they find a `zenoh` of the vehicle's own, whose sessions talk
+by its radio, and `time`, `threading` and other modules on the emulated clock. docs/how-to/zenoh.md is the guide.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shlex
+from collections.abc import Sequence
+from itertools import combinations
+
+import zenoh
+
+from vnet import extras
+from vnet.errors import ProgramError, shown
+from vnet.gateway.keys import RADIO_KEYS
+from vnet.node import Node
+from vnet.runtime.own_asyncio import Task
+from vnet.runtime.virtual_time import VirtualTimeLoop
+
+PYTHON = ("python", "python3")
+"""First words of a command that can run here."""
+
+
+async def main(node: Node) -> None:
+    """Run the programs of a scenario with `program.kind = "zenoh"` until all have ended.
+
+    `node.options` has their commands (`command`), `keys` that cross the radio, and `query_s` and `liveliness_s`.
+    """
+    extras.require('program.kind = "zenoh" in lockstep', "greenlet", error=ProgramError)
+    from vnet.gateway.emulated.programs import run_program
+    from vnet.gateway.emulated.vehicle import Vehicle
+
+    loop = asyncio.get_running_loop()
+    if not isinstance(loop, VirtualTimeLoop):
+        raise ProgramError('vnet.gateway.emulated needs run.pacing = "lockstep": in real time Zenoh itself runs')
+    commands: Sequence[Sequence[str]] = node.options["command"]
+    for words in commands:
+        if len(words) < 2 or words[0] not in PYTHON:
+            raise ProgramError(
+                f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT … or "
+                'python -m MODULE …; any other needs run.pacing = "realtime"'
+            )
+    keys = node.options.get("keys", RADIO_KEYS)
+    _check_keys(keys)
+    vehicle = Vehicle(node, keys, node.options.get("query_s", 1.0), node.options.get("liveliness_s", 1.0))
+    background = [Task(each, loop=loop) for each in vehicle.tasks()]
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            for words in commands:
+                tasks.create_task(run_program(vehicle, [word.replace("{id}", node.id) for word in words]))
+    except* Exception as errors:
+        raise errors.exceptions[0] from None
+    finally:
+        for task in background:
+            task.cancel()
+
+
+def _check_keys(keys: Sequence[str]) -> None:
+    """Raise ProgramError for what is no key expression, and for two of which a sample could be sent twice."""
+    for key in keys:
+        try:
+            zenoh.KeyExpr(key)
+        except zenoh.ZError:
+            raise ProgramError(f"radio.keys: {shown(key)} is no key expression of Zenoh") from None
+    for one, other in combinations(keys, 2):
+        if zenoh.KeyExpr(one).intersects(other):
+            raise ProgramError(f"radio.keys: {shown(one)} and {shown(other)} overlap")

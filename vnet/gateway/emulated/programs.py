@@ -1,0 +1,137 @@
+"""The module `zenoh` that a program of a vehicle imports, and the program's run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from types import ModuleType
+from typing import Any
+
+import zenoh
+import zenoh.ext
+import zenoh.handlers
+
+from vnet.errors import ProgramError
+from vnet.gateway.emulated import advanced, sessions, values
+from vnet.gateway.emulated.modules import ProgramModules
+from vnet.gateway.emulated.strands import run_strand
+from vnet.gateway.emulated.values import Outlet, refused
+from vnet.gateway.emulated.vehicle import Vehicle
+
+REFUSED = {
+    "Link": "sessions of the emulator have no transport",
+    "LinkEvent": "sessions of the emulator have no transport",
+    "LinkEventsListener": "sessions of the emulator have no transport",
+    "TimestampContext": "a frame of the radio carries no stack of timestamps",
+    "TimestampStack": "a frame of the radio carries no stack of timestamps",
+    "TimestampStackRecord": "a frame of the radio carries no stack of timestamps",
+    "Transport": "sessions of the emulator have no transport",
+    "TransportEvent": "sessions of the emulator have no transport",
+    "TransportEventsListener": "sessions of the emulator have no transport",
+}
+"""Names of Zenoh that virtual time does not have, and why."""
+ZENOHS_OWN = (
+    "CongestionControl",
+    "ConsolidationMode",
+    "Encoding",
+    "InterceptionPoint",
+    "KeyExpr",
+    "Locality",
+    "NTP64",
+    "Parameters",
+    "Priority",
+    "QueryConsolidation",
+    "QueryTarget",
+    "Reliability",
+    "ReplyKeyExpr",
+    "SampleKind",
+    "Selector",
+    "SetIntersectionLevel",
+    "Timestamp",
+    "TimestampId",
+    "TimestampInstrumentation",
+    "TimestampInstrumentationBuilder",
+    "WhatAmI",
+    "WhatAmIMatcher",
+    "ZBytes",
+    "ZError",
+)
+"""Values that Python can construct, and which are the same everywhere."""
+EMULATED = (
+    *(
+        sessions.CancellationToken,
+        values.Config,
+        values.EntityGlobalId,
+        values.Handler,
+        values.Hello,
+        sessions.Liveliness,
+    ),
+    *(sessions.LivelinessToken, sessions.MatchingListener, values.MatchingStatus, sessions.Publisher),
+    *(sessions.Querier, sessions.Query, sessions.Queryable, values.Reply, values.ReplyError, values.Sample),
+    *(sessions.Scout, sessions.Session, sessions.SessionInfo, values.SourceInfo, sessions.Subscriber),
+    values.ZenohId,
+)
+EXTENDED = (
+    "AdvancedPublisher",
+    "AdvancedSubscriber",
+    "CacheConfig",
+    "HistoryConfig",
+    "Miss",
+    "MissDetectionConfig",
+    "RecoveryConfig",
+    "RepliesConfig",
+    "SampleMissListener",
+    "declare_advanced_publisher",
+    "declare_advanced_subscriber",
+)
+"""Names of `zenoh.ext` that are emulated; the others of it are Zenoh's own."""
+
+
+def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, ModuleType]:
+    """Return the package `zenoh` of a program, by the names of its modules."""
+    outlet = Outlet(new_number)
+
+    def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
+        if timestamp_callback is not None:
+            raise zenoh.ZError("timestamp_callback is not available on virtual time")
+        return sessions.Session(vehicle, outlet, config)
+
+    def scout(handler: Any = None, what: Any = None, config: zenoh.Config | None = None) -> sessions.Scout:
+        return sessions.Scout(vehicle, outlet, handler, what)
+
+    handlers = ModuleType("zenoh.handlers")
+    vars(handlers).update(
+        Callback=zenoh.handlers.Callback,
+        DefaultHandler=values.DefaultHandler,
+        FifoChannel=values.FifoChannel,
+        Handler=values.Handler,
+        RingChannel=values.RingChannel,
+    )
+    ext = ModuleType("zenoh.ext")
+    vars(ext).update({name: value for name, value in vars(zenoh.ext).items() if not name.startswith("_")})
+    vars(ext).update({name: getattr(advanced, name) for name in EXTENDED})
+    package = ModuleType("zenoh")
+    vars(package).update({name: getattr(zenoh, name) for name in ZENOHS_OWN})
+    vars(package).update({each.__name__: each for each in EMULATED})
+    vars(package).update({name: refused(name, reason) for name, reason in REFUSED.items()})
+    vars(package).update(
+        __path__=[],
+        ext=ext,
+        handlers=handlers,
+        open=open_session,
+        scout=scout,
+        try_init_log_from_env=lambda: None,
+        init_log_from_env_or=lambda level: None,
+    )
+    return {"zenoh": package, "zenoh.ext": ext, "zenoh.handlers": handlers}
+
+
+async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
+    """Run a program of a vehicle to its end. Raises what ends it, ProgramError for a status other than 0."""
+    modules = ProgramModules(vehicle.node)
+    modules.modules.update(zenoh_modules(vehicle, modules.threads.new_number))
+    try:
+        await run_strand(modules.threads.strand(partial(modules.run, words)))
+    except SystemExit as leave:
+        if leave.code not in (None, 0):
+            raise ProgramError(f"{' '.join(words)} ended with {leave.code!r}") from leave

@@ -1,0 +1,339 @@
+"""Threads of a blocking program as tasks of its node: a call that blocks becomes an await on the node's loop.
+
+Each thread is a *strand*, a greenlet that a task drives. Where the thread blocks, its greenlet switches to the task
+with what it waits for; the task yields that to the event loop, as any coroutine does, and switches back with the
+result. One strand runs at a time, until it blocks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+import traceback
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine, Generator
+from contextvars import Context, copy_context
+from functools import partial
+from itertools import count
+from types import ModuleType, coroutine
+from typing import Any, TypeVar
+
+from greenlet import GreenletExit, getcurrent, greenlet
+
+from vnet.runtime.asyncio_internals import note_greenlet
+from vnet.runtime.outside_loop import tell_failed_thread
+from vnet.runtime.own_asyncio import Task, present_node
+
+T = TypeVar("T")
+
+MOST_EXITS = 10
+"""Times that a strand is told to end which blocks in answer, or goes on."""
+LONGEST_WAIT_S = 1e9
+"""Largest timeout of a lock in seconds, as `threading.TIMEOUT_MAX`."""
+
+_unending: list[greenlet] = []
+"""Strands that did not end when they were told to: held, as to discard one is to tell it again."""
+
+
+class Strand(greenlet):
+    """A thread, or the greenlet of a coroutine (`is_task`), which alone a blocking call in it blocks."""
+
+    def __init__(
+        self, run: Callable[[], Any], number: int, is_task: bool = False, context: Context | None = None
+    ) -> None:
+        super().__init__(run)
+        self.number = number
+        self.is_task = is_task
+        self.at_end: list[Callable[[], object]] = []
+        self.gr_context = copy_context() if context is None else context
+
+    def begin(self) -> Any:
+        """Run until the strand blocks, and return what it waits for; or to its end, and return its result."""
+        self.parent = getcurrent()
+        return self.switch()
+
+
+@coroutine
+def drive(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
+    """Run a strand that waits for `item` to its end, and return its result."""
+    note_greenlet(strand)
+    while not strand.dead:
+        try:
+            value = yield item
+        except GeneratorExit:
+            _end(strand)
+            raise
+        except BaseException as error:
+            item = strand.throw(error)
+        else:
+            item = strand.switch(value)
+    if isinstance(item, GreenletExit):
+        raise asyncio.CancelledError
+    return item
+
+
+async def run_strand(strand: Strand) -> Any:
+    """Run a strand from its beginning, and return its result."""
+    return await drive(strand, strand.begin())
+
+
+def _end(strand: Strand) -> None:
+    """End a strand whose task is closed, whatever it does in answer."""
+    for _ in range(MOST_EXITS):
+        if strand.dead:
+            return
+        try:
+            strand.throw(GreenletExit())
+        except KeyboardInterrupt:
+            raise
+        except BaseException:  # of what the program does in answer, which nobody hears any more
+            pass
+    _unending.append(strand)
+
+
+def current_strand() -> Strand | None:
+    """Return the strand that runs, None outside of all."""
+    strand = getcurrent()
+    return strand if isinstance(strand, Strand) else None
+
+
+def block_on(awaitable: Awaitable[T]) -> T:
+    """Block the present strand until `awaitable` is done. Raises RuntimeError outside of strands."""
+    strand = getcurrent()
+    if not isinstance(strand, Strand):
+        raise RuntimeError(
+            "a call that blocks, in a callback of the event loop or in a finalizer: on virtual time it can wait in "
+            "a thread or in a coroutine alone"
+        )
+    assert strand.parent is not None
+    switch, steps = strand.parent.switch, awaitable.__await__()
+    try:
+        item = next(steps)
+        while True:
+            try:
+                value = switch(item)
+            except BaseException as error:
+                item = steps.throw(error)
+            else:
+                item = steps.send(value)
+    except StopIteration as stop:
+        return stop.value  # type: ignore[no-any-return]
+    except asyncio.CancelledError:
+        if strand.is_task:
+            raise
+        raise GreenletExit from None  # the vehicle's program is ended: `finally` and `with` run, `except` does not
+
+
+def sleep(seconds: float) -> None:
+    """Block the present strand for so long."""
+    if seconds < 0:
+        raise ValueError("sleep length must be non-negative")
+    block_on(asyncio.sleep(seconds))
+
+
+class Lock:
+    """`threading.Lock`; who has waited longest gets it."""
+
+    def __init__(self) -> None:
+        self._locked = False
+        self._waiters: deque[asyncio.Future[bool]] = deque()
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """Take the lock; block until it is there, or for `timeout` seconds. Return whether it was taken."""
+        if timeout != -1 and (not blocking or timeout < 0):
+            text = "timeout value must be a non-negative number"
+            raise ValueError(text if blocking else "can't specify a timeout for a non-blocking call")
+        if not self._locked:
+            self._locked = True
+            return True
+        return blocking and self._wait(timeout)
+
+    def _wait(self, timeout: float) -> bool:
+        loop = asyncio.get_running_loop()
+        waiter: asyncio.Future[bool] = loop.create_future()
+        self._waiters.append(waiter)
+        timer = None if timeout == -1 else loop.call_later(timeout, _settle, waiter, False)
+        try:
+            return block_on(waiter)
+        except BaseException:
+            if waiter.done() and not waiter.cancelled() and waiter.result():
+                self.release()
+            raise
+        finally:
+            if timer is not None:
+                timer.cancel()
+            if waiter in self._waiters:
+                self._waiters.remove(waiter)
+
+    def release(self) -> None:
+        """Give the lock to who waits for it, if anybody does. Raises RuntimeError unless it is taken."""
+        if not self._locked:
+            raise RuntimeError("release unlocked lock")
+        while self._waiters:
+            waiter = self._waiters.popleft()
+            if not waiter.done():
+                waiter.set_result(True)
+                return
+        self._locked = False
+
+    def release_if_locked(self) -> None:
+        """Release it unless it is not taken."""
+        if self._locked:
+            self.release()
+
+    def locked(self) -> bool:
+        """Return whether it is taken."""
+        return self._locked
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def _at_fork_reinit(self) -> None:
+        self.__init__()  # type: ignore[misc]
+
+
+def _settle(waiter: asyncio.Future[bool], result: bool) -> None:
+    if not waiter.done():
+        waiter.set_result(result)
+
+
+class ThreadHandle:
+    """`_thread._ThreadHandle` of Python 3.13 and later."""
+
+    def __init__(self, ident: int | None = None) -> None:
+        self.ident = ident
+        self._done = Lock()
+        self._done.acquire()
+
+    def is_done(self) -> bool:
+        """Return whether the thread has ended."""
+        return not self._done.locked()
+
+    def join(self, timeout: float | None = None) -> None:
+        """Block until the thread has ended."""
+        if self._done.acquire(timeout=-1 if timeout is None or timeout < 0 else timeout):
+            self._done.release()
+
+    def _set_done(self) -> None:
+        self._done.release_if_locked()
+
+
+class Threads:
+    """The threads of one program, and the module `_thread` on which the standard library's `threading` stands."""
+
+    def __init__(self) -> None:
+        self._numbers = count(1)
+        self._alive = 0
+        self._handles: list[ThreadHandle] = []
+
+    def strand(self, run: Callable[[], Any], is_task: bool = False) -> Strand:
+        """Make a strand with a number of its own."""
+        return Strand(run, next(self._numbers), is_task)
+
+    def new_number(self) -> int:
+        """Return the number of a further thread."""
+        return next(self._numbers)
+
+    def green(self, coroutine: Coroutine[Any, Any, T]) -> Coroutine[Any, Any, T]:
+        """Return a coroutine that does as `coroutine`, in which calls may block."""
+        return run_strand(self.strand(partial(block_on, coroutine), is_task=True))
+
+    def start(self, function: Callable[..., Any], args: Any = (), kwargs: Any = None) -> int:
+        """Start a thread, and return its number."""
+        strand = self.strand(partial(self._run, function, args, kwargs or {}))
+        self._alive += 1
+        Task(run_strand(strand), loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
+        return strand.number
+
+    def _run(self, function: Callable[..., Any], args: Any, kwargs: Any) -> None:
+        strand = current_strand()
+        assert strand is not None
+        try:
+            function(*args, **kwargs)
+        except SystemExit:
+            pass
+        except Exception as error:
+            fail(error)
+        finally:
+            self._alive -= 1
+            for end in strand.at_end:
+                end()
+
+    def _set_sentinel(self) -> Lock:
+        lock, strand = Lock(), current_strand()
+        if strand is not None:
+            strand.at_end.append(lock.release_if_locked)
+        return lock
+
+    def _start_joinable(
+        self, function: Callable[[], Any], handle: ThreadHandle | None = None, daemon: bool = True
+    ) -> ThreadHandle:
+        handle = handle or ThreadHandle()
+
+        def run() -> None:
+            try:
+                function()
+            finally:
+                handle._set_done()
+
+        handle.ident = self.start(run)
+        if not daemon:
+            self._handles.append(handle)
+        return handle
+
+    def _shutdown(self) -> None:
+        while self._handles:
+            self._handles.pop().join()
+
+    def module(self) -> ModuleType:
+        """Return the module `_thread`, with the names that `threading` needs in Python 3.11 to 3.13."""
+        module = ModuleType("_thread")
+        vars(module).update(
+            allocate_lock=Lock,
+            allocate=Lock,
+            lock=Lock,
+            LockType=Lock,
+            error=RuntimeError,
+            TIMEOUT_MAX=LONGEST_WAIT_S,
+            start_new_thread=self.start,
+            start_new=self.start,
+            get_ident=number_of_thread,
+            get_native_id=number_of_thread,
+            stack_size=lambda size=0: 0,
+            _excepthook=_thread_failed,
+            _ExceptHookArgs=threading.ExceptHookArgs,
+            exit=sys.exit,
+            interrupt_main=lambda signum=2: None,
+            _count=lambda: self._alive,
+            _set_sentinel=self._set_sentinel,
+            daemon_threads_allowed=lambda: True,
+            _is_main_interpreter=lambda: True,
+            _get_main_thread_ident=lambda: 1,
+            _ThreadHandle=ThreadHandle,
+            _make_thread_handle=ThreadHandle,
+            start_joinable_thread=self._start_joinable,
+            _shutdown=self._shutdown,
+        )
+        return module
+
+
+def number_of_thread() -> int:
+    """Return the number of the present strand, 0 in a callback of the event loop."""
+    strand = current_strand()
+    return 0 if strand is None else strand.number
+
+
+def _thread_failed(failed: threading.ExceptHookArgs) -> None:
+    """Stand for `threading.excepthook`; a strand that is ended leaves no message."""
+    if isinstance(failed.exc_value, Exception):
+        fail(failed.exc_value)
+
+
+def fail(error: Exception, place: str = "in a thread") -> None:
+    """Print an exception that has ended a thread or a callback, and have the run tell of it."""
+    traceback.print_exception(error)
+    tell_failed_thread(present_node(), error, place)

@@ -1,0 +1,415 @@
+"""Values and channels of `import zenoh` on virtual time, beside those of Zenoh's own that Python can construct."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextvars import copy_context
+from functools import lru_cache
+from typing import Any, NoReturn
+
+import msgspec
+import zenoh
+from greenlet import GreenletExit
+from zenoh.handlers import Callback
+
+from vnet.gateway.emulated.strands import Strand, block_on, drive, fail
+from vnet.gateway.frames import CrossingReply, CrossingSample
+from vnet.runtime.own_asyncio import Task
+from vnet.units import NS_PER_S
+
+EID_BITS = 16
+"""Bits of an entity's number: session and entity cross the radio as one number of 64 bits."""
+PRIORITIES = {
+    name: getattr(zenoh.Priority, name)
+    for name in ("REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND")
+}
+CONGESTION_CONTROLS = {name: getattr(zenoh.CongestionControl, name) for name in ("DROP", "BLOCK", "BLOCK_FIRST")}
+
+
+class _Value(msgspec.Struct, frozen=True, eq=False, gc=False):
+    """A value that vehicles share."""
+
+
+class ZenohId(msgspec.Struct, frozen=True, gc=False):
+    """The id of a session."""
+
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.number:x}"
+
+    def __bytes__(self) -> bytes:
+        return self.number.to_bytes(6, "little")
+
+    @classmethod
+    def of(cls, *parts: object) -> ZenohId:
+        """Return the id that these parts give."""
+        digest = hashlib.sha256("/".join(map(str, parts)).encode()).digest()
+        return cls(int.from_bytes(digest[:6]) | 1 << 47)
+
+
+class EntityGlobalId(msgspec.Struct, frozen=True, gc=False):
+    """The id of an entity: that of its session, and its number there."""
+
+    zid: ZenohId
+    eid: int
+
+
+class SourceInfo(msgspec.Struct, frozen=True, gc=False):
+    """The entity that has published a sample, and the sample's number there."""
+
+    source_id: EntityGlobalId
+    source_sn: int
+
+
+class Sample(_Value, frozen=True, eq=False, gc=False):
+    """A sample."""
+
+    key_expr: zenoh.KeyExpr
+    payload: zenoh.ZBytes
+    kind: zenoh.SampleKind
+    encoding: zenoh.Encoding
+    timestamp: zenoh.Timestamp | None = None
+    congestion_control: zenoh.CongestionControl = zenoh.CongestionControl.DROP
+    priority: zenoh.Priority = zenoh.Priority.DATA
+    express: bool = False
+    attachment: zenoh.ZBytes | None = None
+    source_info: SourceInfo | None = None
+
+    @property
+    def timestamp_stack(self) -> None:
+        """None: instrumentation of timestamps is refused."""
+        return
+
+
+class ReplyError(_Value, frozen=True, eq=False, gc=False):
+    """An error in reply to a query."""
+
+    payload: zenoh.ZBytes
+    encoding: zenoh.Encoding
+
+    @property
+    def timestamp_stack(self) -> None:
+        """None: instrumentation of timestamps is refused."""
+        return
+
+
+class Reply(_Value, frozen=True, eq=False, gc=False):
+    """A reply to a query."""
+
+    result: Sample | ReplyError
+    replier_id: EntityGlobalId | None = None
+
+    @property
+    def ok(self) -> Sample | None:
+        """The sample, None of an error."""
+        return self.result if isinstance(self.result, Sample) else None
+
+    @property
+    def err(self) -> ReplyError | None:
+        """The error, None of a sample."""
+        return self.result if isinstance(self.result, ReplyError) else None
+
+
+class Hello(_Value, frozen=True, eq=False, gc=False):
+    """What scouting finds."""
+
+    whatami: zenoh.WhatAmI
+    zid: ZenohId
+    locators: list[str]
+
+
+class MatchingStatus(_Value, frozen=True, eq=False, gc=False):
+    """Whether there is anybody at the other end."""
+
+    matching: bool
+
+
+class _ConfigType(type):
+    def __instancecheck__(cls, instance: object) -> bool:
+        return isinstance(instance, zenoh.Config)
+
+
+class Config(metaclass=_ConfigType):
+    """Zenoh's own configuration; that of the environment is a client's, as that which a gateway gives."""
+
+    def __new__(cls) -> zenoh.Config:  # type: ignore[misc]
+        return zenoh.Config()
+
+    from_file = zenoh.Config.from_file
+    from_json5 = zenoh.Config.from_json5
+    get_json = zenoh.Config.get_json
+    insert_json5 = zenoh.Config.insert_json5
+
+    @classmethod
+    def from_env(cls) -> zenoh.Config:
+        """Return the configuration that the vehicle gives its programs."""
+        return zenoh.Config.from_json5('{"mode": "client"}')
+
+
+def refused(name: str, reason: str) -> type:
+    """Return what stands for a name that virtual time does not have."""
+
+    def refuse(cls: type, *args: object, **options: object) -> NoReturn:
+        raise zenoh.ZError(f"zenoh.{name} is not available on virtual time: {reason}")
+
+    return type(name, (), {"__new__": refuse, "__doc__": f"Refused: {reason}."})
+
+
+# Between samples and what crosses the radio.
+
+
+def timestamp_at(unix_ns: int, zid: ZenohId) -> zenoh.Timestamp:
+    """Return the timestamp of an instant."""
+    return zenoh.Timestamp(zenoh.NTP64(*divmod(unix_ns, NS_PER_S)), bytes(zid))
+
+
+def crossing_of(sample: Sample) -> CrossingSample:
+    """Return what of a sample crosses the radio."""
+    stamp, source, time = sample.timestamp, sample.source_info, None
+    if stamp is not None:
+        ntp = stamp.get_time_as_ntp64()
+        time = ntp.as_secs(), ntp.subsec_nanos(), bytes(stamp.get_id())
+    origin = None
+    if source is not None:
+        origin = source.source_id.zid.number << EID_BITS | source.source_id.eid, source.source_sn
+    return CrossingSample(
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        str(sample.encoding),
+        sample.kind == zenoh.SampleKind.DELETE,
+        None if sample.attachment is None else sample.attachment.to_bytes(),
+        name_of(sample.priority),
+        name_of(sample.congestion_control),
+        sample.express,
+        time,
+        origin,
+    )
+
+
+def name_of(member: zenoh.Priority | zenoh.CongestionControl) -> Any:
+    """Return the name of a member of an enumeration."""
+    return str(member).rpartition(".")[2]
+
+
+@lru_cache(maxsize=1024)
+def key_of(text: str) -> zenoh.KeyExpr:
+    """Return a key expression. Raises ZError."""
+    return zenoh.KeyExpr(text)
+
+
+encoding_of = lru_cache(maxsize=256)(zenoh.Encoding)
+
+
+def sample_of(crossing: CrossingSample) -> Sample:
+    """Return the sample that has crossed the radio. Raises ZError, ValueError or OverflowError for none."""
+    time, origin, source = crossing.time, crossing.source, None
+    if origin is not None:
+        zid = ZenohId(origin[0] >> EID_BITS & (1 << 48) - 1)
+        source = SourceInfo(EntityGlobalId(zid, origin[0] & (1 << EID_BITS) - 1), origin[1])
+    return Sample(
+        key_of(crossing.key),
+        zenoh.ZBytes(crossing.payload),
+        zenoh.SampleKind.DELETE if crossing.is_delete else zenoh.SampleKind.PUT,
+        encoding_of(crossing.encoding),
+        None if time is None else zenoh.Timestamp(zenoh.NTP64(*time[:2]), time[2]),
+        CONGESTION_CONTROLS[crossing.congestion],
+        PRIORITIES[crossing.priority],
+        crossing.express,
+        None if crossing.attachment is None else zenoh.ZBytes(crossing.attachment),
+        source,
+    )
+
+
+def result_of(reply: CrossingReply) -> Sample | ReplyError:
+    """Return sample or error of a reply that has crossed the radio. Raises as `sample_of`."""
+    if reply.sample is not None:
+        return sample_of(reply.sample)
+    content, encoding = reply.error or (b"", "")
+    return ReplyError(zenoh.ZBytes(content), zenoh.Encoding(encoding))
+
+
+# Channels.
+
+
+class DefaultHandler:
+    """The default channel, of any length."""
+
+
+class FifoChannel(DefaultHandler):
+    """A channel of any length: a full one would stop Zenoh, and here stops nothing."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+
+
+class RingChannel(DefaultHandler):
+    """A channel that keeps the newest items."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+
+
+class Handler:
+    """The reading end of a channel."""
+
+    def __init__(self, most: int | None = None) -> None:
+        self._items: deque[Any] = deque(maxlen=most)
+        self._waiters: deque[asyncio.Future[None]] = deque()
+        self._closed = False
+
+    def __class_getitem__(cls, item: object) -> type[Handler]:
+        return cls
+
+    def try_recv(self) -> Any:
+        """Return the next item, None if there is none now. Raises ZError if there will be none."""
+        if self._items:
+            return self._items.popleft()
+        if self._closed:
+            raise zenoh.ZError("channel closed")
+        return None
+
+    def recv(self) -> Any:
+        """Return the next item; block until there is one. Raises ZError if there will be none."""
+        while not self._items:
+            if self._closed:
+                raise zenoh.ZError("channel closed")
+            waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            self._waiters.append(waiter)
+            try:
+                block_on(waiter)
+            finally:
+                if waiter in self._waiters:
+                    self._waiters.remove(waiter)
+        return self._items.popleft()
+
+    def __iter__(self) -> Iterator[Any]:
+        return self
+
+    def __next__(self) -> Any:
+        try:
+            return self.recv()
+        except zenoh.ZError:
+            raise StopIteration from None
+
+    # The other end.
+
+    def push(self, item: Any) -> None:
+        """Add an item, and wake who waits longest."""
+        self._items.append(item)
+        if self._waiters:
+            waiter = self._waiters.popleft()
+            if not waiter.done():
+                waiter.set_result(None)
+
+    def close(self) -> None:
+        """Add no more."""
+        self._closed = True
+        for waiter in self._waiters:
+            if not waiter.done():
+                waiter.set_result(None)
+        self._waiters.clear()
+
+
+class CallbackSink:
+    """A callback in a thread of its own, as Zenoh's Python runs it."""
+
+    def __init__(self, callback: Callable[[Any], Any], drop: Callable[[], Any] | None, outlet: Outlet) -> None:
+        self._callback = callback
+        self._drop = drop
+        self._outlet = outlet
+        self._number = outlet.new_number()
+        self._context = copy_context()
+        self._items: deque[Any] = deque()
+        self._runs = self._closed = False
+
+    def push(self, item: Any) -> None:
+        """Have the callback called with an item."""
+        self._items.append(item)
+        if not self._runs:
+            self._runs = True
+            self._outlet.soon(self)
+
+    def close(self) -> None:
+        """Call the callback no more, once it has had all."""
+        if not self._closed:
+            self._closed = True
+            if self._drop is not None and not self._runs:
+                self._runs = True
+                self._outlet.soon(self)
+
+    def run(self) -> None:
+        """Call the callback until it blocks; then a task goes on with it."""
+        strand = Strand(self._work, self._number, context=self._context)
+        item = strand.begin()
+        if not strand.dead:
+            Task(_go_on(strand, item), loop=asyncio.get_running_loop(), name=f"thread {self._number}")
+
+    def _work(self) -> None:
+        try:
+            while self._items:
+                self._call(self._callback, self._items.popleft())
+            if self._closed and self._drop is not None:
+                drop, self._drop = self._drop, None
+                self._call(drop)
+        finally:
+            self._runs = False
+
+    def _call(self, function: Callable[..., Any], *args: Any) -> None:
+        try:
+            function(*args)
+        except GreenletExit:
+            raise
+        except Exception as error:
+            fail(error, "in a callback of Zenoh")
+
+
+async def _go_on(strand: Strand, item: Any) -> None:
+    await drive(strand, item)
+
+
+class Outlet:
+    """What has callbacks of a vehicle run, in the order in which they became due."""
+
+    def __init__(self, new_number: Callable[[], int]) -> None:
+        self.new_number = new_number
+        self._due: list[CallbackSink] = []
+
+    def soon(self, sink: CallbackSink) -> None:
+        """Have a callback run once the present code has blocked or returned."""
+        if not self._due:
+            asyncio.get_running_loop().call_soon(self.run)
+        self._due.append(sink)
+
+    def run(self) -> None:
+        """Run what is due."""
+        due, self._due = self._due, []
+        for sink in due:
+            sink.run()
+
+
+Sink = Handler | CallbackSink
+
+
+def sink_of(handler: Any, outlet: Outlet) -> tuple[Sink, Any, bool]:
+    """Return where items go, the handler that the program sees, and whether they go to a callback alone.
+
+    Raises ValueError for what is no handler.
+    """
+    if handler is None:
+        handler = DefaultHandler()
+    if isinstance(handler, DefaultHandler):
+        channel = Handler(handler.capacity if isinstance(handler, RingChannel) else None)
+        return channel, channel, False
+    seen = None
+    alone = callable(handler)
+    if not alone:
+        if not (isinstance(handler, tuple) and len(handler) == 2 and callable(handler[0])):
+            raise ValueError(f"Invalid handler type {type(handler).__name__}")
+        handler, seen = handler
+    if isinstance(handler, Callback):
+        return CallbackSink(handler.callback, handler.drop, outlet), seen, alone
+    return CallbackSink(handler, None, outlet), seen, alone
