@@ -1,4 +1,4 @@
-"""What Zenoh programs said by radio: the table of their messages, and what became of them by key.
+"""The messages of Zenoh programs on the radio: their table, and their fate by key.
 
 A message is as many frames as the radio's payload asks for. At a receiver it has arrived if each of them has, and
 is lost by the outcome of the first that has not.
@@ -75,7 +75,7 @@ def described(message: Message) -> tuple[str, str, int]:
 
 @dataclass
 class KeyFigures:
-    """What was said under one key, and what became of it at the receivers in range."""
+    """The messages under one key, and their fate at the receivers in range."""
 
     key: str
     kind: str

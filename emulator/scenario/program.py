@@ -171,7 +171,7 @@ class Program(OneProgram):
 
     @property
     def title(self) -> str:
-        """What the vehicles run, for people: the entry, or the commands."""
+        """The programs of the vehicles, for people: the entry, or the commands."""
         return self.entry if self.kind == "vnet" else "; ".join(map(shlex.join, self.commands)) or "Zenoh programs"
 
     @property

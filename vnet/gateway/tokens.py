@@ -12,7 +12,7 @@ class HeardTokens:
     """The tokens of each vehicle that has told them within `lifetime_ns`."""
 
     def __init__(self, lifetime_ns: int) -> None:
-        self._lifetime_ns = lifetime_ns
+        self.lifetime_ns = lifetime_ns
         self._told: dict[str, tuple[int, tuple[str, ...]]] = {}
         """Time of the last frame, and its keys, by vehicle."""
 
@@ -30,7 +30,7 @@ class HeardTokens:
     def expire(self, now_ns: int) -> list[tuple[str, bool]]:
         """Forget vehicles that have not been heard; return the keys that are gone by it."""
         before = self.keys
-        self._told = {sender: told for sender, told in self._told.items() if now_ns - told[0] < self._lifetime_ns}
+        self._told = {sender: told for sender, told in self._told.items() if now_ns - told[0] < self.lifetime_ns}
         return _changes(before, self.keys)
 
 

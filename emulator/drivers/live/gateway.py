@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import secrets
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,6 @@ import zenoh
 
 from emulator.drivers.agent_keys import Hear
 from emulator.scenario.program import ZenohSessions
-from vnet.errors import TransportError
 from vnet.gateway.frames import (
     CrossingQuery,
     CrossingReply,
@@ -32,19 +30,18 @@ from vnet.gateway.frames import (
     Message,
     Reassembly,
 )
-from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
+from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
 from vnet.transport.session import open_local_router, router_endpoint
 from vnet.transport.wire import WireFix
+from vnet.units import NS_PER_S
 
 MOST_SOURCES = 100_000
 """Instances of `SourceInfo` that are kept for samples on their way."""
-TOKEN_PERIODS = 3
-"""Times `liveliness_s` without word of a vehicle's tokens after which they are gone."""
 REMOTE = zenoh.Locality.REMOTE
 
 _sources: OrderedDict[int, zenoh.SourceInfo] = OrderedDict()
 _source_numbers = count()
-_encode = msgspec.msgpack.Encoder().encode
 
 
 class Gateway:
@@ -64,8 +61,7 @@ class Gateway:
         self._reassembly = Reassembly()
         self._declared: dict[str, zenoh.LivelinessToken] = {}
         """Tokens of other vehicles, which are declared at this one's programs."""
-        self._heard_tokens: dict[str, tuple[int, frozenset[str]]] = {}
-        """Emulated time (ns) of the last word of each sender's tokens, and its tokens."""
+        self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * settings.liveliness_s * NS_PER_S))
         self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
         self.sessions: set[str] = set()
@@ -131,6 +127,7 @@ class Gateway:
         """Close the router, with all that is connected to it."""
         session, self._session = self._session, None
         self._declared, self._watches = {}, []
+        self._heard_tokens = HeardTokens(self._heard_tokens.lifetime_ns)
         if session is not None:
             with suppress(zenoh.ZError):
                 await asyncio.to_thread(session.close)
@@ -197,13 +194,12 @@ class Gateway:
             case CrossingReply():
                 self._reply(message)
             case CrossingTokens():
-                self._heard_tokens[sender] = time_ns, frozenset(message.keys)
-                self.renew_tokens(time_ns)
+                self._show_tokens(self._heard_tokens.hear(sender, message.keys, time_ns))
 
     def show_fix(self, fix: WireFix) -> None:
         """Put a fix of the vehicle's receiver at its programs."""
         if self._session is not None:
-            self._session.put(FIX_KEY, _encode(fix_fields(fix)), allowed_destination=REMOTE)
+            self._session.put(FIX_KEY, fix_content(fix.fix()), allowed_destination=REMOTE)
 
     def _show(self, sample: CrossingSample) -> None:
         assert self._session is not None
@@ -257,21 +253,21 @@ class Gateway:
         else:
             query.reply(sample.key, sample.payload, encoding=sample.encoding, **kept)
 
-    def renew_tokens(self, time_ns: int) -> None:
-        """Declare the tokens of which other vehicles have told lately, and no others."""
-        if self._session is None:
-            return
-        oldest_ns = time_ns - math.ceil(TOKEN_PERIODS * self._settings.liveliness_s * 1e9)
-        self._heard_tokens = {
-            sender: told for sender, told in self._heard_tokens.items() if told[1] and told[0] > oldest_ns
-        }
-        there = {key for _, keys in self._heard_tokens.values() for key in keys} - self._tokens
-        for key in self._declared.keys() - there:
-            self._declared.pop(key).undeclare()  # type: ignore[no-untyped-call]
-        for key in sorted(there - self._declared.keys()):
-            # Before the declaration, whose echo comes at once and must not count as a token of this vehicle's own.
-            self._declared[key] = _PENDING
-            self._declared[key] = self._session.liveliness().declare_token(key)
+    def forget_tokens(self, time_ns: int) -> None:
+        """Forget the tokens of vehicles that have not told of any lately."""
+        if self._session is not None:
+            self._show_tokens(self._heard_tokens.expire(time_ns))
+
+    def _show_tokens(self, changes: Sequence[tuple[str, bool]]) -> None:
+        """Declare tokens of other vehicles at the programs, or take them back."""
+        assert self._session is not None
+        for key, is_there in changes:
+            if not is_there:
+                self._declared.pop(key, _PENDING).undeclare()
+            elif key not in self._tokens:
+                # Before the declaration, whose echo must not count as a token of this vehicle's own.
+                self._declared[key] = _PENDING
+                self._declared[key] = self._session.liveliness().declare_token(key)
 
 
 class _Pending:
@@ -318,30 +314,6 @@ def _leaves(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
         name = f"{path}/{key}" if path else key
         leaves += _leaves(value, name) if isinstance(value, dict) else [(name, value)]
     return leaves
-
-
-def fix_fields(fix: WireFix) -> dict[str, Any]:
-    """Return what programs are told of a fix, under `vnet/fix`."""
-    a, b, c, d = fix.covariance_m2
-    return {
-        "time_ns": fix.time_ns,
-        "position_m": fix.position_m,
-        "covariance_m2": ((a, b), (c, d)),
-        "heading_rad": fix.heading_rad,
-        "speed_m_s": fix.speed_m_s,
-    }
-
-
-def check_keys(keys: Sequence[str]) -> None:
-    """Raise TransportError for what is no key expression, and for two of which a sample could be sent twice."""
-    for number, key in enumerate(keys):
-        try:
-            expression = zenoh.KeyExpr(key)
-        except zenoh.ZError:
-            raise TransportError(f"radio.keys: {key!r} is no key expression of Zenoh") from None
-        for other in keys[:number]:
-            if expression.intersects(other):
-                raise TransportError(f"radio.keys: {other!r} and {key!r} overlap")
 
 
 def crossing_of(sample: zenoh.Sample) -> CrossingSample:

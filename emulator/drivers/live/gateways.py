@@ -24,12 +24,12 @@ import msgspec
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit, Launcher
-from emulator.drivers.live.gateway import Gateway, check_keys, session_environment
+from emulator.drivers.live.gateway import Gateway, session_environment
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from vnet.errors import ProgramError, VnetError, first_names, shown
 from vnet.gateway.frames import CrossingReply, Fragments, Message, TooLargeError
-from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY
+from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY, check_keys
 from vnet.reports import Report, Reporter
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
 from vnet.transport import wire
@@ -345,7 +345,7 @@ class Gateways:
 
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
-            vehicle.gateway.renew_tokens(max(self._time_ns(), 0))
+            vehicle.gateway.forget_tokens(max(self._time_ns(), 0))
             if (tokens := vehicle.gateway.tokens()) is not None:
                 self._transmit(vehicle, tokens)
             self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)

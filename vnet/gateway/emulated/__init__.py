@@ -9,13 +9,10 @@ from __future__ import annotations
 import asyncio
 import shlex
 from collections.abc import Sequence
-from itertools import combinations
-
-import zenoh
 
 from vnet import extras
 from vnet.errors import ProgramError, shown
-from vnet.gateway.keys import RADIO_KEYS
+from vnet.gateway.keys import RADIO_KEYS, check_keys
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -44,7 +41,7 @@ async def main(node: Node) -> None:
                 'python -m MODULE …; any other needs run.pacing = "realtime"'
             )
     keys = node.options.get("keys", RADIO_KEYS)
-    _check_keys(keys)
+    check_keys(keys)
     vehicle = Vehicle(node, keys, node.options.get("query_s", 1.0), node.options.get("liveliness_s", 1.0))
     background = [Task(each, loop=loop) for each in vehicle.tasks()]
     try:
@@ -56,15 +53,3 @@ async def main(node: Node) -> None:
     finally:
         for task in background:
             task.cancel()
-
-
-def _check_keys(keys: Sequence[str]) -> None:
-    """Raise ProgramError for what is no key expression, and for two of which a sample could be sent twice."""
-    for key in keys:
-        try:
-            zenoh.KeyExpr(key)
-        except zenoh.ZError:
-            raise ProgramError(f"radio.keys: {shown(key)} is no key expression of Zenoh") from None
-    for one, other in combinations(keys, 2):
-        if zenoh.KeyExpr(one).intersects(other):
-            raise ProgramError(f"radio.keys: {shown(one)} and {shown(other)} overlap")

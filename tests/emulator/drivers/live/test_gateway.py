@@ -9,11 +9,11 @@ import msgspec
 import pytest
 import zenoh
 
-from emulator.drivers.live.gateway import Gateway, check_keys
+from emulator.drivers.live.gateway import Gateway
 from emulator.scenario.program import ZenohSessions
-from vnet.errors import TransportError
+from vnet.errors import ProgramError
 from vnet.gateway.frames import CrossingTokens, Fragments
-from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY
+from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY, check_keys
 from vnet.transport.wire import WireFix
 from vnet.units import NS_PER_S
 
@@ -258,7 +258,7 @@ def test_tokens_of_a_vehicle_are_seen_by_those_in_range_late_ones_too_and_are_go
         late = watch(sessions[1], "car/*")  # history
         assert await late.get() == ("car/a", True)
         second.time_ns = 4 * NS_PER_S  # nothing was heard for longer than three times liveliness_s
-        second.gateway.renew_tokens(second.time_ns)
+        second.gateway.forget_tokens(second.time_ns)
         assert await early.get() == ("car/a", False)
         told = first.gateway.tokens()
         assert told == CrossingTokens(("car/a",))
@@ -325,5 +325,5 @@ def test_sessions_are_counted_by_who_they_are() -> None:
 
 @pytest.mark.parametrize(("keys", "named"), [(("a//b",), "a//b"), (("a/**", "a/b"), "overlap")])
 def test_keys_that_cannot_be_are_named(keys: tuple[str, ...], named: str) -> None:
-    with pytest.raises(TransportError, match=named):
+    with pytest.raises(ProgramError, match=named):
         check_keys(keys)
