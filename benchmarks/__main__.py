@@ -259,6 +259,13 @@ def bench_observer() -> Figures:
     return observer.measure()
 
 
+def bench_zenoh() -> Figures:
+    """Zenoh programs as vehicles, in real time and on virtual time."""
+    from benchmarks import zenoh_programs
+
+    return zenoh_programs.measure()
+
+
 def bench_maps() -> Figures:
     """The lanes within 30 m of 1000 vehicles, on 2 113 km of streets."""
     from benchmarks import maps
@@ -303,6 +310,7 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "realtime": bench_realtime,
     "awaiting": bench_awaiting,
     "observer": bench_observer,
+    "zenoh": bench_zenoh,
 }
 
 
