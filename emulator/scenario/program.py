@@ -179,6 +179,14 @@ class Program(OneProgram):
         """Endpoints of programs of `kind = "zenoh"`."""
         return self.zenoh or ZenohSessions()
 
+    def commands_of(self, node: str) -> list[list[str]]:
+        """Return the commands of a node, with the paths of files that are in `folders`."""
+        return [self._located(words) for words in self.of(node).commands]
+
+    def _located(self, words: Sequence[str]) -> list[str]:
+        files = [next((str(f / word) for f in self.folders if (f / word).is_file()), word) for word in words[:2]]
+        return [*files, *words[2:]]
+
     def of(self, node: str) -> OneProgram:
         """Return the program of `node`."""
         return next((exception for exception in self.exceptions if node in exception.nodes), self)

@@ -283,11 +283,14 @@ class Scenario(Section):
 
     def options_of(self, node: str) -> dict[str, Any]:
         """Return the options of a node's program: those of the scenario, or what a Zenoh program is run with."""
-        program, sessions = self.program.of(node), self.program.sessions
         if self.program.kind != "zenoh":
-            return program.options
-        commands = [list(words) for words in program.commands]
-        own = {"command": commands, "query_s": sessions.query_s, "liveliness_s": sessions.liveliness_s}
+            return self.program.of(node).options
+        sessions = self.program.sessions
+        own = {
+            "command": self.program.commands_of(node),
+            "query_s": sessions.query_s,
+            "liveliness_s": sessions.liveliness_s,
+        }
         return own | ({} if self.radio.keys is None else {"keys": list(self.radio.keys)})
 
     @property

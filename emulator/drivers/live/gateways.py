@@ -283,7 +283,7 @@ class Gateways:
         """Zenoh programs of roadside units have no way to the backbone."""
 
     def _start_commands(self, node: str, vehicle: _Vehicle) -> None:
-        commands = self._program.of(node).commands if self._starts else ()
+        commands = self._program.commands_of(node) if self._starts else []
         folder, endpoint = Path(self._folder.name), self.endpoints[node]
         inherited = {name: value for name, value in os.environ.items() if name != RUNTIME_VARIABLE}
         environment = session_environment(node, endpoint, self._settings, folder, inherited)
@@ -292,26 +292,20 @@ class Gateways:
         try:
             for number, words in enumerate(commands, start=1):
                 name = node if number == 1 else f"{node}~{number}"
-                self._launcher.start_command(name, self._located(words, filled), environment, vehicle.nice)
+                self._launcher.start_command(name, self._filled(words, filled), environment, vehicle.nice)
                 vehicle.names.append(name)
                 self._vehicle_of[name] = node
         except VnetError as error:
             self._say_hello(node, failure=str(error))
 
-    def _located(self, words: Sequence[str], filled: Mapping[str, str]) -> list[str]:
-        """Return the words of a command with all filled in, and its files where they are."""
-        located = []
-        for index, word in enumerate(words):
-            for name, value in filled.items():
-                word = word.replace(name, value)
-            if index < 2:
-                places = [folder / word for folder in self._program.folders]
-                word = next((str(place) for place in places if place.is_file()), word)
-            located.append(word)
-        found = sys.executable if located[0] in PYTHON else shutil.which(located[0])
+    def _filled(self, words: Sequence[str], filled: Mapping[str, str]) -> list[str]:
+        """Return the words of a command with all filled in. Raises ProgramError if there is no such command."""
+        for name, value in filled.items():
+            words = [word.replace(name, value) for word in words]
+        found = sys.executable if words[0] in PYTHON else shutil.which(words[0])
         if found is None:
-            raise ProgramError(f"program.command: {shown(located[0])} is no command")
-        return [found, *located[1:]]
+            raise ProgramError(f"program.command: {shown(words[0])} is no command")
+        return [found, *words[1:]]
 
     def _take_batch(self, vehicle: _Vehicle, batch: wire.Batch) -> None:
         now_ns = max(self._time_ns(), 0)
