@@ -1,0 +1,80 @@
+"""What crosses the radio: messages cut into frames and put together again, whatever is lost or changed."""
+
+import contextlib
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vnet.gateway.frames import (
+    MOST_UNFINISHED,
+    CrossingQuery,
+    CrossingReply,
+    CrossingSample,
+    CrossingTokens,
+    Fragments,
+    Message,
+    Reassembly,
+    TooLargeError,
+)
+
+KEYS = st.text(min_size=1, max_size=20)
+SAMPLES = st.builds(
+    CrossingSample,
+    key=KEYS,
+    payload=st.binary(max_size=400),
+    encoding=KEYS,
+    is_delete=st.booleans(),
+    attachment=st.none() | st.binary(max_size=33),
+    priority=st.sampled_from(["REAL_TIME", "DATA", "BACKGROUND"]),
+    congestion=st.sampled_from(["DROP", "BLOCK", "BLOCK_FIRST"]),
+    express=st.booleans(),
+    time=st.none() | st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 10**9 - 1), st.just(b"\x01")),
+    source=st.none() | st.tuples(st.integers(0, 2**62), st.integers(0, 2**62)),
+)
+MESSAGES: st.SearchStrategy[Message] = st.one_of(
+    SAMPLES,
+    st.builds(CrossingQuery, st.integers(0, 2**62), KEYS, st.binary(max_size=300), st.none(), st.none()),
+    st.builds(CrossingReply, KEYS, st.integers(0, 99), SAMPLES),
+    st.builds(CrossingTokens, st.lists(KEYS, max_size=20).map(tuple)),
+)
+
+
+@given(st.lists(MESSAGES, max_size=8), st.integers(60, 500), st.data())
+def test_a_message_arrives_as_it_was_if_all_its_frames_do_and_else_not_at_all(
+    messages: list[Message], max_payload: int, data: st.DataObject
+) -> None:
+    fragments, reassembly = Fragments(max_payload), Reassembly()
+    expected, heard = [], []
+    for message in messages:
+        frames = list(fragments.of(message))
+        assert all(len(frame) <= max_payload for frame in frames)
+        lost = data.draw(st.sets(st.integers(0, len(frames) - 1), max_size=2))
+        if not lost:
+            expected.append(message)
+        for frame in data.draw(st.permutations([each for n, each in enumerate(frames) if n not in lost])):
+            if (whole := reassembly.take("v01", frame)) is not None:
+                heard.append(whole)
+    assert heard == expected
+
+
+@given(st.binary(max_size=100))
+def test_bytes_of_anybody_are_refused_or_are_a_message(content: bytes) -> None:
+    with contextlib.suppress(msgspec.MsgspecError, LookupError):
+        Reassembly().take("v01", content)
+
+
+def test_unfinished_messages_do_not_fill_the_memory() -> None:
+    fragments, reassembly = Fragments(100), Reassembly()
+    message = CrossingQuery(0, "key", bytes(300), None, None)
+    first = list(fragments.of(message))
+    reassembly.take("v01", first[0])
+    for _ in range(MOST_UNFINISHED):
+        reassembly.take("v01", next(iter(fragments.of(message))))
+    assert [reassembly.take("v01", frame) for frame in first[1:]] == [None] * (len(first) - 1)
+
+
+def test_what_needs_too_many_frames_is_refused_by_its_size() -> None:
+    with pytest.raises(TooLargeError, match=r"317 bytes .*radio.max_payload_bytes = 20"):
+        Fragments(20).of(CrossingQuery(0, "key", bytes(300), None, None))
