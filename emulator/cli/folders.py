@@ -108,7 +108,7 @@ def trace(
         recorded = RecordedRun.open(run)
         if node is not None and node not in recorded.number:
             raise VnetError(f"--node {node}: no such vehicle{did_you_mean(node, recorded.node_ids)}")
-        if decode is not None and recorded.payloads is None:
+        if decode is not None and not recorded.scenario.run.keep_payloads:
             raise VnetError(f"--decode {decode}: {run} has kept no payloads; set run.keep_payloads = true")
         content = _raw if decode is None else _decoded_by(_load(decode))
         end_ns = None if end is None else round(end * NS_PER_S)

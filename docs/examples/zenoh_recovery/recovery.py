@@ -1,8 +1,8 @@
 """Samples and calls of one vehicle over a radio that loses them: what others have of them in the end.
 
-A Zenoh program, written without vnet: `python recovery.py NAME`. Each vehicle publishes a number ten times a second,
-twice: by a plain publisher, and by an advanced one, whose subscribers recover what they miss from its cache. Once a
-second it calls a service of another vehicle. At the end it reports what has come of the numbers and calls of others.
+A Zenoh program, written without vnet: `python recovery.py NAME`. Each vehicle publishes a number ten times a
+second, by a plain publisher, and by an advanced one whose subscribers recover what they miss from its cache. Once a
+second it calls a service of another vehicle. At the end it reports what it has of the numbers and calls.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import zenoh
 from zenoh import ext
 
 PERIOD_S = 0.1
-PUBLISHED = 200
+PUBLISHED = 100
 """Numbers that each vehicle publishes, from the first second on."""
 CACHE = 100
-"""Numbers that an advanced publisher keeps: those of ten seconds."""
+"""Numbers that an advanced publisher keeps: all."""
 LATE_S = 0.09
 """What comes later has been recovered: the radio itself takes a few milliseconds."""
 ATTEMPTS = 3
-END_S = 29.0
+END_S = 19.0
 
 
 class Heard:
@@ -83,7 +83,7 @@ def main(name: str) -> None:
 
     def call_often() -> None:
         callee = "v02" if name == "v01" else "v01"
-        for number in range(20):
+        for number in range(10):
             calls.append(call(session, callee, 1 + number % 2 * (ATTEMPTS - 1)))
             time.sleep(max(0.0, begin_s + number + 2 - time.time()))
 

@@ -101,6 +101,8 @@ class Gateways:
         self._tasks: set[asyncio.Task[None]] = set()
         self._vehicle_of: dict[str, str] = {}
         """Vehicle of each process of a command."""
+        self.on_state: Callable[[str], None] = lambda text: None
+        """Told which endpoints wait for programs."""
         self.endpoints: dict[str, str] = {}
         """The endpoint of each vehicle, which it keeps."""
 
@@ -131,7 +133,12 @@ class Gateways:
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._loop.call_exception_handler({"message": "a gateway has failed", "exception": error})
 
     async def _open(self, node: str, vehicle: _Vehicle) -> None:
         if node in self._closing:
@@ -144,7 +151,7 @@ class Gateways:
         if self._vehicles.get(node) is not vehicle:  # a fault was faster
             await vehicle.gateway.close()
             return
-        self._write_endpoints()
+        self._tell_endpoints()
         self._say_hello(node)
 
     def _listen(self, node: str) -> str:
@@ -157,10 +164,19 @@ class Gateways:
             raise ProgramError(f"program.zenoh.listen = {shown(self._settings.listen)}: no port is left for {node}")
         return f"{address}:{number}"
 
-    def _write_endpoints(self) -> None:
-        path = self._emulation.folder.path
-        if path is not None and len(self.endpoints) == len(self._emulation.world.node_ids):
-            (path / ENDPOINTS).write_text(json.dumps(self.endpoints, indent=1) + "\n")
+    def _tell_endpoints(self) -> None:
+        """Write the endpoints of all vehicles, once they listen, and tell them to whoever starts the programs."""
+        if len(self.endpoints) < sum(node in self._vehicles for node in self._emulation.world.node_ids):
+            return
+        if (path := self._emulation.folder.path) is not None:
+            endpoints = {node: self.endpoints[node] for node in sorted(self.endpoints, key=self._number)}
+            (path / ENDPOINTS).write_text(json.dumps(endpoints, indent=1) + "\n")
+        if not self._starts:
+            where = [f"{node} at {self.endpoints[node]}" for node in self._vehicles]
+            self.on_state(f"waiting for programs of {first_names(where)} ({ENDPOINTS} has all)")
+
+    def _number(self, node: str) -> int:
+        return self._emulation.number[node]
 
     def signal(self, name: str, number: signal.Signals) -> None:
         """Send a signal to the commands of a vehicle."""

@@ -318,6 +318,7 @@ class LiveProcesses(Processes):
             on_state(f"listening at {endpoint}; waiting for {counted(len(hosts), 'host')}: {first_names(hosts)}")
         if self.gateways is not None:
             on_state(f"opening {counted(len(groups), 'endpoint')} for Zenoh programs")
+            self.gateways.on_state = on_state
             self.supervisor.launch(groups)
         elif self._options.launch:
             await self._agents_prepared(deadline)
