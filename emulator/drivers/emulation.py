@@ -23,7 +23,7 @@ from emulator.drivers.backbone import BackboneNetwork, NewsFeed
 from emulator.drivers.orders import Orders
 from emulator.faults.plan import FaultPlan, Nodes, PlannedFault
 from emulator.radio.dot11p import abilities_of
-from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
+from emulator.radio.engine import Deliveries, Delivery, Engine
 from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.radio.topology import connectivity_of
@@ -44,7 +44,7 @@ from emulator.world.neighbours import Links
 from emulator.world.own_sensors import SensorFailure
 from emulator.world.world import Instant, World, components
 from vnet.driving import Action
-from vnet.radio import SendOptions
+from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire
 from vnet.transport.wire import BusyRatios
@@ -314,10 +314,6 @@ def _plain(value: bool | int | float | str) -> bool | int | float | str:
     return value[:LONGEST_TEXT] if isinstance(value, str) else value
 
 
-NO_CHOICES = None, None, None
-"""Power, bit rate and addressee of a frame without any of its own."""
-
-
 @dataclass(frozen=True)
 class PeriodView:
     """State of a run at the end of a period, for progress lines and observers."""
@@ -482,18 +478,13 @@ class Emulation:
         if self._finished:
             return
         self.drive_to(time_ns)
-        frames: dict[str, list[bytes]] = {}
-        options: dict[str, dict[int, SendOptions]] = {}
+        frames: dict[str, list[SentFrame]] = {}
         endings: list[wire.Ending] = []
         unhandled: list[wire.Unhandled] = []
         notes: list[wire.Note] = []
         for part in traffic:
             for frame in part.frames:
-                queued = frames.setdefault(frame.node, [])
-                chosen = SendOptions(frame.power_dbm, frame.rate_mbps, frame.to, frame.number)
-                if chosen[:3] != NO_CHOICES:
-                    options.setdefault(frame.node, {})[len(queued)] = chosen
-                queued.append(frame.payload)
+                frames.setdefault(frame.node, []).append(frame)
             self._reports.extend(report for report in part.reports if self.up[report.node])
             endings.extend(part.endings)
             unhandled.extend(part.unhandled)
@@ -505,7 +496,7 @@ class Emulation:
             self._place(time_ns // self.world.period_ns)
         senders = [node for node in sorted(frames, key=self.number.__getitem__) if self.up[node]]
         for node in self.orders.to_medium(time_ns, senders):
-            self.engine.transmit(time_ns, self.number[node], frames[node], options.get(node, NO_OPTIONS))
+            self.engine.transmit(time_ns, self.number[node], frames[node])
         self.log_book.tell(time_ns, notes, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)

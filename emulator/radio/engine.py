@@ -11,7 +11,7 @@ after it has been sent, over all frames at once that have been sent since the la
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import attrgetter
@@ -55,11 +55,12 @@ from emulator.radio.unicast import Unicasts
 from emulator.scenario.scenario import MIN_LATENCY_NS, Radio, least_latency_ns
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
-from vnet.radio import SendOptions
+from vnet.radio import SentFrame
 from vnet.types import IntArray
 from vnet.units import ANY_TIME, Grid
 
-NO_OPTIONS: Mapping[int, SendOptions] = {}
+NO_CHOICES = None, None, None
+"""Power, bit rate and addressee of a frame without any of its own."""
 
 __all__ = ["Deliveries", "Delivery", "Engine"]
 
@@ -167,18 +168,17 @@ class Engine:
         """Give the next frame of a node this number: a trace lacks the frames that nobody was in range of."""
         self._next_seq[node] = seq
 
-    def transmit(
-        self, time_ns: int, node: int, payloads: Sequence[bytes], options: Mapping[int, SendOptions] = NO_OPTIONS
-    ) -> None:
-        """Enqueue frames that `node` broadcasts at `time_ns`, in order. A node that is down sends nothing.
+    def transmit(self, time_ns: int, node: int, frames: Sequence[SentFrame | bytes]) -> None:
+        """Enqueue frames that `node` sends at `time_ns`, in order. A node that is down sends nothing.
 
-        `options` are those of frames, by their index, that have another power or bit rate than the scenario's.
+        A payload alone is broadcast with the scenario's power and bit rate.
         """
         if not self._topology.is_up(node):
             return
         self._run(time_ns)
         self._topology.advance(time_ns)
-        for index, payload in enumerate(payloads):
+        for asked in frames:
+            payload = asked if isinstance(asked, bytes) else asked.payload
             frame = Frame(
                 sender=node,
                 seq=self._next_seq[node],
@@ -189,8 +189,8 @@ class Engine:
                 bitrate_mbps=self._radio.bitrate_mbps,
                 name=self._node_ids[node],
             )
-            if index in options:
-                chosen = self._chosen(frame, options[index])
+            if not isinstance(asked, bytes) and (asked.power_dbm, asked.rate_mbps, asked.to) != NO_CHOICES:
+                chosen = self._chosen(frame, asked)
                 if chosen is None:
                     continue
                 frame = chosen
@@ -204,19 +204,19 @@ class Engine:
             for each in self._senders.frames(frame):
                 self._enqueue(each)
 
-    def _chosen(self, frame: Frame, options: SendOptions) -> Frame | None:
+    def _chosen(self, frame: Frame, asked: SentFrame) -> Frame | None:
         """Return a frame with what its program has chosen; None for one to nobody, which is not sent."""
         node = frame.sender
-        gain_db, bitrate_mbps = allowed_choices(self._radio, options, self._rules.largest_dbm(node))
+        gain_db, bitrate_mbps = allowed_choices(self._radio, asked, self._rules.largest_dbm(node))
         to, ticket = BROADCAST, 0
-        if options.to is not None:
-            to = self._number.get(options.to, BROADCAST)
+        if asked.to is not None:
+            to = self._number.get(asked.to, BROADCAST)
             if not self._mac.shares_medium:
                 return None
             if to in (node, BROADCAST):
-                self._unicasts.refuse(node, options.number, frame.sent_ns)
+                self._unicasts.refuse(node, asked.number, frame.sent_ns)
                 return None
-            ticket, self._trace.acknowledges = self._unicasts.register(node, options.number), True
+            ticket, self._trace.acknowledges = self._unicasts.register(node, asked.number), True
         if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
         return replace(frame, gain_db=gain_db, bitrate_mbps=bitrate_mbps, to=to, ticket=ticket)
