@@ -39,7 +39,7 @@ from typing import NamedTuple
 from emulator.radio.congestion import CongestionControl, congestion_control_of
 from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.frames import BROADCAST, CopyNumbers, Receptions, Transmission
-from emulator.radio.mac import Mac, Throttle
+from emulator.radio.mac import Mac, ThrottledQueue
 from emulator.radio.medium import WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
 from emulator.radio.reception import BACKOFF, JITTER, NEXT_BACKOFF, Signals, Threshold, milliwatts, sender_draw
@@ -163,7 +163,7 @@ class Csma(Mac):
         listener = self._congestion.observe if self._congestion is not None else None
         carrier_sense_mw = milliwatts(mac.carrier_sense_dbm)
         self._medium = Medium(self._count, carrier_sense_mw, threshold, remembered_ns, listener)
-        self._throttle = Throttle()
+        self._throttle = ThrottledQueue()
         self._events: list[_Event] = []
         self._stations: dict[int, _Station] = {}
         self._counting: dict[int, _Station] = {}

@@ -27,9 +27,9 @@ from emulator.radio.frames import (
     CopyNumbers,
     Frame,
     Receptions,
-    Result,
     Stage,
     Transmission,
+    UnicastResult,
     allowed_choices,
     flipped,
 )
@@ -40,8 +40,8 @@ from emulator.radio.own_rules import OwnRules
 from emulator.radio.propagation import transmit_powers_dbm
 from emulator.radio.reception import Reception, Signals
 from emulator.radio.stages import (
-    Latency,
-    Loss,
+    LatencyStage,
+    LossStage,
     RoundedUp,
     change_by_faults,
     in_range,
@@ -114,10 +114,10 @@ class Engine:
             peer_cap,
             lose_by_faults,
             *([self._reception] if self._reception is not None else []),
-            Loss(seed, radio.loss),
+            LossStage(seed, radio.loss),
         ]
         """Stages that decide which receptions succeed."""
-        self.timing: list[Stage] = [Latency(seed, radio), change_by_faults]
+        self.timing: list[Stage] = [LatencyStage(seed, radio), change_by_faults]
         """Stages after them, which say when and how often those arrive, and with which bytes."""
         if arrivals.step_ns:
             self.timing.append(RoundedUp(arrivals))
@@ -384,7 +384,7 @@ class Engine:
         self._settle()
         return self._unicasts.next_ns()
 
-    def take_results(self, time_ns: int) -> list[Result]:
+    def take_results(self, time_ns: int) -> list[UnicastResult]:
         """Remove and return the results up to `time_ns` of frames to single vehicles, in order."""
         return [] if self.next_result_ns() is None else self._unicasts.take(time_ns)
 

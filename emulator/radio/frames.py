@@ -181,7 +181,7 @@ class CopyNumbers(Counter[tuple[int, int]]):
         return self[sender, seq]
 
 
-class Result(NamedTuple):
+class UnicastResult(NamedTuple):
     """Result of frame `number` of the node number `sender` to one vehicle, which its node learns at `time_ns`."""
 
     time_ns: int

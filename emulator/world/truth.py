@@ -14,7 +14,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import Gnss
 from emulator.world.gnss import MotionSensors, common_errors, further_error_m, noise_m, speed_mps
 from emulator.world.own_sensors import OwnSensors, Reading, SensedTruth
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from emulator.world.radio_inputs import RadioInputs, load_buildings, load_links
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names, shown
@@ -84,7 +84,7 @@ class World:
         motion: Motion,
         lane_map: LaneMap | RoadMap,
         lane_of: NDArray[np.intp],
-        frame: Frame | None = None,
+        frame: CoordinateFrame | None = None,
     ) -> None:
         motion = with_units(motion, scenario.roadside)
         count = len(motion.node_ids)

@@ -38,7 +38,7 @@ from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, 
 from vnet.runtime.own_asyncio import Task, current_node, present_node
 from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
-from vnet.runtime.ready_queue import Chooser, chooser_of, node_of
+from vnet.runtime.ready_queue import EventChooser, chooser_of, node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap
 from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, line_of_task, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
@@ -239,7 +239,7 @@ class Host:
         main = self._main(node, self._programs[node.id])
         self._mains[node.id] = self._loop.create_task(main, name=f"{node.id} main", context=context)
 
-    def _chooser_of(self, node: Node) -> Chooser:
+    def _chooser_of(self, node: Node) -> EventChooser:
         order = self._orders[node.id]
         return chooser_of(Order("tape") if order is None else order)
 

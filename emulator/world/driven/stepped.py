@@ -17,7 +17,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.driven.road import Start, start_on_single_road
 from emulator.world.driven.vehicles import DrivenVehicles, Happening, Log
 from emulator.world.gnss import MotionSensors
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion
 from emulator.world.truth import World, periods_of
 from vnet.driving import Action
@@ -102,7 +102,7 @@ class SteppedWorld(World):
         node_ids: Sequence[str],
         lane_map: LaneMap | RoadMap,
         notes: tuple[str, ...] = (),
-        frame: Frame | None = None,
+        frame: CoordinateFrame | None = None,
     ) -> None:
         self._count, periods = len(node_ids), periods_of(scenario)
         self._units_m = [unit.position_m for unit in scenario.roadside]
@@ -251,7 +251,9 @@ def _node_ids(vehicles: int) -> tuple[str, ...]:
     return tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
 
 
-def _start(scenario: Scenario, count: int) -> tuple[Start, LaneMap | RoadMap, Frame | None, tuple[str, ...]]:
+def _start(
+    scenario: Scenario, count: int
+) -> tuple[Start, LaneMap | RoadMap, CoordinateFrame | None, tuple[str, ...]]:
     """Return where vehicles are at the start, the lanes that programs know, their frame, and notes for the user."""
     if scenario.driven.road == "map":
         from emulator.world.driven.map_driving import start_on_map

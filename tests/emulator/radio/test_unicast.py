@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from emulator.radio.dot11p import AIFSN_AND_CW, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.engine import Engine
-from emulator.radio.frames import Receptions, Result, Transmission
+from emulator.radio.frames import Receptions, Transmission, UnicastResult
 from emulator.radio.unicast import ACK_BYTES, ACK_TIMEOUT_NS, EIFS_NS, MOST_ATTEMPTS, ack_airtime_ns
 from tests.support.radio import engine, line
 from vnet.radio import SentFrame
@@ -42,7 +42,9 @@ radios = st.fixed_dictionaries(
 )
 
 
-def transmit(subject: Engine, frames: list[tuple[int, int, int]], stops: list[int] | None = None) -> list[Result]:
+def transmit(
+    subject: Engine, frames: list[tuple[int, int, int]], stops: list[int] | None = None
+) -> list[UnicastResult]:
     """Send, with looks at the engine at `stops`; returns the results."""
     results = []
     numbers = [0] * 5
@@ -138,7 +140,7 @@ def test_a_result_comes_a_lookahead_after_the_acknowledgement() -> None:
     (result,) = transmit(subject, [(0, 0, 1)])
     (row,) = rows_of(subject)
     assert row["left_ns"] == AIFS_NS + airtime_ns(200, 6.0)
-    assert result == Result(row["left_ns"] + SIFS_NS + ACK_NS + LATENCY_NS, 0, 0, True, 1)
+    assert result == UnicastResult(row["left_ns"] + SIFS_NS + ACK_NS + LATENCY_NS, 0, 0, True, 1)
 
 
 def test_others_keep_silent_until_an_acknowledgement_that_they_cannot_sense_has_ended() -> None:
