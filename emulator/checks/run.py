@@ -14,7 +14,17 @@ from emulator.records.distributions import lowest_share
 from emulator.records.events import Event, EventKind, in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
-from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result, unknown
+from emulator.records.verdicts import (
+    MOST_ROWS,
+    CheckResult,
+    Finding,
+    Verdict,
+    invalid,
+    not_exercised,
+    result,
+    unknown,
+    valid,
+)
 from emulator.scenario.faults import ProcessFault
 from vnet.counted import counted
 from vnet.errors import first_names
@@ -31,7 +41,6 @@ START_UP_NS = 5 * NS_PER_S
 
 def check_transport(recorded: RecordedRun) -> Finding:
     """Check that no message between agents and emulator went missing."""
-    name = "transport"
     gaps = sum(int(event.details.get("count", 1)) for event in recorded.event(EventKind.transport_gap))
     lost = recorded.outcome_is("transport")
     if gaps or lost.any():
@@ -40,33 +49,31 @@ def check_transport(recorded: RecordedRun) -> Finding:
         text = (
             f"{counted(gaps, 'gap')} in sequence numbers, {missing} that never arrived: the machine, not the radio"
         )
-        return unknown(name, text, gaps=gaps, lost=count)
-    return CheckResult(name, Verdict.VALID, "no message between agents and emulator went missing", {"gaps": 0})
+        return unknown(text, gaps=gaps, lost=count)
+    return valid("no message between agents and emulator went missing", gaps=0)
 
 
 def check_agents_alive(recorded: RecordedRun) -> Finding:
     """Check that no process died and no program crashed, except those that a fault ended."""
-    name = "agents_alive"
     gone = [
         event for event in recorded.event(EventKind.died, EventKind.crashed) if not _was_killed(recorded, event)
     ]
     if not gone and not recorded.event(EventKind.started):
-        return unknown(name, "no event says that the run started")
+        return unknown("no event says that the run started")
     if not gone:
         who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
-        return CheckResult(name, Verdict.VALID, f"{who} to the end")
+        return valid(f"{who} to the end")
     listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
-    return CheckResult(name, Verdict.INVALID, in_words(kinds_of(gone)), {"gone": listed})
+    return invalid(in_words(kinds_of(gone)), gone=listed)
 
 
 def check_no_exceptions(recorded: RecordedRun) -> Finding:
     """Check that programs handled every exception that was raised in their tasks, callbacks, jobs and threads."""
-    name = "no_exceptions"
     raised = recorded.event(EventKind.exception)
     if not raised and not recorded.event(EventKind.started):
-        return unknown(name, "no event says that the run started")
+        return unknown("no event says that the run started")
     if not raised:
-        return CheckResult(name, Verdict.VALID, "no exception was left unhandled")
+        return valid("no exception was left unhandled")
     kinds = kinds_of(raised)
     left_out = sum(
         int(e.details["count"])
@@ -84,7 +91,7 @@ def check_no_exceptions(recorded: RecordedRun) -> Finding:
         for kind in kinds
     ]
     first = {"node": kinds[0].first.node, "where": kinds[0].first.details.get("where", "")}
-    return result(name, len(raised), "", in_words(kinds), rows, count=len(raised) + left_out, **first)
+    return result(len(raised), "", in_words(kinds), rows, count=len(raised) + left_out, **first)
 
 
 def _was_killed(recorded: RecordedRun, event: Event) -> bool:
@@ -98,12 +105,11 @@ def _was_killed(recorded: RecordedRun, event: Event) -> bool:
 
 def check_progress(recorded: RecordedRun) -> Finding:
     """Check that the run reached its end: no busy loop, no hang, no interruption."""
-    name = "progress"
     if spun := recorded.event(EventKind.spun):
         event = spun[0]
         when = f"at {event.time_ns / 1e9:.3f} s"
         text = f"{event.node} does not let time advance (busy loop) {when}: {event.details.get('error')}"
-        return CheckResult(name, Verdict.INVALID, text, {"node": event.node, **event.details})
+        return invalid(text, **{"node": event.node, **event.details})
     if stalled := recorded.event(EventKind.stalled):
         event = stalled[0]
         when, error, refused = (
@@ -114,35 +120,34 @@ def check_progress(recorded: RecordedRun) -> Finding:
         text = f"{event.node} hangs at {when}: {error}"
         if refused is not None:
             text = f"the last message of {event.node} at {when} was refused: {refused}; since then {error}"
-        return CheckResult(name, Verdict.UNKNOWN, text, {"node": event.node, **event.details})
+        return unknown(text, **{"node": event.node, **event.details})
     if exceeded := recorded.event(EventKind.memory_exceeded):
-        return unknown(name, memory_exceeded(exceeded[0]), node=exceeded[0].node)
+        return unknown(memory_exceeded(exceeded[0]), node=exceeded[0].node)
     if interrupted := recorded.event(EventKind.interrupted):
-        return unknown(name, f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
+        return unknown(f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
     if not recorded.event(EventKind.ended):
-        return unknown(name, "no event says that the run ended")
+        return unknown("no event says that the run ended")
     due = recorded.scenario.duration_ns // recorded.scenario.period_ns
     if len(recorded.metrics) != due or len(recorded.states) != due * len(recorded.node_ids):
         text = f"{counted(len(recorded.metrics), 'period')} kept, {due} due"
-        return unknown(name, text, periods=len(recorded.metrics), due=due)
-    return CheckResult(name, Verdict.VALID, f"{recorded.scenario.run.duration_s:g} s emulated to the end")
+        return unknown(text, periods=len(recorded.metrics), due=due)
+    return valid(f"{recorded.scenario.run.duration_s:g} s emulated to the end")
 
 
 def check_finite(recorded: RecordedRun) -> Finding:
     """Check that no report holds NaN or infinity."""
-    name = "finite"
     if not len(recorded.metrics):
-        return NotExercised(name, "no period was completed")
+        return not_exercised("no period was completed")
     reporting = int(np.sum(recorded.metrics["reporting"].to_numpy()))
     if reporting == 0:
-        return NotExercised(name, "the program reports nothing")
+        return not_exercised("the program reports nothing")
     not_finite = np.maximum(recorded.metrics["not_finite"].to_numpy(), _not_finite_rows(recorded))
     broken = int(np.sum(not_finite))
     text = f"{counted(reporting, 'report')}, all numbers finite"
     rows = [{"period": int(p), "not_finite": int(not_finite[p])} for p in np.flatnonzero(not_finite)]
     values = "; ".join(_not_finite_values(recorded)) if broken else ""
     broken_text = f"{counted(broken, 'report')} with NaN or infinity" + (f": {values}" if values else "")
-    return result(name, broken, text, broken_text, rows, reports=reporting, not_finite=broken)
+    return result(broken, text, broken_text, rows, reports=reporting, not_finite=broken)
 
 
 def _not_finite_rows(recorded: RecordedRun) -> IntArray:
@@ -178,34 +183,32 @@ def _not_finite_values(recorded: RecordedRun) -> list[str]:
 
 def check_kept_up(recorded: RecordedRun) -> Finding:
     """Check that in real time the machine delivered on time."""
-    name = "kept_up"
     if recorded.scenario.run.pacing != "realtime":
-        return NotExercised(name, "lockstep: nothing can be late")
+        return not_exercised("lockstep: nothing can be late")
     late = recorded.event(EventKind.late_deliveries)
     if not late or not late[-1].details["total"]:
-        return unknown(name, "no delivery was timed")
+        return unknown("no delivery was timed")
     figures = late[-1].details
     count, total = figures["count"], figures["total"]
     at_least = lowest_share(count, total)
     deliveries = counted(total, "delivery", "deliveries")
     text = f"{count / total:.3%} of {deliveries} over 20 ms late (p99 {figures['p99_ms']:.1f} ms)"
     verdict = Verdict.VALID if at_least <= LATE_SHARE_LIMIT else Verdict.UNKNOWN
-    return CheckResult(name, verdict, text, {**figures, "share_at_least": at_least})
+    return CheckResult("", verdict, text, {**figures, "share_at_least": at_least})
 
 
 def check_liveness(recorded: RecordedRun) -> Finding:
     """Check that after the last fault every node that is up reports at least once a second."""
-    name = "liveness"
     if not recorded.reported.any():
-        return NotExercised(name, "the program reports nothing")
+        return not_exercised("the program reports nothing")
     window = max(2, -(-LIVENESS_NS // recorded.scenario.period_ns))
     judged = _expected_to_report(recorded, window)
     if not judged.any():
-        return NotExercised(name, "no program reports once a second")
+        return not_exercised("no program reports once a second")
     start_ns = recorded.period_starts_ns()
     rested = np.flatnonzero(start_ns >= recorded.last_heal_ns)
     if len(rested) < window:
-        return NotExercised(name, "less than a second is left after the last fault")
+        return not_exercised("less than a second is left after the last fault")
     silent: list[dict[str, Any]] = []
     for node in np.flatnonzero(judged).tolist():
         for from_ns, until_ns in _times_up(recorded, node):
@@ -224,7 +227,7 @@ def check_liveness(recorded: RecordedRun) -> Finding:
     if not recorded.plan:
         text = f"{counted(count, 'node')} reported at least once a second"
     broken_text = f"{len(silent)} of {counted(count, 'node')} silent for over a second, {_where(silent)}"
-    return result(name, len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
+    return result(len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
 
 
 def _where(silent: list[dict[str, Any]]) -> str:
@@ -259,13 +262,12 @@ def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
 
 def check_presence(recorded: RecordedRun) -> Finding:
     """Check that vehicles enter and leave when their trips do."""
-    name = "presence"
     if not recorded.moves:
-        return NotExercised(name, "vehicles stand where they are")
+        return not_exercised("vehicles stand where they are")
     there = recorded.places.present()
     changes = _changes(recorded, there)
     if not changes and not recorded.event(EventKind.entered, EventKind.left):
-        return NotExercised(name, "all vehicles are in the network throughout")
+        return not_exercised("all vehicles are in the network throughout")
     known_ns = len(there) * recorded.scenario.period_ns  # of what came later no states are kept
     events = [event for event in recorded.event(EventKind.entered, EventKind.left) if event.time_ns < known_ns]
     told = {(event.kind, str(event.node), event.time_ns) for event in events}
@@ -276,9 +278,7 @@ def check_presence(recorded: RecordedRun) -> Finding:
     rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
     entered = sum(kind == EventKind.entered for kind, _, _ in changes)
     text = f"vehicles entered ({entered}) and left ({len(changes) - entered}) as their trips do"
-    return result(
-        name, len(rows), text, f"{counted(len(rows), 'event')} against the trips", rows, changes=len(changes)
-    )
+    return result(len(rows), text, f"{counted(len(rows), 'event')} against the trips", rows, changes=len(changes))
 
 
 Change = tuple[str, str, int]
@@ -328,17 +328,16 @@ def check_memory(recorded: RecordedRun) -> Finding:
     Judged by the events `memory` {node, time_s, private_kb}, a series each from the start of a process to its end;
     the emulator's own grows with the trace that it keeps, and is not judged.
     """
-    name = "memory"
     if exceeded := recorded.event(EventKind.memory_exceeded):
-        return unknown(name, memory_exceeded(exceeded[0]), node=exceeded[0].node, **exceeded[0].details)
+        return unknown(memory_exceeded(exceeded[0]), node=exceeded[0].node, **exceeded[0].details)
     measured = [
         e for e in recorded.event(EventKind.memory) if e.node in recorded.number and "private_kb" in e.details
     ]
     if not measured:
-        return NotExercised(name, "not measured by vnet simulate")
+        return not_exercised("not measured by vnet simulate")
     judged = [e for e in measured if is_long_enough(e.details["time_s"])]
     if not judged:
-        return NotExercised(name, "no process was measured for 30 s")
+        return not_exercised("no process was measured for 30 s")
     rates = {
         e.node: KB_PER_KIB * steady_growth_kib_per_s(e.details["time_s"], e.details["private_kb"]) for e in judged
     }
@@ -351,7 +350,7 @@ def check_memory(recorded: RecordedRun) -> Finding:
         text = f"note: memory of {of} grows: {node} by {rate:.1f} kB a second, {rate * 3.6:,.0f} MB an hour"
         rows = [{"node": node, "kb_per_s": rate, "kb_per_hour": 3600 * rate} for node, rate in growing.items()]
         figures["growing"] = rows[:MOST_ROWS]
-    return CheckResult(name, Verdict.VALID, text, figures)
+    return valid(text, **figures)
 
 
 def memory_exceeded(event: Event) -> str:

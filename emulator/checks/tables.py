@@ -13,7 +13,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import is_text
 from emulator.records.run_tables import VALUES_AS_LIST
 from emulator.records.tables import STATES
-from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result
+from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, not_exercised, result
 from emulator.scenario.faults import ProcessFault
 from vnet.counted import counted
 from vnet.errors import printable
@@ -27,7 +27,6 @@ KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
 
 def check_row_order(recorded: RecordedRun) -> Finding:
     """Check that the rows of trace, states and metrics are in order, and that each event can be of the run."""
-    name = "row_order"
     count, period_ns = len(recorded.node_ids), recorded.scenario.period_ns
     states, metrics = recorded.states, recorded.metrics
     place = np.arange(len(states))
@@ -50,9 +49,7 @@ def check_row_order(recorded: RecordedRun) -> Finding:
     text = (
         f"{counted(len(recorded.trace), 'row')} of the trace, {counted(len(states), 'row')} of the states in order"
     )
-    return result(
-        name, total, text, f"{counted(total, 'row')} out of order, first in the {next(iter(wrong), '')}", rows
-    )
+    return result(total, text, f"{counted(total, 'row')} out of order, first in the {next(iter(wrong), '')}", rows)
 
 
 def _is_nobodys(event: Event, recorded: RecordedRun) -> bool:
@@ -86,9 +83,8 @@ def _disordered(recorded: RecordedRun) -> Mask:
 
 def check_reports(recorded: RecordedRun) -> Finding:
     """Check that reports hold what `node.report` allows: names, texts and covariance matrices."""
-    name = "reports"
     if not recorded.reported.any():
-        return NotExercised(name, "the program reports nothing")
+        return not_exercised("the program reports nothing")
     wrong: list[dict[str, Any]] = [
         {"what": f"{printable(name)}: not a name of a value"} for name in _names(recorded) if not _allowed(name)
     ]
@@ -107,7 +103,7 @@ def check_reports(recorded: RecordedRun) -> Finding:
     reports = int(recorded.reported.sum())
     text = f"{counted(reports, 'report')} hold what node.report allows"
     first = f": {wrong[0]['what']}" if wrong else ""
-    return result(name, len(wrong), text, f"{counted(len(wrong), 'value')} that node.report refuses{first}", wrong)
+    return result(len(wrong), text, f"{counted(len(wrong), 'value')} that node.report refuses{first}", wrong)
 
 
 def _not_covariances(recorded: RecordedRun, column: str) -> Mask:
@@ -139,10 +135,9 @@ def _allowed(name: str) -> bool:
 
 def check_fault_events(recorded: RecordedRun) -> Finding:
     """Check that events tell the start and the end of each fault, and each restart, at their instants."""
-    name = "fault_events"
     told_of = recorded.event(EventKind.fault_started, EventKind.fault_ended, EventKind.restarted)
     if not recorded.plan and not told_of:
-        return NotExercised(name, NO_FAULTS)
+        return not_exercised(NO_FAULTS)
     in_real_time = recorded.scenario.run.pacing == "realtime"
     due: Counter[tuple[Any, ...]] = Counter()
     for planned in recorded.plan:
@@ -168,9 +163,7 @@ def check_fault_events(recorded: RecordedRun) -> Finding:
         for kind, time_ns, what, _ in events.elements()
     ]
     text = f"{counted(due.total(), 'event')} of faults as they were planned"
-    return result(
-        name, len(rows), text, f"{counted(len(rows), 'event')} against the plan of faults", rows[:MOST_ROWS]
-    )
+    return result(len(rows), text, f"{counted(len(rows), 'event')} against the plan of faults", rows[:MOST_ROWS])
 
 
 def _without_times(events: Counter[tuple[Any, ...]]) -> Counter[tuple[Any, ...]]:
