@@ -37,6 +37,7 @@ from emulator.checks.run import (
     FLOOR_KIB,
     RISING_TENTHS,
     check_agents_alive,
+    check_fault_events,
     check_finite,
     check_kept_up,
     check_liveness,
@@ -44,10 +45,11 @@ from emulator.checks.run import (
     check_no_exceptions,
     check_presence,
     check_progress,
+    check_reports,
+    check_row_order,
     check_transport,
 )
 from emulator.checks.senders import check_copies, check_gnss
-from emulator.checks.tables import check_fault_events, check_reports, check_row_order
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, named
 from vnet.reports import LONGEST_TEXT
