@@ -38,7 +38,7 @@ from rich.text import Text
 
 from emulator.checks.own import is_broken
 from emulator.pages.page import put_page, render, table
-from emulator.records.atomic import write_atomically
+from emulator.records.atomic import check_is_free, write_atomically
 from emulator.records.distributions import lowest_share
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -725,8 +725,7 @@ def run_campaign(
     name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
     folder = out or next(path for path in _folders(name) if not path.exists())
     earlier = _earlier(plan, name, before, out)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise VnetError(f"--out {folder}: exists and is not an empty folder")
+    check_is_free(folder, "--out ")
     folder.mkdir(parents=True, exist_ok=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with _interrupted_once(), Progress(*columns, console=console) as progress:

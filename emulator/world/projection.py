@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -58,12 +59,10 @@ class CoordinateFrame:
         from pyproj import Transformer  # slow to import, and only points in degrees need it
         from pyproj.exceptions import ProjError
 
-        if len(self.proj) > _LONGEST_PROJ or not _PROJ.fullmatch(self.proj):
-            raise ScenarioError(f"projection {printable(self.proj)}: not one that PROJ knows")
-        try:
-            return Transformer.from_crs("EPSG:4326", self.proj, always_xy=True)
-        except ProjError:
-            raise ScenarioError(f"projection {printable(self.proj)}: not one that PROJ knows") from None
+        if len(self.proj) <= _LONGEST_PROJ and _PROJ.fullmatch(self.proj):
+            with suppress(ProjError):
+                return Transformer.from_crs("EPSG:4326", self.proj, always_xy=True)
+        raise ScenarioError(f"projection {printable(self.proj)}: not one that PROJ knows")
 
     def to_local(self, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Array:
         """Return metres (…, 2) of points in WGS-84 degrees (…); infinite outside the projection."""

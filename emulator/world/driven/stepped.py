@@ -19,7 +19,7 @@ from emulator.world.driven.vehicles import DrivenVehicles, Happening, Log
 from emulator.world.gnss import MotionSensors
 from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion
-from emulator.world.truth import World, periods_of
+from emulator.world.truth import World, periods_of, refuse_shared_processes
 from vnet.driving import Action
 from vnet.errors import ScenarioError
 from vnet.node import Fix
@@ -224,11 +224,9 @@ class DrivenWorld(SteppedWorld):
         self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz), start)
         self._furthest_m = start.along_m + scenario.driven.max_speed_mps * scenario.run.duration_s
         super().__init__(scenario, node_ids, lanes, notes, frame)
-        if scenario.run.nodes_per_process > 1 and self.may_leave:
-            raise ScenarioError(
-                f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 where vehicles may leave: "
-                f"they may come to the end of the road, after {self.vehicles.road.end_m.min():g} m"
-            )
+        if self.may_leave:
+            end = f"they may come to the end of the road, after {self.vehicles.road.end_m.min():g} m"
+            refuse_shared_processes(scenario, f"where vehicles may leave: {end}")
 
     @property
     def may_leave(self) -> bool:

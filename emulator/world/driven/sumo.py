@@ -44,6 +44,7 @@ from emulator.world.driven.sumo_process import (
 )
 from emulator.world.driven.vehicles import COLLISION, LIMITED, Happening, Log
 from emulator.world.projection import CoordinateFrame
+from emulator.world.truth import refuse_shared_processes
 from vnet.driving import Action
 from vnet.errors import ScenarioError, VnetError, first_names, printable, shown
 from vnet.extras import require
@@ -437,11 +438,7 @@ class SumoWorld(SteppedWorld):
         if unknown := [node for node in sumo.lights_to if node not in self.node_ids]:
             some = first_names(self.node_ids)
             raise ScenarioError(f"network.sumo.lights_to = {shown(unknown[0])}: no such node; there are {some}")
-        if scenario.run.nodes_per_process > 1:
-            raise ScenarioError(
-                f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 with network.step = true, "
-                "where vehicles enter and leave"
-            )
+        refuse_shared_processes(scenario, "with network.step = true, where vehicles enter and leave")
 
     @property
     def has_traffic(self) -> bool:
