@@ -64,7 +64,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         return parsing.parse(options, cls)
 
 
-class Frame(msgspec.Struct, array_like=True):
+class BaselineFrame(msgspec.Struct, array_like=True):
     """One broadcast: what the sender knew before its fix, and what the fix says (matrix xx, xy, yy; vector)."""
 
     time_ns: int
@@ -86,15 +86,15 @@ class Filtering:
         self._own = own_vehicle(OwnConfig(config), node.map, node.rng)
         self._last_ns: int | None = None
 
-    def observe(self, fix: Fix) -> Frame:
+    def observe(self, fix: Fix) -> BaselineFrame:
         """Take the vehicle's own fix; returns the frame to broadcast."""
         last_ns = fix.time_ns if self._last_ns is None else self._last_ns
         observation = Observation(fix.position_m, fix.covariance_m2, fix.heading_rad) if usable(fix) else None
         increment = self._own.step((fix.time_ns - last_ns) / NS_PER_S, observation)
         self._last_ns = fix.time_ns
-        return Frame(fix.time_ns, self._own.prior.numbers, increment.numbers)
+        return BaselineFrame(fix.time_ns, self._own.prior.numbers, increment.numbers)
 
-    def combine(self, own: Frame, heard: list[Frame]) -> None:
+    def combine(self, own: BaselineFrame, heard: list[BaselineFrame]) -> None:
         """Combine what others say of the same instant."""
         if not heard:
             return
@@ -128,24 +128,24 @@ class Differential:
         self._common_m = np.zeros(2)
         self._covariance_m2 = options.common_sigma_m**2 * np.eye(2)
 
-    def observe(self, fix: Fix) -> Frame:
+    def observe(self, fix: Fix) -> BaselineFrame:
         """Return the frame with the innovation: the distance of the fix from its lane, as information about c."""
         nothing = (0.0, 0.0, 0.0, 0.0, 0.0)
         if not usable(fix):
-            return Frame(fix.time_ns, nothing, nothing)
+            return BaselineFrame(fix.time_ns, nothing, nothing)
         expected_m = fix.position_m - self._common_m
         lanes = candidate_lanes(self._lanes, expected_m, fix.heading_rad, REACH_M)
         if not len(lanes):
-            return Frame(fix.time_ns, nothing, nothing)
+            return BaselineFrame(fix.time_ns, nothing, nothing)
         across_m = self._lanes.normal[lanes] @ expected_m - self._lanes.offset_m[lanes]
         lane = lanes[int(np.argmin(np.abs(across_m)))]
         normal = self._lanes.normal[lane]
         variance_m2 = float(normal @ fix.covariance_m2 @ normal) + (self._lanes.half_width_m / 2) ** 2
         innovation_m = float(normal @ fix.position_m - self._lanes.offset_m[lane])
         seen = Information.from_arrays(np.outer(normal, normal) / variance_m2, innovation_m * normal / variance_m2)
-        return Frame(fix.time_ns, nothing, seen.numbers)
+        return BaselineFrame(fix.time_ns, nothing, seen.numbers)
 
-    def combine(self, own: Frame, heard: list[Frame]) -> None:
+    def combine(self, own: BaselineFrame, heard: list[BaselineFrame]) -> None:
         """Average the innovations of all heard, and the vehicle's own, with those of the last moments."""
         innovations = np.sum([own.increment, *(frame.increment for frame in heard)], axis=0)
         self._sum = self._keep * self._sum + (1 - self._keep) * innovations
@@ -188,10 +188,10 @@ async def main(node: Node) -> None:
         )
 
 
-def _decoded(payload: bytes) -> Frame | None:
+def _decoded(payload: bytes) -> BaselineFrame | None:
     """Return the frame in some bytes, or None if they are none."""
     try:
-        frame = msgspec.msgpack.decode(payload, type=Frame)
+        frame = msgspec.msgpack.decode(payload, type=BaselineFrame)
     except msgspec.DecodeError:
         return None
     return frame if np.isfinite([*frame.prior, *frame.increment]).all() else None

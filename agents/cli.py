@@ -86,7 +86,7 @@ def agent(
     from agents.host import run_agent  # these import numpy, before which `main` sets its number of threads
     from vnet.runtime.host import Disks
     from vnet.transport.credentials import Credentials
-    from vnet.transport.keys import is_segment
+    from vnet.transport.keys import SEGMENTS, is_segment
     from vnet.transport.session import quiet_zenoh
 
     interrupts.raise_from_now_on()
@@ -102,7 +102,7 @@ def agent(
     try:
         for name in [run, *node]:
             if not is_segment(name):
-                raise VnetError(f"{name!r}: names are letters, digits, '_', '.', '-', at most 64")
+                raise VnetError(f"{name!r}: {SEGMENTS}")
         _check_timeout("--connect-timeout-s", connect_timeout_s)
         _check_timeout("--join-timeout-s", join_timeout_s)
         login = None if credentials is None else Credentials.load(credentials)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from vnet.backbone import Backbone, BackboneTransport, UnitAbilities
 from vnet.driving import Action, checked_action
 from vnet.mailbox import Mailbox
-from vnet.radio import NO_ABILITIES, Radio, RadioAbilities, RadioTransport, SendOptions
+from vnet.radio import NO_ABILITIES, Radio, RadioAbilities, RadioTransport, SentFrame
 from vnet.reports import NoteDetail, Report, Reporter, checked_detail
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
@@ -246,7 +246,7 @@ class _Disconnected:
     def now_ns(self, node: str) -> int:
         return self._now_ns
 
-    def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
+    def send_frame(self, frame: SentFrame) -> None:
         pass
 
     def send_message(self, node: str, to: str | None, payload: bytes) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from vnet.arguments import checked_payload, number_or_nan
 from vnet.errors import PayloadTooLargeError, shown
@@ -39,17 +39,19 @@ class RadioAbilities(NamedTuple):
     acknowledges: bool = False
 
 
-class SendOptions(NamedTuple):
-    """Choices of a program for a frame; None: the scenario's power or bit rate.
+class SentFrame(Struct, frozen=True, array_like=True):
+    """One frame that `node` enqueues, with the scenario's power and bit rate where it has none of its own.
 
-    `to` is the vehicle to which a frame is addressed, None for a broadcast; `number` counts the frames of this kind
-    that its sender has sent, and its result names it.
+    It is a broadcast, or addressed `to` one node; then `number` counts such frames of the sender, and its result
+    names it.
     """
 
+    node: str
+    payload: bytes
     power_dbm: float | None = None
     rate_mbps: float | None = None
     to: str | None = None
-    number: int = 0
+    number: Annotated[int, Meta(ge=0, le=2**62)] = 0
 
 
 class SendResult(NamedTuple):
@@ -66,7 +68,7 @@ class SendResult(NamedTuple):
 class RadioTransport(Protocol):
     """Interface of a radio to the process that hosts its node."""
 
-    def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
+    def send_frame(self, frame: SentFrame) -> None:
         """Enqueue a frame at the emulated radio, at the present time."""
         ...
 
@@ -122,10 +124,10 @@ class Radio:
         Raise `PayloadTooLargeError` above `max_payload` bytes, TypeError for what is not bytes, and ValueError for
         a power or a rate that the radio does not have.
         """
-        options = SendOptions(
-            self._checked_power("broadcast", power_dbm), self._checked_rate("broadcast", rate_mbps)
-        )
-        self._transport.send_frame(self._node_id, self._checked_payload("broadcast", payload), options)
+        power_dbm = self._checked_power("broadcast", power_dbm)
+        rate_mbps = self._checked_rate("broadcast", rate_mbps)
+        content = self._checked_payload("broadcast", payload)
+        self._transport.send_frame(SentFrame(self._node_id, content, power_dbm, rate_mbps))
 
     async def send(
         self, to: str, payload: bytes, *, power_dbm: float | None = None, rate_mbps: float | None = None
@@ -150,7 +152,7 @@ class Radio:
         self._sends[number] = result
         self._unknown.add(number)
         try:
-            self._transport.send_frame(self._node_id, content, SendOptions(power_dbm, rate_mbps, to, number))
+            self._transport.send_frame(SentFrame(self._node_id, content, power_dbm, rate_mbps, to, number))
             return await result
         finally:
             self._sends.pop(number, None)

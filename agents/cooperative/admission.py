@@ -25,7 +25,7 @@ FORGET_PERIODS = 10
 """Periods between two times at which senders are forgotten: it need not be exact."""
 
 
-class Frame(Protocol):
+class JudgedFrame(Protocol):
     """The part of a frame that is judged, whatever its layout."""
 
     @property
@@ -49,7 +49,7 @@ class Frame(Protocol):
         ...
 
 
-F = TypeVar("F", bound=Frame)
+F = TypeVar("F", bound=JudgedFrame)
 
 
 class Admission(Generic[F]):

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.ns3.simulators import RADIO, MissingError, build
 from emulator.radio.engine import Engine
 from emulator.scenario.scenario import Radio
-from vnet.radio import SendOptions
+from vnet.radio import SentFrame
 
 PROGRAM = Path(__file__).with_name("unicast.cc")
 OUT = Path("build") / "ns3"
@@ -87,7 +87,7 @@ def our_exchange(case: Case, seconds: float) -> Exchange:
 
 
 def _send(engine: Engine, time_ns: int, sender: int) -> None:
-    engine.transmit(time_ns, sender, [bytes(SIZE_BYTES)], {0: SendOptions(to="v0")})
+    engine.transmit(time_ns, sender, [SentFrame("", bytes(SIZE_BYTES), to="v0")])
 
 
 def _saturate(engine: Engine, case: Case, end_ns: int) -> None:

@@ -12,7 +12,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.records.distributions import binomial_interval
 from emulator.records.events import EventKind
 from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, RecordedRun
-from emulator.records.verdicts import Finding, NotExercised, result, unknown
+from emulator.records.verdicts import Finding, not_exercised, result, unknown
 from emulator.scenario.faults import Custom, CustomSender, SenderFault, StaleMessages
 from emulator.world.radio_inputs import LinkTable
 from vnet.counted import counted
@@ -27,18 +27,17 @@ IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.o
 """Outcomes of rows of the trace; of frames to single vehicles, `out_of_range` as well."""
 
 
-def nothing_seen(name: str, recorded: RecordedRun, text: str) -> Finding:
+def nothing_seen(recorded: RecordedRun, text: str) -> Finding:
     """Return unknown, as nothing was observed; not applicable if no vehicle has another in range."""
     if not recorded.places.most_in_range:
-        return NotExercised(name, "no vehicle has another in range")
-    return unknown(name, text)
+        return not_exercised("no vehicle has another in range")
+    return unknown(text)
 
 
 def check_conservation(recorded: RecordedRun) -> Finding:
     """Check that each frame, and each copy, has one row with one outcome for each receiver in range."""
-    name = "conservation"
     if not len(recorded.trace):
-        return nothing_seen(name, recorded, "no frame was sent")
+        return nothing_seen(recorded, "no frame was sent")
     broken: dict[str, Mask] = {
         "repeated": _repeated(recorded),
         "wrong_count": _in_frames_of_wrong_size(recorded),
@@ -55,7 +54,6 @@ def check_conservation(recorded: RecordedRun) -> Finding:
     total = sum(counts.values()) + gaps
     offending = np.logical_or.reduce(list(broken.values()))
     return result(
-        name,
         total,
         f"{counted(len(frames), 'frame')}, {counted(len(recorded.trace), 'reception')} in range, "
         "each with one outcome",
@@ -152,38 +150,35 @@ def _missing_numbers(recorded: RecordedRun) -> int:
 
 def check_range(recorded: RecordedRun) -> Finding:
     """Check that nothing was delivered to a receiver out of range."""
-    name = "range"
     delivered = recorded.outcome_is("delivered")
     if not delivered.any():
-        return nothing_seen(name, recorded, "nothing was delivered")
+        return nothing_seen(recorded, "nothing was delivered")
     beyond = delivered & recorded.placed & ~recorded.in_range
     broken, count = int(beyond.sum()), int(delivered.sum())
     text = f"all {counted(count, 'delivery', 'deliveries')} within range"
     broken_text = f"{counted(broken, 'delivery', 'deliveries')} beyond range"
-    return result(name, broken, text, broken_text, recorded.rows(beyond), delivered=count, beyond=broken)
+    return result(broken, text, broken_text, recorded.rows(beyond), delivered=count, beyond=broken)
 
 
 def check_peer_cap(recorded: RecordedRun) -> Finding:
     """Check that each receiver hears its nearest `max_peers` live senders in range, and no other."""
-    name = "peer_cap"
     cap = recorded.scenario.radio.max_peers
     largest = recorded.places.most_in_range
     if largest <= cap and not recorded.outcome_is("peer_cap").any():
-        return NotExercised(name, f"no receiver has more than {cap} senders in range (at most {largest})")
+        return not_exercised(f"no receiver has more than {cap} senders in range (at most {largest})")
     if not len(recorded.trace):
-        return unknown(name, "no frame was sent")
+        return unknown("no frame was sent")
     capped = recorded.outcome_is("peer_cap")
     wrong = _wrongly_capped(recorded, capped)
     broken = int(wrong.sum())
     figures = {"cap": cap, "largest_in_range": largest, "capped": int(capped.sum()), "wrong": broken}
     if not broken and not capped.any():
         text = f"the cap of {cap} never acted, though up to {largest} are in range: those beyond it sent nothing"
-        return unknown(name, text, **figures)
+        return unknown(text, **figures)
     if largest <= cap:  # nothing explains them
         broken, wrong = int(capped.sum()), capped
     text = f"{counted(int(capped.sum()), 'reception')} beyond the nearest {cap} (up to {largest} in range)"
     return result(
-        name,
         broken,
         text,
         f"{counted(broken, 'reception')} on the wrong side of the cap",
@@ -212,29 +207,28 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
 
 def check_loss_rate(recorded: RecordedRun) -> Finding:
     """Check that the share of lost receptions is in the binomial band of `radio.loss`, or of the links' losses."""
-    name = "loss_rate"
     if isinstance(recorded.radio_inputs.links, LinkTable):
-        return _check_measured_losses(name, recorded)
+        return _check_measured_losses(recorded)
     loss = recorded.scenario.radio.loss
     drawing = drew_for_loss(recorded)
     lost, drawn = int((drawing & recorded.outcome_is("lost")).sum()), int(drawing.sum())
     if drawn == 0:
-        return nothing_seen(name, recorded, "no reception came as far as the loss")
+        return nothing_seen(recorded, "no reception came as far as the loss")
     low, high = binomial_band(drawn, loss, LOSS_BAND)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": loss, "low": low, "high": high}
     text = f"{lost:,} of {counted(drawn, 'reception')} lost, {lost / drawn:.2%}; {loss:.2%} expected"
     wrong_way = recorded.outcome_is("lost") if lost > high else drawing & ~recorded.outcome_is("lost")
     outside = not low <= lost <= high
     rows = recorded.rows(wrong_way) if outside else []
-    return result(name, int(outside), text, f"{text}: outside the {LOSS_BAND:.1%} band", rows, **figures)
+    return result(int(outside), text, f"{text}: outside the {LOSS_BAND:.1%} band", rows, **figures)
 
 
-def _check_measured_losses(name: str, recorded: RecordedRun) -> Finding:
+def _check_measured_losses(recorded: RecordedRun) -> Finding:
     """Check the number of lost receptions, and each of those on links that lose everything, or nothing."""
     rows = np.flatnonzero(drew_for_loss(recorded) & recorded.placed)
     lost = recorded.outcome_is("lost")[rows]
     if not len(rows):
-        return nothing_seen(name, recorded, "no reception came as far as the loss")
+        return nothing_seen(recorded, "no reception came as far as the loss")
     found = recorded.places.pair_losses(recorded.sender[rows], recorded.receiver[rows], recorded.sent_ns[rows])
     assert found is not None
     loss = np.nan_to_num(found, nan=1.0)
@@ -249,7 +243,7 @@ def _check_measured_losses(name: str, recorded: RecordedRun) -> Finding:
     broken = rows[impossible] if impossible.any() else rows[lost == (share > law)]
     figures = {"lost": int(lost.sum()), "pairs": len(rows), "rate": share, "expected": law}
     count = int(impossible.sum()) + outside
-    return result(name, count, text, problem, recorded.rows(broken) if count else [], **figures)
+    return result(count, text, problem, recorded.rows(broken) if count else [], **figures)
 
 
 def _deviation_of_sum(probability: Array) -> float:
@@ -278,12 +272,11 @@ def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, 
 
 def check_isolation(recorded: RecordedRun) -> Finding:
     """Check that arrivals were sent, byte for byte, that programs report no more, and pass by no other way."""
-    name = "isolation"
     refused = sum(int(event.details.get("count", 0)) for event in recorded.event(EventKind.refused_total))
     arrived = int(recorded.arrived.sum())
     strangers_at = sorted({event.node or "" for event in recorded.event(EventKind.extra_session)})
     if not arrived and not strangers_at:
-        return nothing_seen(name, recorded, "nothing arrived")
+        return nothing_seen(recorded, "nothing arrived")
     foreign = _foreign(recorded)
     claims = _claims_beyond(recorded)
     broken = int(foreign.sum()) + len(claims) + len(strangers_at)
@@ -294,7 +287,7 @@ def check_isolation(recorded: RecordedRun) -> Finding:
     broken_text = f"{unsent} of what was never sent, {overstated} of more than arrived"
     broken_text += f", sessions beside the radio at {first_names(strangers_at)}" if strangers_at else ""
     figures = {"arrivals": arrived, "foreign": int(foreign.sum()), "claims": len(claims), "refused": refused}
-    return result(name, broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
+    return result(broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
 
 
 def _foreign(recorded: RecordedRun) -> Mask:

@@ -28,10 +28,11 @@ from emulator.records.verdicts import (
     NO_FAULTS,
     CheckResult,
     Finding,
-    NotExercised,
-    Verdict,
+    named,
+    not_exercised,
     result,
     unknown,
+    valid,
 )
 from emulator.scenario.faults import (
     BurstLoss,
@@ -80,11 +81,10 @@ def _pauses(fault: Fault) -> bool:
 
 def check_causes(recorded: RecordedRun) -> Finding:
     """Check that a row names a fault exactly where a fitting one acted, on this link and at this time."""
-    name = "causes"
     if not recorded.plan:
         broken = recorded.outcome_is("fault") | (recorded.cause != NO_FAULT)
         if not broken.any():
-            return NotExercised(name, NO_FAULTS)
+            return not_exercised(NO_FAULTS)
     else:
         explained = recorded.cause == NO_FAULT
         for planned in recorded.plan:
@@ -95,7 +95,7 @@ def check_causes(recorded: RecordedRun) -> Finding:
     count, named = int(broken.sum()), int((recorded.cause != NO_FAULT).sum())
     text = f"{counted(named, 'reception')} with the fault that acted on them"
     broken_text = f"{counted(count, 'reception')} without a fault that acted on them"
-    return result(name, count, text, broken_text, recorded.rows(broken), named=named, wrong=count)
+    return result(count, text, broken_text, recorded.rows(broken), named=named, wrong=count)
 
 
 @singledispatch
@@ -141,20 +141,19 @@ def _(fault: CustomSender, recorded: RecordedRun) -> Mask:
 
 def check_partition_respected(recorded: RecordedRun) -> Finding:
     """Check that nothing sent across a cut (partition, block, range, swizzle) passed it."""
-    name = "partition_respected"
     cuts = begun(recorded, _cuts)
     if not cuts:
-        return NotExercised(name, "no fault cuts links" if recorded.plan else NO_FAULTS)
+        return not_exercised("no fault cuts links" if recorded.plan else NO_FAULTS)
     across = np.zeros(len(recorded.trace), dtype=bool)
     for planned in cuts:
         across |= recorded.reached(planned, -recorded.guard_ns)
     if not across.any():
-        return unknown(name, "no frame was sent across a cut")
+        return unknown("no frame was sent across a cut")
     passed = across & recorded.outcome_is(*ON_AIR)
     count = int(passed.sum())
     text = f"{counted(int(across.sum()), 'reception')} across a cut, and none passed"
     broken_text = f"{count} of {counted(int(across.sum()), 'reception')} passed a cut"
-    return result(name, count, text, broken_text, recorded.rows(passed), across=int(across.sum()), passed=count)
+    return result(count, text, broken_text, recorded.rows(passed), across=int(across.sum()), passed=count)
 
 
 def _left_ns(recorded: RecordedRun) -> NDArray[np.int64]:
@@ -164,9 +163,8 @@ def _left_ns(recorded: RecordedRun) -> NDArray[np.int64]:
 
 def check_down_respected(recorded: RecordedRun) -> Finding:
     """Check that a node that is down neither sends, reports nor receives: arrivals there are `receiver_down`."""
-    name = "down_respected"
     if not recorded.down:
-        return NotExercised(name, "no node was down" if recorded.plan else NO_FAULTS)
+        return not_exercised("no node was down" if recorded.plan else NO_FAULTS)
     sure = ~recorded.is_unsure(recorded.sent_ns)
     speaking = sure & recorded.is_down(recorded.sender, recorded.sent_ns)
     judged = recorded.arrived & ~recorded.is_unsure(recorded.due_ns)
@@ -185,7 +183,6 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
     down = {span.node for span in recorded.down}
     figures = {"spoke": int(speaking.sum()), "heard": int(hearing.sum()), "missed": int(missing.sum())}
     return result(
-        name,
         broken,
         f"{counted(len(down), 'node was', 'nodes were')} down, and neither sent nor received",
         f"{counted(broken, 'frame, arrival or report', 'frames, arrivals or reports')} of nodes that were down",
@@ -197,10 +194,9 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
 
 def check_pause_respected(recorded: RecordedRun) -> Finding:
     """Check that a paused node sends nothing and reports nothing."""
-    name = "pause_respected"
     pauses = begun(recorded, _pauses)
     if not pauses:
-        return NotExercised(name, "no node was paused" if recorded.plan else NO_FAULTS)
+        return not_exercised("no node was paused" if recorded.plan else NO_FAULTS)
     speaking = np.zeros(len(recorded.trace), dtype=bool)
     spans = []
     for planned in pauses:
@@ -213,7 +209,7 @@ def check_pause_respected(recorded: RecordedRun) -> Finding:
     paused = {span[0] for span in spans}
     text = f"{counted(len(paused), 'node was', 'nodes were')} paused, and sent and reported nothing"
     rows = recorded.rows(speaking) + reports
-    return result(name, broken, text, broken_text, rows, spoke=int(speaking.sum()), reports=len(reports))
+    return result(broken, text, broken_text, rows, spoke=int(speaking.sum()), reports=len(reports))
 
 
 def _reports_within(recorded: RecordedRun, spans: Iterable[tuple[int, int, int]]) -> list[dict[str, Any]]:
@@ -233,12 +229,11 @@ def _reports_within(recorded: RecordedRun, spans: Iterable[tuple[int, int, int]]
 
 def check_outage_respected(recorded: RecordedRun) -> Finding:
     """Check that a receiver has no fix exactly while an outage acts on it."""
-    name = "outage_respected"
     outages = begun(recorded, lambda fault: isinstance(fault, GnssOutage))
     there = np.isfinite(recorded.vectors("position_m")[..., 0])
     without = there & np.isnan(recorded.vectors("fix_m")[..., 0])
     if not outages and not without.any():
-        return NotExercised(name, "no fault takes the fixes" if recorded.plan else NO_FAULTS)
+        return not_exercised("no fault takes the fixes" if recorded.plan else NO_FAULTS)
     due = np.zeros_like(without)
     for planned in outages:
         due |= recorded.struck(planned) & there
@@ -250,7 +245,6 @@ def check_outage_respected(recorded: RecordedRun) -> Finding:
     count = len(period)
     text = f"{counted(int(due.sum()), 'fix', 'fixes')} withheld, and no others"
     return result(
-        name,
         count,
         text,
         f"{counted(count, 'fix', 'fixes')} given in an outage, or withheld without",
@@ -262,22 +256,21 @@ def check_outage_respected(recorded: RecordedRun) -> Finding:
 def check_fault_loss(recorded: RecordedRun) -> Iterator[Finding]:
     """Yield for each fault that loses receptions by chance whether it does so at its rate."""
     for planned in begun(recorded, _loses):
-        yield _loss_of(recorded, planned)
+        yield named(f"loss_rate:{planned.label}", _loss_of(recorded, planned))
 
 
 def _loss_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
-    name = f"loss_rate:{planned.label}"
     hit = recorded.cause == planned.number
     drawing = _drew_for(recorded, planned)
     drawn, lost = int(drawing.sum()), int((hit & drawing).sum())
     if not drawn:
-        return unknown(name, "no reception came as far as this fault", pairs=0)
+        return unknown("no reception came as far as this fault", pairs=0)
     expected, low, high = loss_band(planned.fault, recorded, planned, drawing)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": expected, "low": low, "high": high}
     text = f"{lost:,} of {counted(drawn, 'reception')} lost, {lost / drawn:.2%}; {expected:.2%} expected"
     outside = not low <= lost <= high
     rows = recorded.rows(drawing & (hit if lost > high else ~hit)) if outside else []
-    return result(name, int(outside), text, f"{text}: outside its band", rows, **figures)
+    return result(int(outside), text, f"{text}: outside its band", rows, **figures)
 
 
 def _drew_for(recorded: RecordedRun, planned: PlannedFault) -> Mask:
@@ -339,72 +332,74 @@ STEADY_FRAMES = 5
 def check_fault_effects(recorded: RecordedRun) -> Iterator[Finding]:
     """Yield a finding for each fault of the plan: it took effect, or nothing shows that it did."""
     for planned in recorded.plan:
-        name = f"effect:{planned.label}"
-        if planned.start_ns == planned.end_ns:
-            yield NotExercised(name, "it was healed before it began")
-        elif planned.start_ns >= recorded.closed_ns:
-            yield unknown(name, "the run ended before it began")
-        elif isinstance(planned.fault, SenderFault) and _held_down(recorded, planned):
-            yield NotExercised(name, "other faults kept its vehicles from sending throughout")
-        else:
-            yield effect(planned.fault, recorded, planned, name)
+        yield named(f"effect:{planned.label}", _effect_of(recorded, planned))
+
+
+def _effect_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
+    if planned.start_ns == planned.end_ns:
+        return not_exercised("it was healed before it began")
+    if planned.start_ns >= recorded.closed_ns:
+        return unknown("the run ended before it began")
+    if isinstance(planned.fault, SenderFault) and _held_down(recorded, planned):
+        return not_exercised("other faults kept its vehicles from sending throughout")
+    return effect(planned.fault, recorded, planned)
 
 
 @singledispatch
-def effect(fault: Fault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def effect(fault: Fault, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     """Return what shows that a planned fault took effect: unless its class says otherwise, rows that name it."""
     count = int((recorded.cause == planned.number).sum())
-    return _found(name, count, "reception names it|receptions name it", "no reception names it")
+    return _found(count, "reception names it|receptions name it", "no reception names it")
 
 
 @effect.register
-def _(fault: Corrupt, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def _(fault: Corrupt, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     changed = changed_bytes(recorded) & (recorded.cause == planned.number)
     text = "reception with changed bytes|receptions with changed bytes"
-    return _found(name, int(changed.sum()), text, "no reception with changed bytes")
+    return _found(int(changed.sum()), text, "no reception with changed bytes")
 
 
 @effect.register
-def _(fault: DelayFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
-    return _later(name, _delayed(recorded, planned))
+def _(fault: DelayFault, recorded: RecordedRun, planned: PlannedFault) -> Finding:
+    return _later(_delayed(recorded, planned))
 
 
 @effect.register
-def _(fault: Throttle, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
-    return _later(name, _delayed(recorded, planned) + _overflowed(recorded, planned))
+def _(fault: Throttle, recorded: RecordedRun, planned: PlannedFault) -> Finding:
+    return _later(_delayed(recorded, planned) + _overflowed(recorded, planned))
 
 
-def _later(name: str, count: int) -> CheckResult:
+def _later(count: int) -> CheckResult:
     text = "arrival is later than it could be without it|arrivals are later than they could be without it"
-    return _found(name, count, text, "no arrival is later than it could be without it")
+    return _found(count, text, "no arrival is later than it could be without it")
 
 
 @effect.register
-def _(fault: ProcessFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def _(fault: ProcessFault, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     count = _silenced(recorded, planned)
     text = "node neither sent nor received|nodes neither sent nor received"
-    return _found(name, count, text, "no node had sent or reported before and then not")
+    return _found(count, text, "no node had sent or reported before and then not")
 
 
 @effect.register
-def _(fault: GnssFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def _(fault: GnssFault, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     error_m = receiver_noise_m(recorded)[_affected(recorded, planned)]
     error_m = error_m[np.isfinite(error_m).all(axis=1)]
     as_noise = not len(error_m) or is_noise(error_m, recorded.scenario.world.gnss.sigma_m)
-    return _wrong_fixes(name, 0 if as_noise else len(error_m))
+    return _wrong_fixes(0 if as_noise else len(error_m))
 
 
 @effect.register
-def _(fault: GnssOutage, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def _(fault: GnssOutage, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     fix_m = recorded.vectors("fix_m")[_affected(recorded, planned)]
-    return _wrong_fixes(name, int((~np.isfinite(fix_m).all(axis=1)).sum()))
+    return _wrong_fixes(int((~np.isfinite(fix_m).all(axis=1)).sum()))
 
 
 @effect.register
-def _(fault: GnssFreeze, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def _(fault: GnssFreeze, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     fix_m = recorded.vectors("fix_m")
     repeated = (fix_m[1:] == fix_m[:-1]).all(axis=2)
-    return _wrong_fixes(name, int(repeated[_affected(recorded, planned)[1:]].sum()))
+    return _wrong_fixes(int(repeated[_affected(recorded, planned)[1:]].sum()))
 
 
 def _affected(recorded: RecordedRun, planned: PlannedFault) -> Mask:
@@ -412,10 +407,10 @@ def _affected(recorded: RecordedRun, planned: PlannedFault) -> Mask:
     return np.asarray(recorded.struck(planned) & np.isfinite(recorded.vectors("position_m")[..., 0]))
 
 
-def _wrong_fixes(name: str, count: int) -> CheckResult:
+def _wrong_fixes(count: int) -> CheckResult:
     what = "missing, repeated, or further off than receiver noise"
     text = f"fix is {what}|fixes are {what}"
-    return _found(name, count, text, "the fixes could be those of a receiver without faults")
+    return _found(count, text, "the fixes could be those of a receiver without faults")
 
 
 def _held_down(recorded: RecordedRun, planned: PlannedFault) -> bool:
@@ -434,12 +429,12 @@ def _held_down(recorded: RecordedRun, planned: PlannedFault) -> bool:
     return bool(planned.nodes.any())
 
 
-def _found(name: str, count: int, text: str, nothing: str) -> CheckResult:
+def _found(count: int, text: str, nothing: str) -> CheckResult:
     """Return a valid result that `count` things were seen: `text` says what, `of one|of several`."""
     if not count:
-        return unknown(name, nothing, count=0)
+        return unknown(nothing, count=0)
     one, several = text.split("|")
-    return CheckResult(name, Verdict.VALID, counted(count, one, several), {"count": count})
+    return valid(counted(count, one, several), count=count)
 
 
 def _delayed(recorded: RecordedRun, planned: PlannedFault) -> int:
@@ -499,7 +494,7 @@ def _missed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
 
 
 @effect.register
-def _(fault: ClockFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def _(fault: ClockFault, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     """Return whether vehicles that always sent at the same time within the period send at another time."""
     phase_ns = recorded.sent_ns % recorded.scenario.period_ns
     originals = recorded.copy == 0
@@ -513,9 +508,9 @@ def _(fault: ClockFault, recorded: RecordedRun, planned: PlannedFault, name: str
             moved += bool((np.abs(during - np.median(before)) > 2 * tolerance_ns).any())
     if moved:
         return _found(
-            name, moved, "vehicle sends at other times of the period|vehicles send at other times of the period", ""
+            moved, "vehicle sends at other times of the period|vehicles send at other times of the period", ""
         )
-    return NotExercised(name, "these vehicles do not send by their own clocks, and nothing else would show them")
+    return not_exercised("these vehicles do not send by their own clocks, and nothing else would show them")
 
 
 def _disturbed(recorded: RecordedRun) -> Mask:
@@ -528,11 +523,11 @@ def _disturbed(recorded: RecordedRun) -> Mask:
 
 
 @effect.register
-def _(fault: Infrastructure, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+def _(fault: Infrastructure, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     done = [e for e in recorded.event(f"{fault.kind}ed") if e.time_ns >= planned.start_ns]
     if done:
-        return _found(name, len(done), "restart|restarts", "")
+        return _found(len(done), "restart|restarts", "")
     started = recorded.event(EventKind.started)
     if started and not started[0].details.get("start_up_s"):
-        return NotExercised(name, "a simulation has neither router nor sessions")
-    return unknown(name, "no event says that anything was restarted")
+        return not_exercised("a simulation has neither router nor sessions")
+    return unknown("no event says that anything was restarted")

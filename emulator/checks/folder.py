@@ -37,6 +37,9 @@ from emulator.records.verdicts import (
     Judgement,
     NotExercised,
     Verdict,
+    invalid,
+    named,
+    not_exercised,
     result,
     unknown,
 )
@@ -70,7 +73,7 @@ ROUNDED_S = 0.001
 
 def kept(unkept: Sequence[str]) -> list[Finding]:
     """Return, at the end of a run, the finding that the disk has refused files; none if it has kept all."""
-    return [unknown(FILES, f"not kept: {'; '.join(unkept)}", unkept=list(unkept))] if unkept else []
+    return [named(FILES, unknown(f"not kept: {'; '.join(unkept)}", unkept=list(unkept)))] if unkept else []
 
 
 def check_files(recorded: OpenedRun) -> Finding:
@@ -78,16 +81,16 @@ def check_files(recorded: OpenedRun) -> Finding:
     digests = read_manifest(recorded.folder)
     if digests is None:
         if recorded.record.format < FIRST_WITH_MANIFEST:
-            return NotExercised(FILES, f"a folder of format {recorded.record.format} has no manifest")
-        return CheckResult(FILES, Verdict.INVALID, f"there is no {MANIFEST_FILE}")
+            return not_exercised(f"a folder of format {recorded.record.format} has no manifest")
+        return invalid(f"there is no {MANIFEST_FILE}")
     differing = differing_files(recorded.folder, digests)
     for check in recorded.record.checks if not differing else ():
         if check.name == FILES and check.figures.get("unkept"):
-            return unknown(FILES, check.text, **check.figures)  # whatever verdict the file gives itself
+            return unknown(check.text, **check.figures)  # whatever verdict the file gives itself
     first = next((f"{name} {what}" for name, what in differing.items()), "")
     rows = [{"file": name, "what": what} for name, what in differing.items()]
     text = f"{counted(len(digests), 'file')} as they were written"
-    return result(FILES, len(rows), text, f"{counted(len(rows), 'file')} other than written: {first}", rows)
+    return result(len(rows), text, f"{counted(len(rows), 'file')} other than written: {first}", rows)
 
 
 def verdict_figures(recorded: RecordedRun, rows: Sequence[Any]) -> dict[str, Any]:
@@ -109,11 +112,10 @@ def verdict_figures(recorded: RecordedRun, rows: Sequence[Any]) -> dict[str, Any
 
 def check_payloads(recorded: OpenedRun) -> Finding:
     """Check that the payload of each frame is the one whose digest the trace has."""
-    name = "payloads"
     if not recorded.scenario.run.keep_payloads:
-        return NotExercised(name, "run.keep_payloads is false")
+        return not_exercised("run.keep_payloads is false")
     if any(isinstance(planned.fault, (SenderFault, Corrupt, OwnRule)) for planned in recorded.plan):
-        return NotExercised(name, "faults change what is sent or received")
+        return not_exercised("faults change what is sent or received")
     kept, first = recorded.payloads, _sent_frames(recorded)
     digests, node_ids = recorded.digest, recorded.node_ids
     frames = [(node_ids[recorded.sender[row]], int(recorded.seq[row]), int(digests[row])) for row in first.tolist()]
@@ -123,15 +125,14 @@ def check_payloads(recorded: OpenedRun) -> Finding:
         if kept is None or kept.of(sender, seq, (digest,)) is None
     ]
     text = f"payloads of {counted(len(frames), 'frame')} as they were sent"
-    return result(name, len(wrong), text, f"{counted(len(wrong), 'frame')} with another payload", wrong[:MOST_ROWS])
+    return result(len(wrong), text, f"{counted(len(wrong), 'frame')} with another payload", wrong[:MOST_ROWS])
 
 
 def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
     """Check that verdict.json has the figures that the other files give, and the verdict that its checks give."""
-    name = "verdict_file"
     record = recorded.record
     if record.format == 1:
-        return NotExercised(name, "figures of a folder of format 1 meant something else")
+        return not_exercised("figures of a folder of format 1 meant something else")
     kept_figures = _plain(record)
     computed = verdict_figures(recorded, rows_of(recorded.metrics)) | dict(_of_the_course(recorded))
     if record.format < 4:  # which left out some
@@ -149,9 +150,7 @@ def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
         wrong.append({"figure": "verdict", "kept": record.verdict.value, "computed": summed.value})
     text = f"{VERDICT_FILE} has what the other files give"
     first = f", first {wrong[0]['figure']}" if wrong else ""
-    return result(
-        name, len(wrong), text, f"{counted(len(wrong), 'figure')} other than the files give{first}", wrong
-    )
+    return result(len(wrong), text, f"{counted(len(wrong), 'figure')} other than the files give{first}", wrong)
 
 
 def _of_the_course(recorded: OpenedRun) -> Iterator[tuple[str, Any]]:
@@ -338,7 +337,7 @@ FOLDER_CHECKS = (
 """Checks of a folder by themselves; `verdict_file` comes last, as it compares what all others have found."""
 VERDICT_FILE_CHECK = FolderCheck(
     "verdict_file",
-    lambda recorded: NotExercised("verdict_file", "judged with all others"),
+    lambda recorded: not_exercised("judged with all others"),
     f"`{VERDICT_FILE}` has the figures, the numbers of frames and vehicles, and the checks that the other files "
     "give.",
     "another figure, or a check that the files do not give",
@@ -348,10 +347,10 @@ VERDICT_FILE_CHECK = FolderCheck(
 
 def judge_folder(recorded: OpenedRun, judgement: Judgement) -> None:
     """Add the findings of the checks of a folder to those of its run."""
-    findings = [check_files(recorded)]
+    findings: list[Finding] = [named(FILES, check_files(recorded))]
     if len(recorded.states):
-        findings += [check.function(recorded) for check in FOLDER_CHECKS[1:]]
-        findings.append(check_verdict_file(recorded, judgement))
+        findings += [named(check.name, check.function(recorded)) for check in FOLDER_CHECKS[1:]]
+        findings.append(named(VERDICT_FILE_CHECK.name, check_verdict_file(recorded, judgement)))
     else:
         findings += [NotExercised(check.name, NO_PERIOD) for check in (*FOLDER_CHECKS[1:], VERDICT_FILE_CHECK)]
     for finding in findings:

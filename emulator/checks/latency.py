@@ -167,10 +167,9 @@ def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arr
 
 def check_latency(recorded: RecordedRun) -> Finding:
     """Check that arrivals are neither earlier nor later than airtime, latency, queue, jitter and faults explain."""
-    name = "latency"
     timed = recorded.arrived & (recorded.due_ns >= 0)
     if not timed.any():
-        return nothing_seen(name, recorded, "nothing arrived")
+        return nothing_seen(recorded, "nothing arrived")
     allowed = bounds(recorded)
     early = timed & (recorded.due_ns < allowed.earliest_ns)
     late = timed & (recorded.due_ns > allowed.latest_ns)
@@ -186,7 +185,7 @@ def check_latency(recorded: RecordedRun) -> Finding:
         f"{figures['early']} too early, {figures['late']} too late" if broken else f"{text}: outside its band"
     )
     rows = recorded.rows(early | late if broken else timed & allowed.alone) if broken or off else []
-    return result(name, broken + off, text, broken_text, rows, **figures)
+    return result(broken + off, text, broken_text, rows, **figures)
 
 
 def _mean_latency(recorded: RecordedRun, allowed: Bounds, timed: Mask) -> dict[str, float]:

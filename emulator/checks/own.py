@@ -19,8 +19,19 @@ import numpy as np
 from emulator.records.events import Event, EventKind
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run import Run
-from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Record, Verdict, unknown
-from emulator.records.verdicts import result as finding
+from emulator.records.verdicts import (
+    MOST_ROWS,
+    CheckResult,
+    Finding,
+    NotExercised,
+    Record,
+    Verdict,
+    invalid,
+    named,
+    not_exercised,
+    unknown,
+    valid,
+)
 from emulator.scenario.faults import OwnRule
 from emulator.scenario.own_functions import declared_checks, in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
@@ -86,7 +97,7 @@ def own_findings(program: Program, run: Run) -> list[Finding]:
                 findings[finding.name] = finding
         except KeyboardInterrupt:
             interrupted = True
-            findings[_broken(entry)] = unknown(_broken(entry), "interrupted")
+            findings[_broken(entry)] = named(_broken(entry), unknown("interrupted"))
         except (Exception, SystemExit) as error:
             findings[_broken(entry)] = _unknown(entry, error)
     return list(findings.values())
@@ -110,9 +121,9 @@ def _unknown(entry: str, error: BaseException) -> CheckResult:
         said = str(error) if isinstance(error, _NonsenseError) else f"raises {in_words(error)}"
     frames = outside(error, __file__)
     if frames is None or isinstance(error, _NonsenseError):
-        return unknown(_broken(entry), said)
+        return named(_broken(entry), unknown(said))
     where = "".join(traceback.format_exception(error.with_traceback(frames)))
-    return unknown(_broken(entry), f"{said} ({line_of(frames)})", where=where)
+    return named(_broken(entry), unknown(f"{said} ({line_of(frames)})", where=where))
 
 
 def _findings_of(entry: str, program: Program, run: Run) -> Iterator[Finding]:
@@ -198,17 +209,17 @@ def recorded_findings(record: Record) -> list[Finding]:
 
 def check_own_rules(recorded: RecordedRun) -> Finding:
     """Check that no rule of the user's own raised, answered nonsense, or did not answer at all."""
-    name = "own_rules"
     rules = [fault for fault in recorded.scenario.fault if isinstance(fault, OwnRule)]
     failed = recorded.event(EventKind.rule_failed)
     sensors = recorded.scenario.world.sensor
     if not rules and not sensors and not failed:
-        return NotExercised(name, "no rule and no sensor of your own")
+        return not_exercised("no rule and no sensor of your own")
     answered = [f"{counted(len(rules), 'rule')} of your own answered every frame"] if rules else []
     answered += [f"{counted(len(sensors), 'sensor')} of your own answered every period"] if sensors else []
     text = " and ".join(answered)
-    broken_text = "; ".join(map(_told, failed))
-    return finding(name, len(failed), text, broken_text, list(map(_row, failed)), failed=len(failed))
+    if not failed:
+        return valid(text, failed=0)
+    return invalid("; ".join(map(_told, failed)), failed=len(failed), rows=list(map(_row, failed))[:MOST_ROWS])
 
 
 def _told(event: Event) -> str:

@@ -18,7 +18,7 @@ from emulator.radio.reception import Threshold, milliwatts
 from emulator.radio.unicast import MOST_ATTEMPTS, ack_airtime_ns
 from emulator.records.distributions import chi2_sf
 from emulator.records.recorded_run import ON_AIR, RecordedRun
-from emulator.records.verdicts import Finding, NotExercised, result
+from emulator.records.verdicts import Finding, not_exercised, result
 from emulator.scenario.faults import Throttle
 from emulator.scenario.radio import EtsiReactive, Limeric, Receiver
 from emulator.scenario.scenario import Radio
@@ -38,13 +38,12 @@ ROUNDING = 1e-6
 
 def check_fading(recorded: RecordedRun) -> Finding:
     """Check that as many receptions faded as path loss, fading and noise predict."""
-    name = "fading"
     radio = recorded.scenario.radio
     if not radio.is_physical:
-        return NotExercised(name, "unit-disc radio: no fading")
+        return not_exercised("unit-disc radio: no fading")
     drawing = np.flatnonzero(recorded.outcome_is(*ON_AIR) & ~received_twice(recorded) & recorded.placed)
     if not len(drawing):
-        return nothing_seen(name, recorded, "no reception came as far as the receiver")
+        return nothing_seen(recorded, "no reception came as far as the receiver")
     survives = _survival(recorded, radio, drawing)
     faded = recorded.outcome_is("faded")[drawing]
     expected, seen = float((1 - survives).sum()), int(faded.sum())
@@ -60,7 +59,7 @@ def check_fading(recorded: RecordedRun) -> Finding:
         rows, unlike = drawing[impossible], True
         broken_text = f"{counted(len(rows), 'reception')} with an impossible outcome"
         figures["impossible"] = len(rows)
-    return result(name, broken + unlike, text, broken_text, recorded.rows(rows), **figures)
+    return result(broken + unlike, text, broken_text, recorded.rows(rows), **figures)
 
 
 def _unlike_their_law(
@@ -186,11 +185,10 @@ def check_medium(recorded: RecordedRun) -> Finding:
     No vehicle sends twice at once, without a pause, or while it senses another transmission. A collided frame met
     another transmission that its receiver could hear, and no vehicle receives while it sends.
     """
-    name = "medium"
     if not recorded.shares_air:
-        return NotExercised(name, "no MAC configured ([radio.mac])")
+        return not_exercised("no MAC configured ([radio.mac])")
     if not len(recorded.trace):
-        return nothing_seen(name, recorded, "no frame was sent")
+        return nothing_seen(recorded, "no frame was sent")
     air = _Air.of(recorded)
     broken: dict[str, NDArray[np.intp]] = {
         "mistimed": _mistimed(recorded),
@@ -208,7 +206,7 @@ def check_medium(recorded: RecordedRun) -> Finding:
     text = f"{sent} by the rules of the MAC, {counted(collided, 'reception')} collided"
     broken_text = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
     rows = recorded.rows(np.concatenate(list(broken.values())))
-    return result(name, total, text, broken_text, rows, transmissions=len(air.rows), collided=collided, **counts)
+    return result(total, text, broken_text, rows, transmissions=len(air.rows), collided=collided, **counts)
 
 
 def _mistimed(recorded: RecordedRun) -> NDArray[np.intp]:

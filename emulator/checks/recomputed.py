@@ -24,7 +24,7 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.recorded_world import ARRAYS, RecordedWorld
 from emulator.records.run_folder import WORLD_FILE
 from emulator.records.tables import BUSY, STATES
-from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result
+from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, Verdict, invalid, not_exercised, result
 from emulator.scenario.faults import OwnRule, SenderFault, StaleMessages
 from emulator.scenario.loading import input_files_of
 from emulator.scenario.scenario import Scenario
@@ -59,9 +59,8 @@ def same_numbers(ours: Array, theirs: Array, tolerance: float = ABSOLUTE) -> Mas
 
 def check_metrics(recorded: OpenedRun) -> Finding:
     """Check that the metrics are those of the states, and that verdict.json has their hash."""
-    name = "metrics"
     if not len(recorded.metrics) and not recorded.periods:
-        return NotExercised(name, "no period was completed")
+        return not_exercised("no period was completed")
     rows = rows_of(recorded.metrics)
     wrong = list(_wrong_metrics(recorded, rows))
     if (told := recorded.record.metrics_sha256) and told != sha256_of_rows(rows):
@@ -69,7 +68,7 @@ def check_metrics(recorded: OpenedRun) -> Finding:
     text = f"{counted(len(rows), 'period')}, all figures as the states give them"
     first = f", first {wrong[0]['figure']}" if wrong else ""
     broken_text = f"{counted(len(wrong), 'figure')} other than the states give{first}"
-    return result(name, len(wrong), text, broken_text, wrong)
+    return result(len(wrong), text, broken_text, wrong)
 
 
 def _wrong_metrics(recorded: RecordedRun, rows: list[Any]) -> Iterator[dict[str, Any]]:
@@ -122,15 +121,15 @@ def input_of(scenario: Scenario) -> str:
 
 def check_truth(recorded: OpenedRun) -> Finding:
     """Check that positions, headings, common errors and fixes are those that the scenario and its seed give."""
-    name, scenario = "truth", recorded.scenario
+    scenario = recorded.scenario
     if why := input_of(scenario):
-        return NotExercised(name, why)
+        return not_exercised(why)
     vehicles = len(recorded.world.node_ids)
     if vehicles != scenario.network.vehicles + len(scenario.roadside):
         text = f"{WORLD_FILE} has {counted(vehicles, 'node')}, the scenario {scenario.network.vehicles}"
-        return CheckResult(name, Verdict.INVALID, text)
+        return invalid(text)
     if periods_of(scenario) * vehicles > len(recorded.states) + SPARE_ROWS:
-        return NotExercised(name, "the run was cut short")
+        return not_exercised("the run was cut short")
     world = build_world(scenario)
     ours, theirs = recorded.world, RecordedWorld.of(world)
     wrong = [{"file": WORLD_FILE, "column": each} for each in ARRAYS if not _same_array(ours, theirs, each)]
@@ -141,7 +140,7 @@ def check_truth(recorded: OpenedRun) -> Finding:
     text = f"{counted(recorded.periods, 'period')} of {counted(vehicles, 'node')} as the scenario gives them"
     first = f"{wrong[0]['column']} of {wrong[0]['file']}" if wrong else ""
     broken_text = f"other truth or fixes than the scenario gives, first in {first}"
-    return result(name, len(wrong), text, broken_text, wrong)
+    return result(len(wrong), text, broken_text, wrong)
 
 
 def _same_array(ours: RecordedWorld, theirs: RecordedWorld, name: str) -> bool:
@@ -178,16 +177,15 @@ def _wrong_states(recorded: RecordedRun, gnss: FaultyGnss, periods: int) -> list
 
 def check_outcomes(recorded: OpenedRun) -> Finding:
     """Check that each reception has the outcome, cause and arrival that the radio gives the frames of the trace."""
-    name = "outcomes"
     if why := _why_not_decided_again(recorded):
-        return NotExercised(name, why)
+        return not_exercised(why)
     size = recorded.column("size_bytes")
     if int(size.min()) < 0 or int(size.max()) > LARGEST_MESSAGE_BYTES:
-        return CheckResult(name, Verdict.INVALID, f"frames of {int(size.min())} to {int(size.max())} bytes")
+        return invalid(f"frames of {int(size.min())} to {int(size.max())} bytes")
     try:
         engine = _decided_again(recorded)
     except (AssertionError, IndexError, OverflowError, ValueError) as error:  # no run has such frames
-        return CheckResult(name, Verdict.INVALID, f"the radio cannot send these frames: {printable(str(error))}")
+        return invalid(f"the radio cannot send these frames: {printable(str(error))}")
     computed = engine.trace.to_table()
     order = np.lexsort([_codes(recorded, each) for each in reversed(KEY)])
     kept = recorded.trace.take(pa.array(order))
@@ -195,7 +193,7 @@ def check_outcomes(recorded: OpenedRun) -> Finding:
     counts = {outcome.name: count for outcome, count in engine.counts.items()}
     text = f"{counted(len(kept), 'reception')} decided again as they were"
     broken_text = f"{counted(len(wrong), 'reception')} other than the radio decides" if wrong else ""
-    return result(name, len(wrong), text, broken_text, wrong, out_of_range=counts["out_of_range"])
+    return result(len(wrong), text, broken_text, wrong, out_of_range=counts["out_of_range"])
 
 
 def _wrong_busy_ratios(recorded: RecordedRun, engine: Engine) -> list[dict[str, Any]]:

@@ -37,6 +37,7 @@ from emulator.checks.run import (
     FLOOR_KIB,
     RISING_TENTHS,
     check_agents_alive,
+    check_fault_events,
     check_finite,
     check_kept_up,
     check_liveness,
@@ -44,12 +45,13 @@ from emulator.checks.run import (
     check_no_exceptions,
     check_presence,
     check_progress,
+    check_reports,
+    check_row_order,
     check_transport,
 )
 from emulator.checks.senders import check_copies, check_gnss
-from emulator.checks.tables import check_fault_events, check_reports, check_row_order
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict
+from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, named
 from vnet.reports import LONGEST_TEXT
 
 Function = Callable[[RecordedRun], Finding] | Callable[[RecordedRun], Iterator[Finding]]
@@ -78,7 +80,8 @@ class Check:
     """One check: its function and its row of the reference page.
 
     `invalid`, `unknown` and `not_applicable` say when a run gets that verdict; empty: never. `name` defaults to
-    that of the function; a check with a finding for each fault is named `NAME:LABEL`, and its function yields them.
+    that of the function; a check with a finding for each fault is named `NAME:LABEL`, and its function yields them
+    with their names.
     """
 
     function: Function
@@ -108,7 +111,8 @@ class Check:
         """Judge a run."""
         if len(recorded.states) or self.without_positions is WithoutPositions.JUDGE:
             found = self.function(recorded)
-            yield from map(self._within_class, found if isinstance(found, Iterable) else [found])
+            findings = found if isinstance(found, Iterable) else [named(self.name, found)]
+            yield from map(self._within_class, findings)
         elif self.without_positions is WithoutPositions.UNKNOWN:
             yield CheckResult(self.name, Verdict.UNKNOWN, NO_PERIOD)
         elif not self.per_fault:

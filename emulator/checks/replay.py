@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from emulator.records.parting import partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import AGAIN
-from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result
+from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, invalid, named, valid
 from vnet.errors import VnetError, printable
 from vnet.units import NS_PER_S
 
@@ -141,7 +141,7 @@ def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> CheckResult:
         if index is not None:
             return _difference(name, first, second, index)
     text = f"two runs agree: {len(tables[0][1]):,} rows of the trace, all states and metrics"
-    return result("replay", 0, text, "", rows_each=len(tables[0][1]))
+    return named("replay", valid(text, rows_each=len(tables[0][1])))
 
 
 def _difference(name: str, first: pa.Table, second: pa.Table, index: int) -> CheckResult:
@@ -153,7 +153,7 @@ def _difference(name: str, first: pa.Table, second: pa.Table, index: int) -> Che
         for run, row in (("first", ours), ("again", theirs))
     ]
     text = f"two runs differ, first in row {index} of the {name}: {how}"
-    return result("replay", 1, "", text, shown, table=name, row=index, differing=differing)
+    return named("replay", invalid(text, table=name, row=index, differing=differing, rows=shown))
 
 
 def first_difference(first: pa.Table, second: pa.Table) -> int | None:

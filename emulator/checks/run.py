@@ -1,7 +1,8 @@
-"""Checks of the run itself: all processes lived and reported, and the machine kept up."""
+"""Checks of the run itself: processes lived and reported, the machine kept up, and rows and reports are sound."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -14,10 +15,24 @@ from emulator.records.distributions import lowest_share
 from emulator.records.events import Event, EventKind, in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
-from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result, unknown
+from emulator.records.run_tables import VALUES_AS_LIST
+from emulator.records.tables import STATES
+from emulator.records.verdicts import (
+    MOST_ROWS,
+    NO_FAULTS,
+    CheckResult,
+    Finding,
+    Verdict,
+    invalid,
+    not_exercised,
+    result,
+    unknown,
+    valid,
+)
 from emulator.scenario.faults import ProcessFault
 from vnet.counted import counted
-from vnet.errors import first_names
+from vnet.errors import first_names, printable
+from vnet.reports import COVARIANCE_TOLERANCE, LONGEST_TEXT, check_name
 from vnet.types import IntArray, Mask
 from vnet.units import NS_PER_S
 
@@ -31,7 +46,6 @@ START_UP_NS = 5 * NS_PER_S
 
 def check_transport(recorded: RecordedRun) -> Finding:
     """Check that no message between agents and emulator went missing."""
-    name = "transport"
     gaps = sum(int(event.details.get("count", 1)) for event in recorded.event(EventKind.transport_gap))
     lost = recorded.outcome_is("transport")
     if gaps or lost.any():
@@ -40,33 +54,31 @@ def check_transport(recorded: RecordedRun) -> Finding:
         text = (
             f"{counted(gaps, 'gap')} in sequence numbers, {missing} that never arrived: the machine, not the radio"
         )
-        return unknown(name, text, gaps=gaps, lost=count)
-    return CheckResult(name, Verdict.VALID, "no message between agents and emulator went missing", {"gaps": 0})
+        return unknown(text, gaps=gaps, lost=count)
+    return valid("no message between agents and emulator went missing", gaps=0)
 
 
 def check_agents_alive(recorded: RecordedRun) -> Finding:
     """Check that no process died and no program crashed, except those that a fault ended."""
-    name = "agents_alive"
     gone = [
         event for event in recorded.event(EventKind.died, EventKind.crashed) if not _was_killed(recorded, event)
     ]
     if not gone and not recorded.event(EventKind.started):
-        return unknown(name, "no event says that the run started")
+        return unknown("no event says that the run started")
     if not gone:
         who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
-        return CheckResult(name, Verdict.VALID, f"{who} to the end")
+        return valid(f"{who} to the end")
     listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
-    return CheckResult(name, Verdict.INVALID, in_words(kinds_of(gone)), {"gone": listed})
+    return invalid(in_words(kinds_of(gone)), gone=listed)
 
 
 def check_no_exceptions(recorded: RecordedRun) -> Finding:
     """Check that programs handled every exception that was raised in their tasks, callbacks, jobs and threads."""
-    name = "no_exceptions"
     raised = recorded.event(EventKind.exception)
     if not raised and not recorded.event(EventKind.started):
-        return unknown(name, "no event says that the run started")
+        return unknown("no event says that the run started")
     if not raised:
-        return CheckResult(name, Verdict.VALID, "no exception was left unhandled")
+        return valid("no exception was left unhandled")
     kinds = kinds_of(raised)
     left_out = sum(
         int(e.details["count"])
@@ -84,7 +96,7 @@ def check_no_exceptions(recorded: RecordedRun) -> Finding:
         for kind in kinds
     ]
     first = {"node": kinds[0].first.node, "where": kinds[0].first.details.get("where", "")}
-    return result(name, len(raised), "", in_words(kinds), rows, count=len(raised) + left_out, **first)
+    return result(len(raised), "", in_words(kinds), rows, count=len(raised) + left_out, **first)
 
 
 def _was_killed(recorded: RecordedRun, event: Event) -> bool:
@@ -98,12 +110,11 @@ def _was_killed(recorded: RecordedRun, event: Event) -> bool:
 
 def check_progress(recorded: RecordedRun) -> Finding:
     """Check that the run reached its end: no busy loop, no hang, no interruption."""
-    name = "progress"
     if spun := recorded.event(EventKind.spun):
         event = spun[0]
         when = f"at {event.time_ns / 1e9:.3f} s"
         text = f"{event.node} does not let time advance (busy loop) {when}: {event.details.get('error')}"
-        return CheckResult(name, Verdict.INVALID, text, {"node": event.node, **event.details})
+        return invalid(text, **{"node": event.node, **event.details})
     if stalled := recorded.event(EventKind.stalled):
         event = stalled[0]
         when, error, refused = (
@@ -114,35 +125,34 @@ def check_progress(recorded: RecordedRun) -> Finding:
         text = f"{event.node} hangs at {when}: {error}"
         if refused is not None:
             text = f"the last message of {event.node} at {when} was refused: {refused}; since then {error}"
-        return CheckResult(name, Verdict.UNKNOWN, text, {"node": event.node, **event.details})
+        return unknown(text, **{"node": event.node, **event.details})
     if exceeded := recorded.event(EventKind.memory_exceeded):
-        return unknown(name, memory_exceeded(exceeded[0]), node=exceeded[0].node)
+        return unknown(memory_exceeded(exceeded[0]), node=exceeded[0].node)
     if interrupted := recorded.event(EventKind.interrupted):
-        return unknown(name, f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
+        return unknown(f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
     if not recorded.event(EventKind.ended):
-        return unknown(name, "no event says that the run ended")
+        return unknown("no event says that the run ended")
     due = recorded.scenario.duration_ns // recorded.scenario.period_ns
     if len(recorded.metrics) != due or len(recorded.states) != due * len(recorded.node_ids):
         text = f"{counted(len(recorded.metrics), 'period')} kept, {due} due"
-        return unknown(name, text, periods=len(recorded.metrics), due=due)
-    return CheckResult(name, Verdict.VALID, f"{recorded.scenario.run.duration_s:g} s emulated to the end")
+        return unknown(text, periods=len(recorded.metrics), due=due)
+    return valid(f"{recorded.scenario.run.duration_s:g} s emulated to the end")
 
 
 def check_finite(recorded: RecordedRun) -> Finding:
     """Check that no report holds NaN or infinity."""
-    name = "finite"
     if not len(recorded.metrics):
-        return NotExercised(name, "no period was completed")
+        return not_exercised("no period was completed")
     reporting = int(np.sum(recorded.metrics["reporting"].to_numpy()))
     if reporting == 0:
-        return NotExercised(name, "the program reports nothing")
+        return not_exercised("the program reports nothing")
     not_finite = np.maximum(recorded.metrics["not_finite"].to_numpy(), _not_finite_rows(recorded))
     broken = int(np.sum(not_finite))
     text = f"{counted(reporting, 'report')}, all numbers finite"
     rows = [{"period": int(p), "not_finite": int(not_finite[p])} for p in np.flatnonzero(not_finite)]
     values = "; ".join(_not_finite_values(recorded)) if broken else ""
     broken_text = f"{counted(broken, 'report')} with NaN or infinity" + (f": {values}" if values else "")
-    return result(name, broken, text, broken_text, rows, reports=reporting, not_finite=broken)
+    return result(broken, text, broken_text, rows, reports=reporting, not_finite=broken)
 
 
 def _not_finite_rows(recorded: RecordedRun) -> IntArray:
@@ -178,34 +188,32 @@ def _not_finite_values(recorded: RecordedRun) -> list[str]:
 
 def check_kept_up(recorded: RecordedRun) -> Finding:
     """Check that in real time the machine delivered on time."""
-    name = "kept_up"
     if recorded.scenario.run.pacing != "realtime":
-        return NotExercised(name, "lockstep: nothing can be late")
+        return not_exercised("lockstep: nothing can be late")
     late = recorded.event(EventKind.late_deliveries)
     if not late or not late[-1].details["total"]:
-        return unknown(name, "no delivery was timed")
+        return unknown("no delivery was timed")
     figures = late[-1].details
     count, total = figures["count"], figures["total"]
     at_least = lowest_share(count, total)
     deliveries = counted(total, "delivery", "deliveries")
     text = f"{count / total:.3%} of {deliveries} over 20 ms late (p99 {figures['p99_ms']:.1f} ms)"
     verdict = Verdict.VALID if at_least <= LATE_SHARE_LIMIT else Verdict.UNKNOWN
-    return CheckResult(name, verdict, text, {**figures, "share_at_least": at_least})
+    return CheckResult("", verdict, text, {**figures, "share_at_least": at_least})
 
 
 def check_liveness(recorded: RecordedRun) -> Finding:
     """Check that after the last fault every node that is up reports at least once a second."""
-    name = "liveness"
     if not recorded.reported.any():
-        return NotExercised(name, "the program reports nothing")
+        return not_exercised("the program reports nothing")
     window = max(2, -(-LIVENESS_NS // recorded.scenario.period_ns))
     judged = _expected_to_report(recorded, window)
     if not judged.any():
-        return NotExercised(name, "no program reports once a second")
+        return not_exercised("no program reports once a second")
     start_ns = recorded.period_starts_ns()
     rested = np.flatnonzero(start_ns >= recorded.last_heal_ns)
     if len(rested) < window:
-        return NotExercised(name, "less than a second is left after the last fault")
+        return not_exercised("less than a second is left after the last fault")
     silent: list[dict[str, Any]] = []
     for node in np.flatnonzero(judged).tolist():
         for from_ns, until_ns in _times_up(recorded, node):
@@ -224,7 +232,7 @@ def check_liveness(recorded: RecordedRun) -> Finding:
     if not recorded.plan:
         text = f"{counted(count, 'node')} reported at least once a second"
     broken_text = f"{len(silent)} of {counted(count, 'node')} silent for over a second, {_where(silent)}"
-    return result(name, len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
+    return result(len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
 
 
 def _where(silent: list[dict[str, Any]]) -> str:
@@ -259,13 +267,12 @@ def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
 
 def check_presence(recorded: RecordedRun) -> Finding:
     """Check that vehicles enter and leave when their trips do."""
-    name = "presence"
     if not recorded.moves:
-        return NotExercised(name, "vehicles stand where they are")
+        return not_exercised("vehicles stand where they are")
     there = recorded.places.present()
     changes = _changes(recorded, there)
     if not changes and not recorded.event(EventKind.entered, EventKind.left):
-        return NotExercised(name, "all vehicles are in the network throughout")
+        return not_exercised("all vehicles are in the network throughout")
     known_ns = len(there) * recorded.scenario.period_ns  # of what came later no states are kept
     events = [event for event in recorded.event(EventKind.entered, EventKind.left) if event.time_ns < known_ns]
     told = {(event.kind, str(event.node), event.time_ns) for event in events}
@@ -276,9 +283,7 @@ def check_presence(recorded: RecordedRun) -> Finding:
     rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
     entered = sum(kind == EventKind.entered for kind, _, _ in changes)
     text = f"vehicles entered ({entered}) and left ({len(changes) - entered}) as their trips do"
-    return result(
-        name, len(rows), text, f"{counted(len(rows), 'event')} against the trips", rows, changes=len(changes)
-    )
+    return result(len(rows), text, f"{counted(len(rows), 'event')} against the trips", rows, changes=len(changes))
 
 
 Change = tuple[str, str, int]
@@ -328,17 +333,16 @@ def check_memory(recorded: RecordedRun) -> Finding:
     Judged by the events `memory` {node, time_s, private_kb}, a series each from the start of a process to its end;
     the emulator's own grows with the trace that it keeps, and is not judged.
     """
-    name = "memory"
     if exceeded := recorded.event(EventKind.memory_exceeded):
-        return unknown(name, memory_exceeded(exceeded[0]), node=exceeded[0].node, **exceeded[0].details)
+        return unknown(memory_exceeded(exceeded[0]), node=exceeded[0].node, **exceeded[0].details)
     measured = [
         e for e in recorded.event(EventKind.memory) if e.node in recorded.number and "private_kb" in e.details
     ]
     if not measured:
-        return NotExercised(name, "not measured by vnet simulate")
+        return not_exercised("not measured by vnet simulate")
     judged = [e for e in measured if is_long_enough(e.details["time_s"])]
     if not judged:
-        return NotExercised(name, "no process was measured for 30 s")
+        return not_exercised("no process was measured for 30 s")
     rates = {
         e.node: KB_PER_KIB * steady_growth_kib_per_s(e.details["time_s"], e.details["private_kb"]) for e in judged
     }
@@ -351,7 +355,7 @@ def check_memory(recorded: RecordedRun) -> Finding:
         text = f"note: memory of {of} grows: {node} by {rate:.1f} kB a second, {rate * 3.6:,.0f} MB an hour"
         rows = [{"node": node, "kb_per_s": rate, "kb_per_hour": 3600 * rate} for node, rate in growing.items()]
         figures["growing"] = rows[:MOST_ROWS]
-    return CheckResult(name, Verdict.VALID, text, figures)
+    return valid(text, **figures)
 
 
 def memory_exceeded(event: Event) -> str:
@@ -385,3 +389,168 @@ def steady_growth_kib_per_s(time_s: Sequence[float], size_kb: Sequence[float]) -
     grown_kb = float(levels_kb[-1] - levels_kb[0])
     is_steady = int((np.diff(levels_kb) > 0).sum()) >= RISING_TENTHS and grown_kb >= FLOOR_KIB
     return grown_kb / (to_s - from_s) if is_steady else 0.0
+
+
+KINDS = {str(kind): kind for kind in EventKind}
+KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
+"""Columns by which the rows of the trace are sorted."""
+
+
+def check_row_order(recorded: RecordedRun) -> Finding:
+    """Check that the rows of trace, states and metrics are in order, and that each event can be of the run."""
+    count, period_ns = len(recorded.node_ids), recorded.scenario.period_ns
+    states, metrics = recorded.states, recorded.metrics
+    place = np.arange(len(states))
+    period = place // max(count, 1)
+    columns = {
+        "period of the states": np.asarray(states["period"].to_numpy()) != period,
+        "time_ns of the states": np.asarray(states["time_ns"].to_numpy()) != period * period_ns,
+        "node of the states": _nodes(recorded) != place - period * count,
+        "period of the metrics": np.asarray(metrics["period"].to_numpy()) != np.arange(len(metrics)),
+        "time_ns of the metrics": np.asarray(metrics["time_ns"].to_numpy()) != np.arange(len(metrics)) * period_ns,
+        "trace": _disordered(recorded),
+    }
+    columns["events"] = np.array([_is_nobodys(event, recorded) for event in recorded.events], dtype=bool)
+    kinds = [event.kind for event in recorded.events]
+    if EventKind.started in kinds and EventKind.ended in kinds[: kinds.index(EventKind.started)]:
+        columns["events"][0] = True
+    wrong = {what: np.flatnonzero(mask) for what, mask in columns.items() if mask.any()}
+    rows = [{"table": what, "row": int(where[0]), "count": len(where)} for what, where in wrong.items()]
+    total = sum(map(len, wrong.values()))
+    text = (
+        f"{counted(len(recorded.trace), 'row')} of the trace, {counted(len(states), 'row')} of the states in order"
+    )
+    return result(total, text, f"{counted(total, 'row')} out of order, first in the {next(iter(wrong), '')}", rows)
+
+
+def _is_nobodys(event: Event, recorded: RecordedRun) -> bool:
+    """Return whether an event is of no kind, of no node of the run, or of no time in it."""
+    if event.kind not in KINDS or event.time_ns < 0:
+        return True
+    of_vehicle = (
+        KINDS[event.kind].node_is == "vehicle" and event.kind != EventKind.refused
+    )  # whoever claims to be one
+    if event.node is not None and of_vehicle and event.node not in recorded.number:
+        return bool(recorded.number)
+    return recorded.scenario.run.pacing == "lockstep" and event.time_ns > recorded.scenario.duration_ns
+
+
+def _nodes(recorded: RecordedRun) -> Any:
+    column = recorded.states["node"].combine_chunks().dictionary_encode()
+    code = np.array([recorded.number_of(node) for node in column.dictionary.to_pylist()], dtype=np.intp)
+    return code[column.indices.to_numpy()]
+
+
+def _disordered(recorded: RecordedRun) -> Mask:
+    """Mask (rows,) of the rows of the trace that do not come after the one before."""
+    later = np.zeros(max(len(recorded.trace) - 1, 0), dtype=bool)
+    equal = ~later
+    for column in (recorded.sent_ns, recorded.sender, recorded.seq, recorded.receiver, recorded.copy):
+        step = np.diff(column)
+        later |= equal & (step > 0)
+        equal &= step == 0
+    return np.concatenate([np.zeros(min(len(recorded.trace), 1), dtype=bool), ~later & ~equal])
+
+
+def check_reports(recorded: RecordedRun) -> Finding:
+    """Check that reports hold what `node.report` allows: names, texts and covariance matrices."""
+    if not recorded.reported.any():
+        return not_exercised("the program reports nothing")
+    wrong: list[dict[str, Any]] = [
+        {"what": f"{printable(name)}: not a name of a value"} for name in _names(recorded) if not _allowed(name)
+    ]
+    wrong += [
+        {"what": f"{column}: no covariance matrix", "period": period, "node": recorded.node_ids[node]}
+        for column in recorded.reported_names
+        if column.endswith("covariance_m2")
+        for period, node in np.argwhere(_not_covariances(recorded, column)).tolist()
+    ]
+    for column in recorded.value_names:
+        if is_text(recorded.states[column].type):
+            texts = [text for text in recorded.states[column].unique().to_pylist() if text is not None]
+            wrong += [
+                {"what": f"{column}: text of {len(text)} characters"} for text in texts if len(text) > LONGEST_TEXT
+            ]
+    reports = int(recorded.reported.sum())
+    text = f"{counted(reports, 'report')} hold what node.report allows"
+    first = f": {wrong[0]['what']}" if wrong else ""
+    return result(len(wrong), text, f"{counted(len(wrong), 'value')} that node.report refuses{first}", wrong)
+
+
+def _not_covariances(recorded: RecordedRun, column: str) -> Mask:
+    """Mask (periods, N) of the matrices that are not symmetric and positive semidefinite, but for rounding."""
+    matrix = recorded.matrices(column)
+    a, b, c, d = (matrix[..., row, other] for row in (0, 1) for other in (0, 1))
+    largest = np.abs(matrix).max(axis=(2, 3), initial=0.0)
+    margin = COVARIANCE_TOLERANCE * largest
+    with np.errstate(invalid="ignore", over="ignore"):
+        wrong = (np.abs(b - c) > margin) | (a < -margin) | (d < -margin) | (a * d - b * c < -margin * largest)
+    return np.asarray(wrong)
+
+
+def _names(recorded: RecordedRun) -> list[str]:
+    """Return the names of all values that were reported."""
+    lists = recorded.states["values"].combine_chunks().cast(VALUES_AS_LIST)
+    keys = pc.unique(pc.struct_field(lists.flatten(), "key")).to_pylist()
+    columns = [name for name in recorded.states.column_names if name not in STATES.columns]
+    return [*columns, *(str(key) for key in keys)]
+
+
+def _allowed(name: str) -> bool:
+    try:
+        check_name(name)
+    except ValueError:
+        return False
+    return True
+
+
+def check_fault_events(recorded: RecordedRun) -> Finding:
+    """Check that events tell the start and the end of each fault, and each restart, at their instants."""
+    told_of = recorded.event(EventKind.fault_started, EventKind.fault_ended, EventKind.restarted)
+    if not recorded.plan and not told_of:
+        return not_exercised(NO_FAULTS)
+    in_real_time = recorded.scenario.run.pacing == "realtime"
+    due: Counter[tuple[Any, ...]] = Counter()
+    for planned in recorded.plan:
+        if planned.start_ns >= min(planned.end_ns, recorded.closed_ns):
+            continue  # it never acts
+        nodes = [recorded.node_ids[node] for node in np.flatnonzero(planned.placed(planned.start_ns).nodes)]
+        due[EventKind.fault_started, planned.start_ns, planned.label, tuple(nodes)] += 1
+        if planned.end_ns < recorded.closed_ns:
+            due[EventKind.fault_ended, planned.end_ns, planned.label, ()] += 1
+    for node, time_ns in _restarts(recorded):
+        due[EventKind.restarted, time_ns, node, ()] += 1
+    told: Counter[tuple[Any, ...]] = Counter()
+    for event in told_of:
+        what = event.node if event.kind == EventKind.restarted else event.details.get("fault")
+        nodes = event.details.get("nodes", []) if event.kind == EventKind.fault_started else []
+        told[event.kind, event.time_ns, what, tuple(nodes) if isinstance(nodes, list) else ()] += 1
+    if in_real_time:  # processes take their time, and the run acts when it comes to it
+        due, told = (_without_times(events) for events in (due, told))
+    missing, odd = due - told, told - due
+    rows = [
+        {"event": kind, "time_ns": time_ns, "of": what, "what": how}
+        for how, events in (("missing", missing), ("out of place", odd))
+        for kind, time_ns, what, _ in events.elements()
+    ]
+    text = f"{counted(due.total(), 'event')} of faults as they were planned"
+    return result(len(rows), text, f"{counted(len(rows), 'event')} against the plan of faults", rows[:MOST_ROWS])
+
+
+def _without_times(events: Counter[tuple[Any, ...]]) -> Counter[tuple[Any, ...]]:
+    return Counter((kind, 0, what, ()) for kind, _, what, _ in events.elements() if kind != EventKind.restarted)
+
+
+def _restarts(recorded: RecordedRun) -> list[tuple[str, int]]:
+    """Return the nodes that come back because a fault ends, and when; not those that enter the network."""
+    entered = {(event.node, event.time_ns) for event in recorded.event(EventKind.entered)}
+    ending = [
+        planned for planned in recorded.plan if isinstance(planned.fault, ProcessFault) and planned.fault.ends
+    ]
+    found = set()
+    for planned in ending:
+        nodes, time_ns = np.flatnonzero(planned.nodes), planned.end_ns
+        if planned.start_ns < time_ns < recorded.closed_ns:
+            before, after = (recorded.is_down(nodes, np.full(len(nodes), at)) for at in (time_ns - 1, time_ns))
+            found |= {(recorded.node_ids[node], time_ns) for node in nodes[before & ~after].tolist()}
+    return sorted(found - entered)

@@ -11,7 +11,7 @@ from emulator.checks.channel import received_twice
 from emulator.faults.plan import PlannedFault
 from emulator.records.distributions import chi2_cdf, chi2_sf
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
+from emulator.records.verdicts import NO_FAULTS, Finding, not_exercised, result, unknown
 from emulator.scenario.faults import CustomSender, DataReplay, DoS, GnssFault, Sybil
 from emulator.world.gnss import further_error_m
 from vnet.counted import counted
@@ -26,9 +26,8 @@ CERTAIN = 1e-6
 
 def check_copies(recorded: RecordedRun) -> Finding:
     """Check that floods and Sybils send each frame as often as configured, and replays one of the right age."""
-    name = "copies"
     if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in recorded.plan):
-        return NotExercised(name, "no fault sends frames again" if recorded.plan else NO_FAULTS)
+        return not_exercised("no fault sends frames again" if recorded.plan else NO_FAULTS)
     once = ~received_twice(recorded) & (recorded.attempt < 2)  # what is transmitted again is the MAC's
     first = _first_rows(recorded, once & ~_near_a_change(recorded) & ~_sent_by_rule(recorded))
     originals, copies = first[recorded.copy[first] == 0], first[recorded.copy[first] > 0]
@@ -48,7 +47,7 @@ def check_copies(recorded: RecordedRun) -> Finding:
         f"{counted(len(wrong), 'frame')} not sent as often as configured, {len(odd)} replayed at another time"
     )
     rows = recorded.rows(np.concatenate([wrong, np.array(odd, dtype=np.intp)])) if broken else []
-    return result(name, broken, text, broken_text, rows, copies=len(copies), miscounted=len(wrong), odd=len(odd))
+    return result(broken, text, broken_text, rows, copies=len(copies), miscounted=len(wrong), odd=len(odd))
 
 
 def _of(recorded: RecordedRun, rows: Rows) -> list[tuple[int, int]]:
@@ -118,7 +117,6 @@ def _last_before(sent_ns: IntArray, time_ns: int, planned: PlannedFault) -> int 
 
 def check_gnss(recorded: RecordedRun) -> Finding:
     """Check that fixes differ from the truth, the world's errors and the offsets of faults by receiver noise."""
-    name = "gnss"
     sigma_m = recorded.scenario.world.gnss.sigma_m
     error_m = receiver_noise_m(recorded)
     for planned in recorded.plan:
@@ -136,12 +134,12 @@ def check_gnss(recorded: RecordedRun) -> Finding:
     groups = {label: group & usable for label, group in groups.items()}
     judged = {label: error_m[group] for label, group in groups.items() if group.any()}
     if not judged:
-        return unknown(name, "no fix is free of faults with random effect")
+        return unknown("no fix is free of faults with random effect")
     rows = [_described(label, error) for label, error in judged.items() if not is_noise(error, sigma_m)]
     fixes = sum(map(len, judged.values()))
     text = f"{counted(fixes, 'fix', 'fixes')} with the noise of {sigma_m:g} m"
     broken_text = f"fixes do not have the receiver's noise: {', '.join(row['under'] for row in rows)}"
-    return result(name, len(rows), text, broken_text, rows, fixes=fixes)
+    return result(len(rows), text, broken_text, rows, fixes=fixes)
 
 
 def receiver_noise_m(recorded: RecordedRun) -> Array:

@@ -46,7 +46,7 @@ def host(
         from emulator.drivers.hosts.host import run_host
         from vnet.transport.access import host_user
         from vnet.transport.credentials import Credentials
-        from vnet.transport.keys import is_segment
+        from vnet.transport.keys import SEGMENTS, is_segment
         from vnet.transport.session import quiet_zenoh
 
         login = None if credentials is None else Credentials.load(credentials)
@@ -56,7 +56,7 @@ def host(
             name = login.user.removeprefix(host_user(""))
         for each in (run, name):
             if not is_segment(each):
-                raise VnetError(f"{each!r}: names are letters, digits, '_', '.', '-', at most 64")
+                raise VnetError(f"{each!r}: {SEGMENTS}")
         if os.environ.get(STARTED_BY_VNET):
             signal_at_parent_death(signal.SIGKILL)
         quiet_zenoh()

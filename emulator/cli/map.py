@@ -20,7 +20,7 @@ from emulator.world.maps.city import SIZE_M, city_roads
 from emulator.world.maps.files import read_roads, write_roads, writer_of
 from emulator.world.maps.problems import PLACE_M, Calibration, MapReport, calibrate, examine, residuals
 from emulator.world.maps.roads import Roads
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.drive import whole_motion
 from emulator.world.trips.files import check_trips_name, write_trips
 from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
@@ -205,7 +205,7 @@ def _box(middle_m: tuple[float, float], side_km: float) -> tuple[Array, Array]:
     return middle - half_m, middle + half_m
 
 
-def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
+def _print(path: Path, report: MapReport, frame: CoordinateFrame | None) -> None:
     east, north = report.size_km
     console = SafeConsole()
     print(f"{path.name}: {east:.1f} × {north:.1f} km, {report.roads:,} roads, {report.nodes:,} points")

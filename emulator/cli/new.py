@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from emulator.cli.docs import EXAMPLES
+from emulator.records.atomic import check_is_free
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError, did_you_mean, printable
 
@@ -39,8 +40,7 @@ def new(
         folder = Path(name or example or "")
         if example is not None:
             source = _example(example)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise VnetError(f"{folder}: exists and is not an empty folder")
+        check_is_free(folder)
         if example is not None:
             copy_example(source, folder)
         else:

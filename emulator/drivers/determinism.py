@@ -22,7 +22,7 @@ from emulator.checks.replay import CALLS, check_replay, compare_folders
 from emulator.drivers.conclude import judge_further
 from emulator.drivers.emulation import Emulation
 from emulator.records.run_folder import AGAIN
-from emulator.records.verdicts import CheckResult, Finding, unknown
+from emulator.records.verdicts import CheckResult, Finding, named, unknown
 from vnet.errors import VnetError
 from vnet.runtime.replay_probes import CALLS_VARIABLE, SCATTER_VARIABLE
 
@@ -112,12 +112,12 @@ def run_again(
     """
     path = emulation.folder.path
     agreeing: list[str] = []
-    finding: Finding = unknown("replay", "was not repeated")
+    finding: Finding = named("replay", unknown("was not repeated"))
     alive = next((check for check in judgement.checks if check.name == "agents_alive"), finding)
     gone = alive.figures.get("gone", ()) if isinstance(alive, CheckResult) else ()
     if ended := [each["node"] for each in gone if each["kind"] == "died" and "where" not in each]:
         why = f"the process of {ended[0]} ended, at an instant that depends on processes and windows"
-        finding = unknown("replay", f"was not repeated: {why}")
+        finding = named("replay", unknown(f"was not repeated: {why}"))
     for repetition in () if ended else repetitions(command, emulation):
         shutil.rmtree(path / AGAIN, ignore_errors=True)
         status = repetition.run(emulation.folder.scenario_path, path / AGAIN, options)
@@ -136,7 +136,7 @@ def run_again(
 def _compared(path: Path, repetition: Repetition, status: int, agreeing: Sequence[str]) -> Finding:
     """Return the finding on the repetition in a run's folder `again`; `agreeing` are those before it."""
     if status not in {each.exit_status for each in Verdict}:
-        return unknown("replay", f"the run {repetition.name} ended with status {status}")
+        return named("replay", unknown(f"the run {repetition.name} ended with status {status}"))
     finding = check_replay(path)
     if not isinstance(finding, CheckResult):
         return finding

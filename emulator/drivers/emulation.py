@@ -3,16 +3,22 @@
 The loops of both pacings bring what nodes enqueue and take what is due; everything that must be the same in both,
 live and simulated, happens here. `Presence` is the state of each node, `Driving` passes actions to vehicles,
 `BusyFeed` tells programs how busy the channel was, and `LogBook` writes down what programs say.
+
+`Orders` is in which order simultaneous events come: what nodes are told of it, the medium's part, the tape. With
+`run.order = "fifo"` and no tape there is nothing to do: nodes decide nothing, and frames of one instant come to the
+medium in the order of the nodes.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+import random
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,10 +26,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.drivers.backbone import BackboneNetwork, NewsFeed
-from emulator.drivers.orders import Orders
 from emulator.faults.plan import FaultPlan, Nodes, PlannedFault
 from emulator.radio.dot11p import abilities_of
-from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
+from emulator.radio.engine import Deliveries, Delivery, Engine
 from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.radio.topology import connectivity_of
@@ -34,6 +39,7 @@ from emulator.records.metrics import Metrics
 from emulator.records.run_folder import RunFolder
 from emulator.records.samples import SampleRecorder
 from emulator.records.tables import PayloadRecorder, background_table
+from emulator.records.tape import MediumOrder, TapeEntry, first_left, parse_tape, read_tape
 from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.program import Program, RoadsideUnit
 from emulator.scenario.scenario import Scenario, least_latency_ns
@@ -44,12 +50,89 @@ from emulator.world.neighbours import Links
 from emulator.world.own_sensors import SensorFailure
 from emulator.world.world import Instant, World, components
 from vnet.driving import Action
-from vnet.radio import SendOptions
+from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire
-from vnet.transport.wire import BusyRatios
+from vnet.transport.wire import BusyRatios, Deviation, Order
 from vnet.types import Array, IntArray
 from vnet.units import NS_PER_S
+
+
+class Orders:
+    """The orders of a run; see the module's text. `made` has its deviations from FIFO so far, its tape."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        run = scenario.run
+        self._run = run
+        self.tape: Sequence[TapeEntry] = _tape_of(run.tape)
+        self.explores = run.order != "fifo" or run.tape is not None or run.order_slack_us > 0
+        """True if another order than FIFO is possible, or compared with what is possible."""
+        self._at_medium = {entry.time_ns: entry.medium for entry in self.tape if isinstance(entry, MediumOrder)}
+        self.made: list[TapeEntry] = []
+        self.steps: Mapping[str, int] = {}
+        """Decisions of each node, once the run has been simulated."""
+
+    def of_node(self, node: str, incarnation: int) -> Order | None:
+        """Return what the welcome of a node says of orders."""
+        run = self._run
+        if not self.explores:
+            return None
+        slack_ns, phase_ns = run.order_grid
+        if run.order == "fifo":
+            tape = [each for each in self.tape if isinstance(each, Deviation)]
+            tape = [each for each in tape if (each.node, each.incarnation) == (node, incarnation)]
+            return Order("tape", tape=tape, slack_ns=slack_ns, phase_ns=phase_ns)
+        seed = self._seed(f"{node}/{incarnation}")
+        return Order(run.order, seed, run.order_depth, run.order_steps or 0, (), slack_ns, phase_ns)
+
+    def _seed(self, of: str) -> int:
+        """Return a seed that says nothing about the scenario's."""
+        digest = hashlib.sha256(f"vnet order/{self._run.seed}/{self._run.order_seed}/{of}".encode()).digest()
+        return int.from_bytes(digest[:7], "big")
+
+    def to_medium(self, time_ns: int, nodes: Sequence[str]) -> Sequence[str]:
+        """Return the order in which the frames of `nodes`, given in FIFO's order, come to the medium."""
+        if not self.explores or len(nodes) < 2:
+            return nodes
+        ordered = self._ordered(time_ns, nodes)
+        if ordered != list(nodes):
+            self.made.append(MediumOrder(time_ns, tuple(ordered)))
+        return ordered
+
+    def _ordered(self, time_ns: int, nodes: Sequence[str]) -> list[str]:
+        if self._run.order == "shuffle":
+            ordered = list(nodes)
+            random.Random(self._seed(f"medium/{time_ns}")).shuffle(ordered)
+            return ordered
+        if self._run.order == "pct":
+            return sorted(nodes, key=lambda node: self._seed(f"medium/{node}"))
+        place = {node: number for number, node in enumerate(self._at_medium.get(time_ns, ()))}
+        return sorted(nodes, key=lambda node: place.get(node, len(place)))
+
+    def take(self, deviations: Iterable[Deviation]) -> None:
+        """Note what nodes have decided otherwise than FIFO."""
+        if self.explores:
+            self.made.extend(deviations)
+
+    def in_order(self) -> list[TapeEntry]:
+        """Return the tape of the run, in the order of time, which does not depend on processes."""
+        return sorted(self.made, key=_sort_key)
+
+    def left(self) -> TapeEntry | None:
+        """Return the first entry of the given tape that the run could not follow."""
+        return first_left(self.tape, self.made)
+
+
+def _tape_of(tape: Path | Sequence[str] | None) -> Sequence[TapeEntry]:
+    if tape is None:
+        return ()
+    return read_tape(tape) if isinstance(tape, Path) else parse_tape(tape, "run.tape")
+
+
+def _sort_key(entry: TapeEntry) -> tuple[int, str, int]:
+    if isinstance(entry, MediumOrder):
+        return entry.time_ns, "", 0
+    return entry.time_ns, entry.node, entry.decision
 
 
 class NodeState(StrEnum):
@@ -314,10 +397,6 @@ def _plain(value: bool | int | float | str) -> bool | int | float | str:
     return value[:LONGEST_TEXT] if isinstance(value, str) else value
 
 
-NO_CHOICES = None, None, None
-"""Power, bit rate and addressee of a frame without any of its own."""
-
-
 @dataclass(frozen=True)
 class PeriodView:
     """State of a run at the end of a period, for progress lines and observers."""
@@ -482,18 +561,13 @@ class Emulation:
         if self._finished:
             return
         self.drive_to(time_ns)
-        frames: dict[str, list[bytes]] = {}
-        options: dict[str, dict[int, SendOptions]] = {}
+        frames: dict[str, list[SentFrame]] = {}
         endings: list[wire.Ending] = []
         unhandled: list[wire.Unhandled] = []
         notes: list[wire.Note] = []
         for part in traffic:
             for frame in part.frames:
-                queued = frames.setdefault(frame.node, [])
-                chosen = SendOptions(frame.power_dbm, frame.rate_mbps, frame.to, frame.number)
-                if chosen[:3] != NO_CHOICES:
-                    options.setdefault(frame.node, {})[len(queued)] = chosen
-                queued.append(frame.payload)
+                frames.setdefault(frame.node, []).append(frame)
             self._reports.extend(report for report in part.reports if self.up[report.node])
             endings.extend(part.endings)
             unhandled.extend(part.unhandled)
@@ -505,7 +579,7 @@ class Emulation:
             self._place(time_ns // self.world.period_ns)
         senders = [node for node in sorted(frames, key=self.number.__getitem__) if self.up[node]]
         for node in self.orders.to_medium(time_ns, senders):
-            self.engine.transmit(time_ns, self.number[node], frames[node], options.get(node, NO_OPTIONS))
+            self.engine.transmit(time_ns, self.number[node], frames[node])
         self.log_book.tell(time_ns, notes, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)

@@ -44,7 +44,7 @@ NONCE = b""
 """Nonce of simulated processes, which nobody can impersonate."""
 
 
-class RunOverError(Exception):
+class NoMoreGrantsError(Exception):
     """The barrier has granted nothing more."""
 
 
@@ -175,7 +175,7 @@ class InLoop(LocalProcesses):
         try:
             self._course.send(None)
         except StopIteration:
-            raise RunOverError from None
+            raise NoMoreGrantsError from None
         return self._turn
 
     def run(self, course: Coroutine[Any, Any, None]) -> None:
@@ -257,7 +257,7 @@ class HostedPrograms:
             self._host.start(self.loop, self._programs)
             self.loop.start_at(self._take(self._swap(None)))
             self._host.run(self.loop, self.only_programs_raise)
-        except RunOverError:
+        except NoMoreGrantsError:
             self._close()
         except KeyboardInterrupt:
             self._host.forget_interrupt()

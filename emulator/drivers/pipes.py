@@ -28,7 +28,7 @@ from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit
-from emulator.drivers.local import Call, Ended, HostedPrograms, LocalProcesses, RunOverError, Turn
+from emulator.drivers.local import Call, Ended, HostedPrograms, LocalProcesses, NoMoreGrantsError, Turn
 from emulator.drivers.processes import Heard
 from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
@@ -288,7 +288,7 @@ def _run(connection: Connection, welcomes: Sequence[wire.Welcome], programs: Pro
             say(message)
         told: Any = pickle.loads(connection.recv_bytes())
         if told is None:
-            raise RunOverError
+            raise NoMoreGrantsError
         calls, encoded, messages = told
         grant = wire.decode_rx(encoded)
         assert isinstance(grant, wire.Grant)

@@ -76,7 +76,7 @@ STYLED: dict[Any, Any] = {
 
 
 @dataclass(frozen=True)
-class Span:
+class FaultSpan:
     """A time [start, end) in seconds in which a fault acted."""
 
     label: str
@@ -110,7 +110,7 @@ def canvas(
     x_label: str,
     y_label: str,
     legend_rows: int = 0,
-    spans: Sequence[Span] = (),
+    spans: Sequence[FaultSpan] = (),
     end_s: float = 0.0,
     plot_px: float = PLOT_PX,
 ) -> Canvas:
@@ -140,16 +140,16 @@ def canvas(
     return Canvas(figure, axes, len(spans) - sum(map(len, lanes)))
 
 
-def _reach(span: Span, end_s: float) -> tuple[float, float]:
+def _reach(span: FaultSpan, end_s: float) -> tuple[float, float]:
     """Return the start and end in seconds of a span with its label; a label stays left of the right edge."""
     label_s = (_LETTER_PX * len(span.label) + 8) * end_s / (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
     start_s = min(span.start_s, end_s - label_s)
     return start_s, max(span.end_s, start_s + label_s)
 
 
-def _in_lanes(spans: Sequence[Span], end_s: float) -> list[list[Span]]:
+def _in_lanes(spans: Sequence[FaultSpan], end_s: float) -> list[list[FaultSpan]]:
     """Arrange spans in as few rows as hold them and their labels; those beyond the last row are dropped."""
-    lanes: list[list[Span]] = []
+    lanes: list[list[FaultSpan]] = []
     for span in sorted(spans, key=lambda span: (span.start_s, span.end_s)):
         start_s, _ = _reach(span, end_s)
         free = (lane for lane in lanes if _reach(lane[-1], end_s)[1] <= start_s)
@@ -161,7 +161,7 @@ def _in_lanes(spans: Sequence[Span], end_s: float) -> list[list[Span]]:
     return lanes
 
 
-def _draw_lanes(strip: Axes, lanes: Sequence[Sequence[Span]], end_s: float) -> None:
+def _draw_lanes(strip: Axes, lanes: Sequence[Sequence[FaultSpan]], end_s: float) -> None:
     strip.set(xlim=(0, end_s), ylim=(len(lanes), 0))
     strip.set_axis_off()
     for row, lane in enumerate(lanes):

@@ -7,16 +7,22 @@ at the time of its arrival. Receptions in range are rows of the trace; those out
 A frame passes three steps: it is enqueued, it waits for the medium and is on air, and it has been sent. The state
 of the network (positions, nodes that are up, faults) is kept with the frame when it is enqueued. The stages run
 after it has been sent, over all frames at once that have been sent since the last query.
+
+All receptions in flight are in one table, whatever their receivers, so that no work is done per reception until a
+program takes a packet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
+from typing import overload
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
@@ -27,21 +33,20 @@ from emulator.radio.frames import (
     CopyNumbers,
     Frame,
     Receptions,
-    Result,
     Stage,
     Transmission,
+    UnicastResult,
     allowed_choices,
     flipped,
 )
-from emulator.radio.in_flight import NO_ARRIVAL_NS, Deliveries, Delivery, InFlight
 from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
 from emulator.radio.propagation import transmit_powers_dbm
 from emulator.radio.reception import Reception, Signals
 from emulator.radio.stages import (
-    Latency,
-    Loss,
+    LatencyStage,
+    LossStage,
     RoundedUp,
     change_by_faults,
     in_range,
@@ -55,13 +60,216 @@ from emulator.radio.unicast import Unicasts
 from emulator.scenario.scenario import MIN_LATENCY_NS, Radio, least_latency_ns
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
-from vnet.radio import SendOptions
+from vnet.radio import Packet, SentFrame
 from vnet.types import IntArray
 from vnet.units import ANY_TIME, Grid
 
-NO_OPTIONS: Mapping[int, SendOptions] = {}
+NO_ARRIVAL_NS = np.iinfo(np.int64).max
+"""Time of the next arrival where none is in flight."""
+INITIAL_CAPACITY = 1 << 12
+"""Receptions for which the table has room at first."""
+_ARRIVAL, _RECEIVER, _ROW, _FRAME = range(4)
 
-__all__ = ["Deliveries", "Delivery", "Engine"]
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """A packet that has reached the node number `receiver`; `row` is the number of its row of the trace."""
+
+    receiver: int
+    packet: Packet
+    row: int
+
+
+@dataclass(slots=True)
+class Deliveries(Sequence[Delivery]):
+    """Packets that have reached their receivers, in the order (arrival, sender, seq, receiver, copy).
+
+    The objects are built at the first access to one of them.
+    """
+
+    _table: IntArray
+    _frames: dict[int, Transmission]
+    _trace: Trace
+    _built: list[Delivery] | None = field(default=None, init=False)
+
+    def __len__(self) -> int:
+        return int(self._table.shape[1])
+
+    @overload
+    def __getitem__(self, index: int) -> Delivery: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Delivery]: ...
+
+    def __getitem__(self, index: int | slice) -> Delivery | list[Delivery]:
+        return self._all()[index]
+
+    def __iter__(self) -> Iterator[Delivery]:
+        return iter(self._all())
+
+    def _all(self) -> list[Delivery]:
+        if self._built is None:
+            table = self._table[:, self._order()]
+            receivers, rows = table[_RECEIVER].tolist(), table[_ROW].tolist()
+            self._built = [*map(Delivery, receivers, self._packets(table), rows)]
+        return self._built
+
+    def by_receiver(self) -> Iterator[tuple[int, list[Packet]]]:
+        """Yield each receiver's number and its packets, as they stand: by receiver, and in their order for each.
+
+        Nothing is kept of them, which is what takes time where there are many.
+        """
+        table = self._table[:, self._order()]
+        table = table[:, np.argsort(table[_RECEIVER], kind="stable")]
+        packets = self._packets(table)
+        first = 0
+        for receiver, count in Counter(table[_RECEIVER].tolist()).items():
+            yield receiver, packets[first : first + count]
+            first += count
+
+    def _packets(self, table: IntArray) -> list[Packet]:
+        """Return the packets of these columns (4, n) of the table, as they stand."""
+        arrivals_ns, receivers, _, numbers = table.tolist()
+        transmissions = [self._frames[number] for number in numbers]
+        packets = [
+            Packet(sent.frame.name, sent.frame.sent_ns, arrival_ns, sent.altered.get(receiver, sent.frame.payload))
+            if sent.altered
+            else Packet((frame := sent.frame).name, frame.sent_ns, arrival_ns, frame.payload)
+            for sent, arrival_ns, receiver in zip(transmissions, arrivals_ns, receivers, strict=True)
+        ]
+        if not self._trace.knows_power:
+            return packets
+        powers = zip(packets, *self._trace.powers(table[_ROW]), strict=True)
+        return [structs.replace(packet, rssi_dbm=rssi_dbm, snr_db=snr_db) for packet, rssi_dbm, snr_db in powers]
+
+    def _order(self) -> NDArray[np.intp]:
+        order: NDArray[np.intp] = self._table[_ARRIVAL].argsort(kind="stable")
+        arrival_ns = self._table[_ARRIVAL, order]
+        is_same = arrival_ns[1:] == arrival_ns[:-1]
+        if is_same.any():
+            tied = np.append(is_same, False) | np.append(False, is_same)
+            some = order[tied]
+            arrival, receiver, row, _ = self._table[:, some]
+            rows = self._trace.rows(row)
+            order[tied] = some[np.lexsort((row, rows["copy"], receiver, rows["seq"], rows["sender"], arrival))]
+        return order
+
+
+class InFlight:
+    """The receptions in flight to `count` nodes.
+
+    Rows of the table are arrival time, receiver, row of the trace, and frame; columns are receptions. The first
+    `_compared` of them are in `_by_receiver`: many drivers never ask for it.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._table: IntArray = np.zeros((4, INITIAL_CAPACITY), np.int64)
+        self._length = 0
+        self._frames: dict[int, Transmission] = {}
+        self._frames_kept = 64
+        self._next_frame = 0
+        self._by_receiver: IntArray = np.full(count, NO_ARRIVAL_NS)
+        self._compared = 0
+        self._soonest_ns = NO_ARRIVAL_NS
+        self._foreseen_ns = -1
+
+    def add(
+        self,
+        transmissions: Sequence[Transmission],
+        frame_index: NDArray[np.intp],
+        receiver: IntArray,
+        row: IntArray,
+        arrival_ns: IntArray,
+    ) -> None:
+        """Add receptions, arrays (n,) each: `frame_index` are indices into `transmissions`, `row` is in the trace.
+
+        None of them arrives by a time up to which arrivals have been foreseen.
+        """
+        if not len(row):
+            return
+        soonest_ns = int(arrival_ns.min())
+        assert soonest_ns > self._foreseen_ns, f"arrival at {soonest_ns} ns: foreseen up to {self._foreseen_ns} ns"
+        self._make_room(len(row))
+        new = self._table[:, self._length : self._length + len(row)]
+        new[_ARRIVAL], new[_RECEIVER], new[_ROW] = arrival_ns, receiver, row
+        new[_FRAME] = frame_index + self._next_frame
+        self._frames.update(enumerate(transmissions, self._next_frame))
+        self._next_frame += len(transmissions)
+        self._length += len(row)
+        self._soonest_ns = min(self._soonest_ns, soonest_ns)
+
+    def _make_room(self, more: int) -> None:
+        if self._length + more > self._table.shape[1]:
+            grown = np.zeros((4, 2 * (self._length + more)), np.int64)
+            grown[:, : self._length] = self._table[:, : self._length]
+            self._table = grown
+
+    def soonest_ns(self) -> int | None:
+        """Return the time of the next arrival at any node, or None."""
+        return self._soonest_ns if self._length else None
+
+    def next_ns(self, receiver: int) -> int | None:
+        """Return the time of the next arrival at `receiver`, or None."""
+        next_ns = int(self.by_receiver()[receiver])
+        return None if next_ns == NO_ARRIVAL_NS else next_ns
+
+    def by_receiver(self) -> IntArray:
+        """Return the time of the next arrival at each receiver (N,), or `NO_ARRIVAL_NS`; not to be changed."""
+        if self._compared < self._length:
+            new = self._table[:, self._compared : self._length]
+            np.minimum.at(self._by_receiver, new[_RECEIVER], new[_ARRIVAL])
+            self._compared = self._length
+        return self._by_receiver
+
+    def foresee(self, time_ns: int, up: NDArray[np.bool_], trace: Trace) -> Deliveries:
+        """Return what arrives up to `time_ns` at receivers that are `up` (N,); it stays in flight.
+
+        None that is added later may arrive by then.
+        """
+        self._foreseen_ns = max(self._foreseen_ns, time_ns)
+        flying = self._table[:, : self._length]
+        due = flying[_ARRIVAL] <= time_ns
+        due[due] = up[flying[_RECEIVER, due]]
+        return Deliveries(flying[:, due], self._frames, trace)
+
+    def rows(self) -> list[int]:
+        """Return the row numbers of the trace of all receptions in flight."""
+        return [int(row) for row in self._table[_ROW, : self._length]]
+
+    def take(self, time_ns: int) -> IntArray:
+        """Remove and return the columns (4, n) of the receptions that arrive up to `time_ns`."""
+        if self._soonest_ns > time_ns:
+            return self._table[:, :0]
+        flying = self._table[:, : self._length]
+        due = flying[_ARRIVAL] <= time_ns
+        taken, left = flying[:, due], flying[:, ~due]
+        self._length = left.shape[1]
+        self._table[:, : self._length] = left
+        self._soonest_ns = int(left[_ARRIVAL].min(initial=NO_ARRIVAL_NS))
+        self._by_receiver[:], self._compared = NO_ARRIVAL_NS, 0
+        return taken
+
+    def miss(self, table: IntArray) -> None:
+        """Note in transmissions to single vehicles that these receptions, which `take` returned, found nobody."""
+        for number in table[_FRAME].tolist():
+            self._frames[number].is_missed = True
+
+    def deliveries(self, table: IntArray, trace: Trace) -> Deliveries:
+        """Return the receptions that `take` returned as packets."""
+        deliveries = Deliveries(table, self._frames, trace)
+        self._forget()
+        return deliveries
+
+    def _forget(self) -> None:
+        """Forget the frames that no reception in flight needs; earlier `Deliveries` keep the old dictionary."""
+        if len(self._frames) > self._frames_kept:
+            needed = np.unique(self._table[_FRAME, : self._length]).tolist()
+            self._frames = {number: self._frames[number] for number in needed}
+            self._frames_kept = 2 * len(needed) + 64
+
+
+NO_CHOICES = None, None, None
+"""Power, bit rate and addressee of a frame without any of its own."""
 
 _COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
 _CHOICES = attrgetter(*(f"frame.{name}" for name in CHOSEN))
@@ -113,10 +321,10 @@ class Engine:
             peer_cap,
             lose_by_faults,
             *([self._reception] if self._reception is not None else []),
-            Loss(seed, radio.loss),
+            LossStage(seed, radio.loss),
         ]
         """Stages that decide which receptions succeed."""
-        self.timing: list[Stage] = [Latency(seed, radio), change_by_faults]
+        self.timing: list[Stage] = [LatencyStage(seed, radio), change_by_faults]
         """Stages after them, which say when and how often those arrive, and with which bytes."""
         if arrivals.step_ns:
             self.timing.append(RoundedUp(arrivals))
@@ -167,18 +375,17 @@ class Engine:
         """Give the next frame of a node this number: a trace lacks the frames that nobody was in range of."""
         self._next_seq[node] = seq
 
-    def transmit(
-        self, time_ns: int, node: int, payloads: Sequence[bytes], options: Mapping[int, SendOptions] = NO_OPTIONS
-    ) -> None:
-        """Enqueue frames that `node` broadcasts at `time_ns`, in order. A node that is down sends nothing.
+    def transmit(self, time_ns: int, node: int, frames: Sequence[SentFrame | bytes]) -> None:
+        """Enqueue frames that `node` sends at `time_ns`, in order. A node that is down sends nothing.
 
-        `options` are those of frames, by their index, that have another power or bit rate than the scenario's.
+        A payload alone is broadcast with the scenario's power and bit rate.
         """
         if not self._topology.is_up(node):
             return
         self._run(time_ns)
         self._topology.advance(time_ns)
-        for index, payload in enumerate(payloads):
+        for asked in frames:
+            payload = asked if isinstance(asked, bytes) else asked.payload
             frame = Frame(
                 sender=node,
                 seq=self._next_seq[node],
@@ -189,8 +396,8 @@ class Engine:
                 bitrate_mbps=self._radio.bitrate_mbps,
                 name=self._node_ids[node],
             )
-            if index in options:
-                chosen = self._chosen(frame, options[index])
+            if not isinstance(asked, bytes) and (asked.power_dbm, asked.rate_mbps, asked.to) != NO_CHOICES:
+                chosen = self._chosen(frame, asked)
                 if chosen is None:
                     continue
                 frame = chosen
@@ -204,19 +411,19 @@ class Engine:
             for each in self._senders.frames(frame):
                 self._enqueue(each)
 
-    def _chosen(self, frame: Frame, options: SendOptions) -> Frame | None:
+    def _chosen(self, frame: Frame, asked: SentFrame) -> Frame | None:
         """Return a frame with what its program has chosen; None for one to nobody, which is not sent."""
         node = frame.sender
-        gain_db, bitrate_mbps = allowed_choices(self._radio, options, self._rules.largest_dbm(node))
+        gain_db, bitrate_mbps = allowed_choices(self._radio, asked, self._rules.largest_dbm(node))
         to, ticket = BROADCAST, 0
-        if options.to is not None:
-            to = self._number.get(options.to, BROADCAST)
+        if asked.to is not None:
+            to = self._number.get(asked.to, BROADCAST)
             if not self._mac.shares_medium:
                 return None
             if to in (node, BROADCAST):
-                self._unicasts.refuse(node, options.number, frame.sent_ns)
+                self._unicasts.refuse(node, asked.number, frame.sent_ns)
                 return None
-            ticket, self._trace.acknowledges = self._unicasts.register(node, options.number), True
+            ticket, self._trace.acknowledges = self._unicasts.register(node, asked.number), True
         if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
         return replace(frame, gain_db=gain_db, bitrate_mbps=bitrate_mbps, to=to, ticket=ticket)
@@ -384,7 +591,7 @@ class Engine:
         self._settle()
         return self._unicasts.next_ns()
 
-    def take_results(self, time_ns: int) -> list[Result]:
+    def take_results(self, time_ns: int) -> list[UnicastResult]:
         """Remove and return the results up to `time_ns` of frames to single vehicles, in order."""
         return [] if self.next_result_ns() is None else self._unicasts.take(time_ns)
 

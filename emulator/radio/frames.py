@@ -20,7 +20,7 @@ from emulator.radio.propagation import DIGITS
 from emulator.radio.topology import TopologySnapshot
 from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio
-from vnet.radio import MIN_POWER_DBM, SendOptions
+from vnet.radio import MIN_POWER_DBM, SentFrame
 from vnet.types import Mask
 
 NO_CAUSE = -1
@@ -57,17 +57,17 @@ def flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:
     return bytes(changed)
 
 
-def allowed_choices(radio: Radio, options: SendOptions, largest_dbm: float | None) -> tuple[float, float]:
+def allowed_choices(radio: Radio, asked: SentFrame, largest_dbm: float | None) -> tuple[float, float]:
     """Return the power above `largest_dbm` in dB and the bit rate in Mbit/s that a program has chosen for a frame.
 
     They are those that the radio has. `largest_dbm` is the sender's largest power, None without a path loss.
     """
     gain_db, bitrate_mbps = 0.0, radio.bitrate_mbps
-    if options.power_dbm is not None and largest_dbm is not None and math.isfinite(options.power_dbm):
-        power_dbm = max(options.power_dbm, MIN_POWER_DBM)
+    if asked.power_dbm is not None and largest_dbm is not None and math.isfinite(asked.power_dbm):
+        power_dbm = max(asked.power_dbm, MIN_POWER_DBM)
         gain_db = round(min(power_dbm - largest_dbm, 0.0), DIGITS)
-    if radio.is_physical and options.rate_mbps in RATES_MBPS:
-        bitrate_mbps = float(options.rate_mbps or bitrate_mbps)
+    if radio.is_physical and asked.rate_mbps in RATES_MBPS:
+        bitrate_mbps = float(asked.rate_mbps or bitrate_mbps)
     return gain_db, bitrate_mbps
 
 
@@ -181,7 +181,7 @@ class CopyNumbers(Counter[tuple[int, int]]):
         return self[sender, seq]
 
 
-class Result(NamedTuple):
+class UnicastResult(NamedTuple):
     """Result of frame `number` of the node number `sender` to one vehicle, which its node learns at `time_ns`."""
 
     time_ns: int

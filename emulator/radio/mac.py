@@ -141,7 +141,7 @@ class TransmitQueue(Mac):
         return backlog.take(frame.sent_ns + jitter_ns, airtime)
 
 
-class Throttle:
+class ThrottledQueue:
     """A slow queue before a MAC of fixed bitrate, through which throttled senders' frames pass."""
 
     def __init__(self) -> None:

@@ -68,7 +68,7 @@ def change_by_faults(transmissions: Sequence[Transmission], receptions: Receptio
             sent.frame.effects.changes(sent, index, receptions)
 
 
-class Loss:
+class LossStage:
     """Independent loss of every reception, with probability `radio.loss`, or with that of its link."""
 
     def __init__(self, seed: int, loss: float) -> None:
@@ -82,7 +82,7 @@ class Loss:
             receptions.decide(frame_draws(self._draws, transmissions, receptions) < loss, Outcome.lost)
 
 
-class Latency:
+class LatencyStage:
     """Transport latency: `latency_ms` plus uniform `jitter_ms`, rounded up to the delivery tick."""
 
     def __init__(self, seed: int, radio: Radio) -> None:

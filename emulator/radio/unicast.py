@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.dot11p import PREAMBLE_NS, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.faults import ActiveLinkFaults
-from emulator.radio.frames import BROADCAST, NO_CAUSE, Frame, Result, Transmission
+from emulator.radio.frames import BROADCAST, NO_CAUSE, Frame, Transmission, UnicastResult
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from vnet.types import IntArray, Mask
@@ -120,7 +120,7 @@ class Unicasts:
         self._trace = trace
         self._tickets = 0
         self._open: dict[int, tuple[int, int]] = {}
-        self._results: list[Result] = []
+        self._results: list[UnicastResult] = []
         self._duplicates: list[tuple[int, int, int, Transmission]] = []
         """Heap of attempts received once more: arrival time, row, addressee, and the attempt received first."""
         self.counts = {"sent": 0, "delivered": 0, "attempts": 0}
@@ -151,7 +151,7 @@ class Unicasts:
 
     def _conclude(self, ticket: int, delivered: bool, attempts: int, time_ns: int) -> None:
         if asked := self._open.pop(ticket, None):
-            heappush(self._results, Result(time_ns + self._delay_ns, *asked, delivered, attempts))
+            heappush(self._results, UnicastResult(time_ns + self._delay_ns, *asked, delivered, attempts))
             self.counts["sent"] += 1
             self.counts["delivered"] += delivered
             self.counts["attempts"] += attempts
@@ -196,7 +196,7 @@ class Unicasts:
         """Return the time of the next result, or None."""
         return self._results[0].time_ns if self._results else None
 
-    def take(self, time_ns: int) -> list[Result]:
+    def take(self, time_ns: int) -> list[UnicastResult]:
         """Remove and return the results up to `time_ns`, in order."""
         taken = []
         while self._results and self._results[0].time_ns <= time_ns:

@@ -20,6 +20,12 @@ def disk_errors(path: Path) -> Iterator[None]:
         raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None
 
 
+def check_is_free(folder: Path, option: str = "") -> None:
+    """Raise VnetError if a folder that is to be made exists and is not empty; `option` says who has named it."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise VnetError(f"{option}{folder}: exists and is not an empty folder")
+
+
 @contextmanager
 def atomically(path: Path) -> Iterator[Path]:
     """Yield a path beside `path` at which to write a file or a folder; move it to `path` at the end of the block.

@@ -16,7 +16,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.records.atomic import atomically, disk_errors
+from emulator.records.atomic import atomically, check_is_free, disk_errors
 from emulator.records.code_digest import code_digests, rule_digests
 from emulator.records.events import Event, EventKind
 from emulator.scenario.loading import dump_scenario, input_digests
@@ -74,8 +74,8 @@ class RunFolder:
         """Return the folder that `open` will make. Raises VnetError for an `out` that is not empty."""
         path = out or RUNS / f"{scenario.run.name}-{scenario.run.seed}"
         with disk_errors(path):
-            if out is not None and path.exists() and (not path.is_dir() or any(path.iterdir())):
-                raise VnetError(f"--out {path}: exists and is not an empty folder")
+            if out is not None:
+                check_is_free(out, "--out ")
         folder = cls(path)
         folder._has_own_number = out is None
         # Digests are those of the start: what is edited while the run is on has not been read.

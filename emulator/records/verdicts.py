@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -55,6 +55,7 @@ class NotExercised:
 
 
 Finding = CheckResult | NotExercised
+F = TypeVar("F", CheckResult, NotExercised, Finding)
 
 
 @dataclass(frozen=True)
@@ -97,18 +98,39 @@ class Judgement:
             self.not_exercised.append(finding)
 
 
+# Findings are made without the name of their check, which whoever lists the check gives them.
+
+
+def named(name: str, finding: F) -> F:
+    """Return a finding as that of the check of this name."""
+    return replace(finding, name=name)
+
+
+def valid(text: str, /, **figures: Any) -> CheckResult:
+    """A check that has found nothing wrong."""
+    return CheckResult("", Verdict.VALID, text, figures)
+
+
+def invalid(text: str, /, **figures: Any) -> CheckResult:
+    """A check that has found something wrong."""
+    return CheckResult("", Verdict.INVALID, text, figures)
+
+
+def unknown(text: str, /, **figures: Any) -> CheckResult:
+    """A check that should have seen something, and did not."""
+    return CheckResult("", Verdict.UNKNOWN, text, figures)
+
+
+def not_exercised(reason: str) -> NotExercised:
+    """A check that this run could not exercise, and why."""
+    return NotExercised("", reason)
+
+
 def result(
-    name: str, broken: int, text: str, broken_text: str, rows: list[dict[str, Any]] | None = None, **figures: Any
+    broken: int, text: str, broken_text: str, rows: list[dict[str, Any]] | None = None, /, **figures: Any
 ) -> CheckResult:
     """Invalid with its offending rows where anything is broken, else valid."""
-    if not broken:
-        return CheckResult(name, Verdict.VALID, text, figures)
-    return CheckResult(name, Verdict.INVALID, broken_text, {**figures, "rows": (rows or [])[:MOST_ROWS]})
-
-
-def unknown(name: str, text: str, **figures: Any) -> CheckResult:
-    """A check that should have seen something, and did not."""
-    return CheckResult(name, Verdict.UNKNOWN, text, figures)
+    return invalid(broken_text, **figures, rows=(rows or [])[:MOST_ROWS]) if broken else valid(text, **figures)
 
 
 LARGEST_BYTES = 64 * 2**20

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.checks.replay import compare_folders
-from emulator.pages.canvas import BLUE, RED, Canvas, Span, canvas, legend
+from emulator.pages.canvas import BLUE, RED, Canvas, FaultSpan, canvas, legend
 from emulator.pages.page import SIGNS, put_page, render, table
 from emulator.pages.text import cell
 from emulator.records.reported import ReportedFigure, figure_text
@@ -297,7 +297,7 @@ def _over_time(
     return Drawing(made, f"{caption}{said}{note}".strip())
 
 
-def _spans(comparison: Comparison) -> tuple[list[Span], str]:
+def _spans(comparison: Comparison) -> tuple[list[FaultSpan], str]:
     """The spans of faults if both runs had the same, and the caption's sentence on them."""
     if comparison.first.spans == comparison.second.spans:
         return comparison.first.spans, " Shaded: active faults." if comparison.first.spans else ""

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from emulator.pages.canvas import (
     LEGEND_COLUMNS,
     Canvas,
-    Span,
+    FaultSpan,
     canvas,
     from_zero,
     legend,
@@ -62,7 +62,7 @@ class Chart:
 
 
 def time_figure(
-    lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[Span] = (), linear: bool = False
+    lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[FaultSpan] = (), linear: bool = False
 ) -> Canvas:
     """Draw lines against time, spans of faults behind them; logarithmic if they spread far, unless `linear`."""
     rows = math.ceil(len(lines) / LEGEND_COLUMNS) if len(lines) > 1 else 0

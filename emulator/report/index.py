@@ -34,7 +34,7 @@ NONE: Number = ("", "–", "")
 
 
 @dataclass(frozen=True)
-class Column:
+class FigureColumn:
     """A column of numbers; one that is `less` is hidden on narrow screens."""
 
     title: str
@@ -150,7 +150,7 @@ def _entries(folder: Path) -> Iterator[Entry]:
             continue  # it has just been removed
 
 
-def _row(entry: Entry, is_latest: bool, numbers: Sequence[Column]) -> dict[str, Any]:
+def _row(entry: Entry, is_latest: bool, numbers: Sequence[FigureColumn]) -> dict[str, Any]:
     folder, record = entry.folder, entry.record
     files = [name for name in (SCENARIO_FILE, VERDICT_FILE, RECORDING) if (folder / name).is_file()]
     return {
@@ -174,20 +174,20 @@ def _link(folder: Path, name: str) -> str:
 # Columns of numbers.
 
 
-def _columns(records: Sequence[Record]) -> list[Column]:
+def _columns(records: Sequence[Record]) -> list[FigureColumn]:
     """The columns that some run has a number for."""
     columns = [
-        Column("vehicles", True, lambda record: _number(record.vehicles, "d")),
-        Column("emulated (s)", True, lambda record: _number(record.emulated_s, ".1f")),
+        FigureColumn("vehicles", True, lambda record: _number(record.vehicles, "d")),
+        FigureColumn("emulated (s)", True, lambda record: _number(record.emulated_s, ".1f")),
     ]
     for key in {each.name: each for record in records for each in record.key_figures}.values():
         if key.column and any(record.figures.get(key.name) is not None for record in records):
-            columns.append(Column(key.column, key.is_less, partial(_figure, key.name)))
-    columns.append(Column("PDR (%)", False, _delivered))
+            columns.append(FigureColumn(key.column, key.is_less, partial(_figure, key.name)))
+    columns.append(FigureColumn("PDR (%)", False, _delivered))
     counts = Counter(name for record in records for name in record.reported)
     for name, _ in counts.most_common(MOST_REPORTED):
         title = next(record.reported[name] for record in records if name in record.reported).words(name)[0]
-        columns.append(Column(title, False, partial(_reported, name)))
+        columns.append(FigureColumn(title, False, partial(_reported, name)))
     return columns
 
 

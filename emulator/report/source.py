@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 import pyarrow as pa
 
-from emulator.pages.canvas import Span
+from emulator.pages.canvas import FaultSpan
 from emulator.records.events import CUTS_RUN, Event, EventKind
 from emulator.records.period_figures import SAME, ProgramFigures
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
@@ -107,7 +107,7 @@ class Source(OpenedRun):
         return last_ns / 1e9 or (maybe(lambda: self.scenario.run.duration_s) or 1.0)
 
     @cached_property
-    def spans(self) -> list[Span]:
+    def spans(self) -> list[FaultSpan]:
         """Spans in which faults acted, as the events say."""
         started: dict[str, float] = {}
         spans = []
@@ -116,8 +116,8 @@ class Source(OpenedRun):
             if event.kind == EventKind.fault_started:
                 started[label] = event.time_ns / 1e9
             elif event.kind == EventKind.fault_ended and label in started:
-                spans.append(Span(label, started.pop(label), event.time_ns / 1e9))
-        return spans + [Span(label, start_s, max(start_s, self.end_s)) for label, start_s in started.items()]
+                spans.append(FaultSpan(label, started.pop(label), event.time_ns / 1e9))
+        return spans + [FaultSpan(label, start_s, max(start_s, self.end_s)) for label, start_s in started.items()]
 
     @cached_property
     def cut(self) -> Event | None:

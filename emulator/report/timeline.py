@@ -199,7 +199,7 @@ def _down(recorded: OpenedRun, end_us: int) -> list[list[int]]:
 
 
 @dataclass(frozen=True)
-class Frames:
+class TraceFrames:
     """The frames of a trace (n,): each one's first row and its number of receptions; and the frame of each row."""
 
     first: NDArray[np.intp]
@@ -207,11 +207,11 @@ class Frames:
     of_row: NDArray[np.intp]
 
 
-def _frames(recorded: OpenedRun) -> Frames:
+def _frames(recorded: OpenedRun) -> TraceFrames:
     _, first, of_row, counts = np.unique(
         recorded.emission, return_index=True, return_inverse=True, return_counts=True
     )
-    return Frames(first, counts.astype(np.int64), of_row)
+    return TraceFrames(first, counts.astype(np.int64), of_row)
 
 
 def points_of(marks: Sequence[Mark], bars: Sequence[Bar]) -> dict[int, IntArray]:
@@ -225,7 +225,7 @@ def points_of(marks: Sequence[Mark], bars: Sequence[Bar]) -> dict[int, IntArray]
 
 
 def choose(
-    frames: Frames, sent_us: IntArray, points: dict[int, IntArray], most: int
+    frames: TraceFrames, sent_us: IntArray, points: dict[int, IntArray], most: int
 ) -> tuple[Mask, tuple[int, int]]:
     """Return a mask of the frames that are shown, with `most` receptions at most, and how they were chosen.
 

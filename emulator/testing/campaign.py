@@ -38,7 +38,7 @@ from rich.text import Text
 
 from emulator.checks.own import is_broken
 from emulator.pages.page import put_page, render, table
-from emulator.records.atomic import write_atomically
+from emulator.records.atomic import check_is_free, write_atomically
 from emulator.records.distributions import lowest_share
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -386,7 +386,7 @@ def shown_parting(explanation: Explanation) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CampaignRun:
     """A run that is over; of one that failed also the shrunk one, and the folder where it is kept."""
 
     number: int
@@ -487,11 +487,11 @@ class Campaign:
         self._folder = folder
         self._progress = progress
         self._workshop = TrialPool(plan.limit_s, plan.scenario, executor, plan.check_determinism)
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[CampaignRun] = []
         self.interrupted = False
 
     @property
-    def failures(self) -> list[Outcome]:
+    def failures(self) -> list[CampaignRun]:
         """The runs that have failed, by number."""
         return sorted((o for o in self.outcomes if o.trial.failed), key=lambda o: o.number)
 
@@ -523,7 +523,7 @@ class Campaign:
         self._take_left(futures)
         self.write()
 
-    def _take(self, outcome: Outcome) -> None:
+    def _take(self, outcome: CampaignRun) -> None:
         self.outcomes.append(outcome)
         self._progress.update(
             self._task, advance=1, description=f"campaign: {counted(len(self.failures), 'failure')}"
@@ -531,7 +531,7 @@ class Campaign:
         if outcome.trial.failed or len(self.outcomes) % WRITE_EVERY == 0:
             self.write()
 
-    def _take_left(self, futures: Sequence[Future[Outcome]]) -> None:
+    def _take_left(self, futures: Sequence[Future[CampaignRun]]) -> None:
         """Take the runs that were over, or half shrunk, when the campaign was interrupted."""
         taken = {outcome.number for outcome in self.outcomes}
         for future in futures:
@@ -541,13 +541,13 @@ class Campaign:
             if outcome.number not in taken and outcome.trial.verdicts:
                 self._take(outcome)
 
-    def _one(self, number: int) -> Outcome:
+    def _one(self, number: int) -> CampaignRun:
         scenario = self._plan.draw(number)
         trial = self._workshop.run_anywhere(scenario)
-        outcome = Outcome(number + 1, scenario, trial)
+        outcome = CampaignRun(number + 1, scenario, trial)
         return self._shrink(outcome) if trial.failed else outcome
 
-    def _shrink(self, outcome: Outcome) -> Outcome:
+    def _shrink(self, outcome: CampaignRun) -> CampaignRun:
         """Shrink a failure, and run the smallest once more where it is kept."""
         wanted = {column_of(name) for name in outcome.trial.failed}
         until_s, apart = time.monotonic() + self._plan.limit_s, outcome.trial.apart
@@ -567,7 +567,7 @@ class Campaign:
         (folder / TEST_FILE).write_text(test)
         return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
 
-    def _explained(self, outcome: Outcome) -> Outcome:
+    def _explained(self, outcome: CampaignRun) -> CampaignRun:
         """Return a run that has failed with what tells it from one that passes, which is also put in its folder."""
         if outcome.folder is None or outcome.shrunk is None or self._workshop.closed:
             return outcome
@@ -580,7 +580,7 @@ class Campaign:
         write_failure_page(outcome.folder, title, outcome.texts(), explanation)
         return replace(outcome, explanation=explanation)
 
-    def _smallest(self, outcome: Outcome, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
+    def _smallest(self, outcome: CampaignRun, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
         """Return the least run found that still fails, and how many were tried: order, faults, vehicles, time."""
         base, left = outcome.scenario, self._plan.shrink_steps
         if base.run.order != "fifo":
@@ -619,7 +619,7 @@ class Campaign:
         failures = [self._described(outcome) for outcome in self.failures]
         return page(f"Campaign {run.name}", facts, matrix, failures, self.kinds)
 
-    def _described(self, outcome: Outcome) -> dict[str, Any]:
+    def _described(self, outcome: CampaignRun) -> dict[str, Any]:
         assert outcome.folder is not None
         return {
             "number": outcome.label,
@@ -654,7 +654,7 @@ class Campaign:
                 yield Text(f"{outcome.label} {outcome.explanation.line()}")
 
 
-def _distance(outcome: Outcome, other: Outcome) -> tuple[bool, int]:
+def _distance(outcome: CampaignRun, other: CampaignRun) -> tuple[bool, int]:
     """Return by what to choose among runs to compare a run with: the last one before it, else the next."""
     return other.number > outcome.number, abs(other.number - outcome.number)
 
@@ -725,8 +725,7 @@ def run_campaign(
     name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
     folder = out or next(path for path in _folders(name) if not path.exists())
     earlier = _earlier(plan, name, before, out)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise VnetError(f"--out {folder}: exists and is not an empty folder")
+    check_is_free(folder, "--out ")
     folder.mkdir(parents=True, exist_ok=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with _interrupted_once(), Progress(*columns, console=console) as progress:

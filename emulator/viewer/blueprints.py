@@ -10,7 +10,7 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from emulator.records.period_figures import Estimate, ProgramFigures
-from emulator.viewer.drawing import POSITION, TIMELINE, Period
+from emulator.viewer.drawing import POSITION, TIMELINE, PeriodArrays
 from emulator.viewer.radio_scene import WINDOW_S
 from emulator.viewer.vehicle_scene import entity, titled
 
@@ -36,7 +36,7 @@ class Content:
     values: tuple[str, ...] = ()
     texts: tuple[str, ...] = ()
 
-    def after(self, period: Period, declared: ProgramFigures, values: list[str], texts: list[str]) -> Content:
+    def after(self, period: PeriodArrays, declared: ProgramFigures, values: list[str], texts: list[str]) -> Content:
         """Return the content of the run up to and with this period."""
         off_m = period.points("estimate_m") - period.points("fix_m")
         seen = [each for each in declared.estimates if np.isfinite(period.points(each.estimate)).any()]

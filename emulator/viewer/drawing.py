@@ -54,7 +54,7 @@ def _has_glyph(character: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Period:
+class PeriodArrays:
     """A period message as arrays; n vehicles in the order of `node_ids`, NaN for what was not reported."""
 
     message: Mapping[str, Any]
@@ -150,7 +150,7 @@ class Period:
         return {name: {node: unpack(each)[:, 0] for node, each in by.items()} for name, by in found.items()}
 
 
-def link_states(period: Period) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int32]]:
+def link_states(period: PeriodArrays) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int32]]:
     """Senders, receivers and states (outcomes) of the links on which frames were decided in a period.
 
     A link is `delivered` if a frame got through; else its state is what befell most of them.

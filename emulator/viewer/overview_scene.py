@@ -33,7 +33,7 @@ from emulator.viewer.drawing import (
     SKY,
     Canvas,
     Floats,
-    Period,
+    PeriodArrays,
     drawable,
     ellipses,
     in_length,
@@ -134,7 +134,7 @@ class OverviewScene:
             canvas.point_style(f"{each.name}/estimate", SKY, 4.0, self._node_ids)
             canvas.strip_style(f"{each.name}/ellipses", (*SKY, 130), 1.2)
 
-    def period(self, period: Period) -> None:
+    def period(self, period: PeriodArrays) -> None:
         """Draw a period."""
         self._map(period)
         self._beliefs(period)
@@ -144,7 +144,7 @@ class OverviewScene:
         self.events(period.message["events"])
         self._canvas.at(period.time_ns)
 
-    def _map(self, period: Period) -> None:
+    def _map(self, period: PeriodArrays) -> None:
         canvas, position = self._canvas, period.points("position_m")
         sender, receiver, state = link_states(period)
         # Each direction is the half of the line that is nearer to its sender.
@@ -156,7 +156,7 @@ class OverviewScene:
         canvas.points("map/fix", period.points("fix_m"))
         canvas.points("map/estimate", period.points("estimate_m"))
 
-    def _beliefs(self, period: Period) -> None:
+    def _beliefs(self, period: PeriodArrays) -> None:
         canvas, position = self._canvas, period.points("position_m")
         canvas.points("position/fix", period.points("fix_m") - position)
         canvas.points("position/estimate", period.off_truth(POSITION))
@@ -174,7 +174,7 @@ class OverviewScene:
                 if clouds:
                     canvas.points(f"{each.name}/cloud", np.concatenate([clouds[node] for node in sorted(clouds)]))
 
-    def _figures(self, period: Period) -> None:
+    def _figures(self, period: PeriodArrays) -> None:
         found = {} if self._reference is None else self._reference.step(period.message)
         for chart in self._declared.charts:
             names = list(chart["lines"].values())[: len(CURVES)]
@@ -186,7 +186,7 @@ class OverviewScene:
             self._canvas.plot(f"figures/{chart['id']}", *values)
         self._canvas.plot("figures/position", period.figure("position_rmse_m"), period.figure("fix_rmse_m"))
 
-    def _of_peers(self, period: Period) -> None:
+    def _of_peers(self, period: PeriodArrays) -> None:
         count = len(self._node_ids)
         for name, by_node in period.peers().items():
             matrix = self._peers.setdefault(name, np.full((count, count), np.nan, dtype=np.float32))
@@ -201,7 +201,7 @@ class OverviewScene:
             axes = ("reports", "of")
             self._canvas.log(f"peers/{name}", rr.Tensor(matrix, dim_names=axes, value_range=(0, 1)))
 
-    def _faults_and_downs(self, period: Period) -> None:
+    def _faults_and_downs(self, period: PeriodArrays) -> None:
         acting = set(period.message["faults"])
         for label in sorted(acting ^ self._faults):
             if label not in self._known_faults:

@@ -20,7 +20,7 @@ from emulator.viewer.drawing import (
     SKY,
     Canvas,
     Floats,
-    Period,
+    PeriodArrays,
 )
 
 WINDOW_S = 5.0
@@ -38,7 +38,7 @@ def next_charts_s(time_s: float) -> float:
     return time_s + min(max(1.0, time_s), WINDOW_S)
 
 
-class Window:
+class SlidingSum:
     """Sums of arrays of whole numbers over the last periods."""
 
     def __init__(self, periods: int) -> None:
@@ -65,9 +65,9 @@ class Ages:
 
     def __init__(self, count: int, periods: int) -> None:
         self._sent_ms = np.full((count, count), np.nan)
-        self._gaps = Window(periods)
+        self._gaps = SlidingSum(periods)
 
-    def period(self, period: Period, end_ms: float) -> None:
+    def period(self, period: PeriodArrays, end_ms: float) -> None:
         """Take a period that ended then."""
         links, age_ms = period.received()
         sender, receiver, number = links.T
@@ -103,8 +103,8 @@ class RadioScene:
         self._period_s = self._period_ns / 1e9
         self._range_m: float | None = scene["range_m"]
         periods = round(WINDOW_S / self._period_s)
-        self._tried, self._delivered = Window(periods), Window(periods)
-        self._latency, self._sent, self._received = Window(periods), Window(periods), Window(periods)
+        self._tried, self._delivered = SlidingSum(periods), SlidingSum(periods)
+        self._latency, self._sent, self._received = SlidingSum(periods), SlidingSum(periods), SlidingSum(periods)
         self._latency_bins = LEAST_LATENCY_BINS
         self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods)
         self._announced: set[str] = set()
@@ -112,7 +112,7 @@ class RadioScene:
         loads = (("sent: mean", SKY, 2.0), ("sent: most", BLUE, 1.0), ("received: mean", GREEN, 2.0))
         canvas.series("radio/load", [*loads, ("received: most", ORANGE, 1.0)])
 
-    def period(self, period: Period) -> None:
+    def period(self, period: PeriodArrays) -> None:
         """Draw a period."""
         self._stack(period)
         self._load(period)
@@ -128,7 +128,7 @@ class RadioScene:
             self._next_s = next_charts_s(period.time_s)
             self._charts(period)
 
-    def _stack(self, period: Period) -> None:
+    def _stack(self, period: PeriodArrays) -> None:
         """Frames by outcome, one layer on the other: each is a line from its lower to its upper bound and back.
 
         The line ends with the period: joined to the next one, which has another number of frames, it would be seen
@@ -150,11 +150,11 @@ class RadioScene:
                 self._canvas.plot_at(entity, times_ns, [lower, lower + count] * STROKES + [np.nan])
             lower += count
 
-    def _load(self, period: Period) -> None:
+    def _load(self, period: PeriodArrays) -> None:
         rates = [period.numbers(name) / self._period_s / 1e3 for name in ("sent_bytes", "received_bytes")]
         self._canvas.plot("radio/load", *(float(value) for rate in rates for value in (rate.mean(), rate.max())))
 
-    def _busy(self, period: Period) -> None:
+    def _busy(self, period: PeriodArrays) -> None:
         ratio = 100 * period.numbers("busy_ratio")[period.up]
         if not len(ratio) or np.isnan(ratio).any():  # senders share no medium, or no window is over
             return
@@ -179,7 +179,7 @@ class RadioScene:
         half_ms, most_ms = np.quantile(ages_ms[known], [0.5, 0.95], method="higher").tolist()
         self._canvas.plot("radio/age", half_ms, most_ms, self._ages.mean_gap_ms)
 
-    def _charts(self, period: Period) -> None:
+    def _charts(self, period: PeriodArrays) -> None:
         canvas, span_s = self._canvas, len(self._latency) * self._period_s
         latency, width_ms = self._latency.total, LATENCY_BIN_NS / 1e6
         self._latency_bins = max(self._latency_bins, int(np.flatnonzero(latency).max(initial=0)) + 2)
@@ -192,10 +192,10 @@ class RadioScene:
             self._links(period)
             self._age(self._end_ms(period))
 
-    def _end_ms(self, period: Period) -> float:
+    def _end_ms(self, period: PeriodArrays) -> float:
         return (period.time_ns + self._period_ns) / 1e6
 
-    def _links(self, period: Period) -> None:
+    def _links(self, period: PeriodArrays) -> None:
         """Delivery by link, by vehicle and by distance."""
         tried, delivered = self._tried.total, self._delivered.total
         vehicles, heard = np.arange(self._count), 100 * delivered.sum(axis=1) / np.maximum(1, tried.sum(axis=1))

@@ -20,7 +20,7 @@ from emulator.records.period_figures import ProgramFigures, figures_if_here
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.loading import parse_recorded_scenario
 from emulator.viewer.blueprints import Content, blueprint
-from emulator.viewer.drawing import Canvas, Period
+from emulator.viewer.drawing import Canvas, PeriodArrays
 from emulator.viewer.overview_scene import OverviewScene
 from emulator.viewer.radio_scene import RadioScene
 from emulator.viewer.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
@@ -49,7 +49,7 @@ class Recorder:
         self._content = Content()
         self._declared = ProgramFigures()
         self._node_ids: list[str] = []
-        self._waiting: deque[Period] = deque()
+        self._waiting: deque[PeriodArrays] = deque()
         self._last: int | None = None
         self.missed = 0
 
@@ -69,7 +69,7 @@ class Recorder:
         if stream == "scene" and not self._parts:
             self._begin(message)
         elif stream == "period" and self._parts:
-            self._waiting.append(Period(message, self._node_ids))
+            self._waiting.append(PeriodArrays(message, self._node_ids))
             first_s = self._waiting[0].time_s
             if self._last is None or self._waiting[-1].time_s - first_s > DRAWN_TOGETHER_S:
                 self.draw()
@@ -108,7 +108,7 @@ class Recorder:
             self._lay_out(period)
         self._canvas.send()
 
-    def _lay_out(self, period: Period) -> None:
+    def _lay_out(self, period: PeriodArrays) -> None:
         """Draw what programs report, and lay out views for what the run has shown for the first time."""
         assert self._program is not None and self._vehicle is not None
         self._program.period(period)

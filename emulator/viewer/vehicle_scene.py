@@ -20,7 +20,7 @@ from emulator.viewer.drawing import (
     SKY,
     Canvas,
     Floats,
-    Period,
+    PeriodArrays,
     drawable,
     ellipses,
     flipped,
@@ -28,7 +28,7 @@ from emulator.viewer.drawing import (
     nice_length,
     outcome_colours,
 )
-from emulator.viewer.radio_scene import WINDOW_S, Window, next_charts_s
+from emulator.viewer.radio_scene import WINDOW_S, SlidingSum, next_charts_s
 from vnet.units import title_of, unit_of
 
 SLOW_EVERY_S = 1.0
@@ -55,7 +55,7 @@ class VehicleScene:
         self._vehicle = vehicle
         self._number = self._node_ids.index(vehicle)
         periods = round(WINDOW_S * 1e9 / scene["period_ns"])
-        self._tried, self._heard = Window(periods), Window(periods)
+        self._tried, self._heard = SlidingSum(periods), SlidingSum(periods)
         self._peers = {name: np.full(len(self._node_ids), np.nan) for name in declared.peers}
         self._next_s = self._next_slow_s = 0.0
         self._is_there = True
@@ -71,7 +71,7 @@ class VehicleScene:
         )
         canvas.series("vehicle/frames", (("delivered", GREEN, 2.0), ("not delivered", RED, 1.0)))
 
-    def period(self, period: Period) -> None:
+    def period(self, period: PeriodArrays) -> None:
         """Draw a period; nothing while the vehicle is not in the network."""
         is_there = bool(np.isfinite(period.points("position_m")[self._number, 0]))
         if not is_there:
@@ -118,7 +118,7 @@ class VehicleScene:
         canvas.point_style("vehicle/hears/self", SKY, 7.0, [self._vehicle], show_labels=True)
         canvas.points("vehicle/hears/self", [[0.0, 0.0]], static=True)
 
-    def _errors(self, period: Period) -> None:
+    def _errors(self, period: PeriodArrays) -> None:
         """Its estimates, as differences from the truth."""
         canvas, one = self._canvas, slice(self._number, self._number + 1)
         canvas.points("vehicle/position/fix", (period.points("fix_m") - period.points("position_m"))[one])
@@ -139,7 +139,7 @@ class VehicleScene:
             self._next_slow_s = period.time_s + SLOW_EVERY_S
             self._neighbours(period)
 
-    def _neighbours(self, period: Period) -> None:
+    def _neighbours(self, period: PeriodArrays) -> None:
         """Draw the links from the vehicles in range, coloured by the outcome of their frames."""
         canvas, position = self._canvas, period.points("position_m")
         place = position - position[self._number]
@@ -156,7 +156,7 @@ class VehicleScene:
         )
         canvas.log("vehicle/hears/neighbours", names)
 
-    def _frames(self, period: Period) -> None:
+    def _frames(self, period: PeriodArrays) -> None:
         received = period.pairs[period.pairs[:, 1] == self._number]
         got = received[received[:, 2] == Outcome.delivered, 3].sum()
         self._canvas.plot("vehicle/frames", float(got), float(received[:, 3].sum() - got))
@@ -164,7 +164,7 @@ class VehicleScene:
         got_from = received[received[:, 2] == Outcome.delivered]
         self._heard.add(np.bincount(got_from[:, 0], got_from[:, 3], len(self._node_ids)))
 
-    def _table(self, period: Period) -> None:
+    def _table(self, period: PeriodArrays) -> None:
         """Neighbours: what was heard of each lately, and what the vehicle reports of it, in descending order."""
         tried, heard = self._tried.total, self._heard.total
         told = np.array([np.nan_to_num(values, nan=-1.0) for values in self._peers.values()])
@@ -223,7 +223,7 @@ class ProgramScene:
         """Names of the texts that the vehicle that is looked at closely has reported."""
         return list(self._told)
 
-    def period(self, period: Period) -> None:
+    def period(self, period: PeriodArrays) -> None:
         """Draw a period."""
         values = period.values()
         for name in values:

@@ -57,7 +57,7 @@ _LARGEST_ANNEALED = 200
 
 
 @dataclass(frozen=True)
-class Network:
+class PlacedVehicles:
     """Vehicles and their lanes: `position_m` (N, 2) on the centre line, `heading_rad` (N,) in [0, 2π).
 
     `notes` are lines for the user about the file.
@@ -69,7 +69,7 @@ class Network:
     notes: tuple[str, ...] = ()
 
 
-def load_network(path: Path) -> Network:
+def load_network(path: Path) -> PlacedVehicles:
     """Read a CSV file with the columns `COLUMNS`. Raise ScenarioError, naming the line, for a bad file."""
     vehicles: dict[str, tuple[float, float, float]] = {}
     with open_csv(path, _LONGEST_LINE) as lines:
@@ -85,7 +85,7 @@ def load_network(path: Path) -> Network:
         raise ScenarioError(f"{path}: no vehicles; at least one row is needed")
     numbers = np.array(list(vehicles.values()))
     notes = (f"{path}: {DEGREES_NOTE}",) if _look_like_degrees(numbers[:, :2]) else ()
-    return Network(tuple(vehicles), numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi), notes)
+    return PlacedVehicles(tuple(vehicles), numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi), notes)
 
 
 def _look_like_degrees(position_m: Array) -> bool:
@@ -106,7 +106,7 @@ def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, t
     return name, (values[0], values[1], values[2])
 
 
-def generate_network(layout: str, vehicles: int, seed: int) -> Network:
+def generate_network(layout: str, vehicles: int, seed: int) -> PlacedVehicles:
     """Draw a network of `vehicles`; the same arguments give the same network.
 
     `urban` has the degrees and components of the published networks for 50, 38 and 24 vehicles; for other numbers,
@@ -118,11 +118,11 @@ def generate_network(layout: str, vehicles: int, seed: int) -> Network:
     node_ids = tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
     heading_rad = _draw_headings(rng, vehicles)
     if layout == "dense":
-        return Network(node_ids, rng.uniform(0, 1.4 * REFERENCE_RANGE_M, (vehicles, 2)), heading_rad)
+        return PlacedVehicles(node_ids, rng.uniform(0, 1.4 * REFERENCE_RANGE_M, (vehicles, 2)), heading_rad)
     if 1 < vehicles <= _LARGEST_ANNEALED:
-        return Network(node_ids, _Town(rng, vehicles).anneal(), heading_rad)
+        return PlacedVehicles(node_ids, _Town(rng, vehicles).anneal(), heading_rad)
     side_m = TOWN_SIDE_M * math.sqrt(vehicles / 50)
-    return Network(node_ids, rng.uniform(0, side_m, (vehicles, 2)), heading_rad)
+    return PlacedVehicles(node_ids, rng.uniform(0, side_m, (vehicles, 2)), heading_rad)
 
 
 def _draw_headings(rng: np.random.Generator, vehicles: int) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -30,21 +31,21 @@ _LONGEST_PROJ = 1000
 
 
 @dataclass(frozen=True)
-class Frame:
+class CoordinateFrame:
     """A coordinate frame in metres: the projection `proj` (a PROJ definition), plus `offset_m`."""
 
     proj: str
     offset_m: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def around(cls, latitude_deg: float, longitude_deg: float) -> Frame:
+    def around(cls, latitude_deg: float, longitude_deg: float) -> CoordinateFrame:
         """Return the frame of metres east and north of an origin."""
         return cls(
             f"+proj=tmerc +lat_0={latitude_deg!r} +lon_0={longitude_deg!r} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m"
         )
 
     @classmethod
-    def named(cls, proj: str, offset_m: tuple[float, float]) -> Frame:
+    def named(cls, proj: str, offset_m: tuple[float, float]) -> CoordinateFrame:
         """Return the frame that a file states. Raise ScenarioError unless PROJ knows it, and it is in metres."""
         frame = cls(proj, offset_m)
         target = frame._transformer.target_crs
@@ -58,12 +59,10 @@ class Frame:
         from pyproj import Transformer  # slow to import, and only points in degrees need it
         from pyproj.exceptions import ProjError
 
-        if len(self.proj) > _LONGEST_PROJ or not _PROJ.fullmatch(self.proj):
-            raise ScenarioError(f"projection {printable(self.proj)}: not one that PROJ knows")
-        try:
-            return Transformer.from_crs("EPSG:4326", self.proj, always_xy=True)
-        except ProjError:
-            raise ScenarioError(f"projection {printable(self.proj)}: not one that PROJ knows") from None
+        if len(self.proj) <= _LONGEST_PROJ and _PROJ.fullmatch(self.proj):
+            with suppress(ProjError):
+                return Transformer.from_crs("EPSG:4326", self.proj, always_xy=True)
+        raise ScenarioError(f"projection {printable(self.proj)}: not one that PROJ knows")
 
     def to_local(self, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Array:
         """Return metres (…, 2) of points in WGS-84 degrees (…); infinite outside the projection."""
@@ -85,14 +84,14 @@ def project(
     longitude_deg: Array,
     origin_deg: tuple[float, float] | None,
     name: Callable[[int], str] | None = None,
-) -> tuple[Frame, Array]:
+) -> tuple[CoordinateFrame, Array]:
     """Return the frame around `origin_deg`, or around the points' centre, and the points (n, 2) in metres.
 
     Points (n,) are in degrees; there is at least one. Raise ScenarioError if one is further than
     `MAX_FROM_ORIGIN_M` from the origin; it names `source`, and `name` of the greatest outlier.
     """
     origin = origin_deg or middle_deg(latitude_deg, longitude_deg)
-    frame = Frame.around(*origin)
+    frame = CoordinateFrame.around(*origin)
     position_m = frame.to_local(latitude_deg, longitude_deg)
     farthest_m = float(np.abs(position_m).max())
     if not farthest_m <= MAX_FROM_ORIGIN_M:

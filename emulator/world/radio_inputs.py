@@ -16,7 +16,7 @@ from emulator.scenario.scenario import Radio, Scenario
 from emulator.scenario.sections import DAY_S
 from emulator.world.buildings import Buildings
 from emulator.world.input_files import MAX_ROWS, check_columns, check_row_count, number_within, open_csv
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from vnet.errors import ScenarioError, first_names, shown
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
@@ -234,7 +234,7 @@ class RadioInputs:
     units: tuple[RoadsideUnit, ...] = ()
 
 
-def load_buildings(scenario: Scenario, frame: Frame | None, area_m: Array) -> Buildings | None:
+def load_buildings(scenario: Scenario, frame: CoordinateFrame | None, area_m: Array) -> Buildings | None:
     """Return the buildings of a scenario that touch the box `area_m` (2, 2) of all vehicles; None without any.
 
     `frame` is that of the map's or the trips' metres, if it is known. Raise ScenarioError if they cannot be read.
@@ -247,9 +247,9 @@ def load_buildings(scenario: Scenario, frame: Frame | None, area_m: Array) -> Bu
     path = section.path if roads is None else section.path or roads.path
     assert path is not None
 
-    def of_degrees() -> Frame:
+    def of_degrees() -> CoordinateFrame:
         if section.origin_deg is not None:
-            return Frame.around(*section.origin_deg)
+            return CoordinateFrame.around(*section.origin_deg)
         if frame is None:
             raise ScenarioError(
                 f"{path}: in degrees, but nothing says where x = y = 0 m is: set radio.buildings.origin_deg"

@@ -14,7 +14,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import Gnss
 from emulator.world.gnss import MotionSensors, common_errors, further_error_m, noise_m, speed_mps
 from emulator.world.own_sensors import OwnSensors, Reading, SensedTruth
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from emulator.world.radio_inputs import RadioInputs, load_buildings, load_links
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names, shown
@@ -84,7 +84,7 @@ class World:
         motion: Motion,
         lane_map: LaneMap | RoadMap,
         lane_of: NDArray[np.intp],
-        frame: Frame | None = None,
+        frame: CoordinateFrame | None = None,
     ) -> None:
         motion = with_units(motion, scenario.roadside)
         count = len(motion.node_ids)
@@ -105,7 +105,8 @@ class World:
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((present[1:] != present[:-1]).any(axis=1)) + 1  # periods
         _check_exceptions(scenario, motion.node_ids)
-        _check_processes(scenario, bool(present.all()))
+        if not present.all():
+            refuse_shared_processes(scenario, "where vehicles enter or leave")
         self._covariance_m2 = np.eye(2) * _stated_variance_m2(scenario.world.gnss)
         self._covariance_m2.flags.writeable = False  # one for all fixes
         common = common_errors(scenario, self.periods)
@@ -227,9 +228,7 @@ def _check_exceptions(scenario: Scenario, node_ids: tuple[str, ...]) -> None:
                 raise ScenarioError(f"program.exceptions: {node!r}: no such vehicle; the network has {some}")
 
 
-def _check_processes(scenario: Scenario, all_present: bool) -> None:
-    """Raise ScenarioError if nodes share a process, which starts and ends as one, but enter or leave separately."""
-    if scenario.run.nodes_per_process > 1 and not all_present:
-        raise ScenarioError(
-            f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 where vehicles enter or leave"
-        )
+def refuse_shared_processes(scenario: Scenario, where: str) -> None:
+    """Raise ScenarioError if nodes share a process, which starts and ends as one, `where` they come and go."""
+    if scenario.run.nodes_per_process > 1:
+        raise ScenarioError(f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 {where}")

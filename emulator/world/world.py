@@ -20,8 +20,8 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.driven.stepped import DrivenWorld
 from emulator.world.driven.sumo import SumoWorld
 from emulator.world.neighbours import Links, components_of_links, links_within
-from emulator.world.networks import Network, generate_network, load_network
-from emulator.world.projection import Frame
+from emulator.world.networks import PlacedVehicles, generate_network, load_network
+from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion, lateral_offsets_m
 from emulator.world.truth import Instant, World, periods_of
 from vnet.roads.lanes import LaneMap
@@ -42,7 +42,7 @@ def _draw_lateral(scenario: Scenario, count: int) -> Array:
     return lateral_offsets_m(normal, lateral.sigma_m, keep, lateral.half_width_m)
 
 
-def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
+def _stand_on_lanes(scenario: Scenario, network: PlacedVehicles) -> World:
     """Return a world in which each vehicle stands on a straight lane of its own, with a varying lateral offset."""
     count = len(network.node_ids)
     order = stream(scenario.run.seed, "map order").permutation(count)
@@ -68,7 +68,7 @@ def _drive(scenario: Scenario) -> World:
         motion, lanes, frame = drive_through_city(scenario.network, section, periods, scenario.period_ns)
     else:
         motion = drive(scenario.network, scenario.program, periods, scenario.period_ns)
-        frame = None if motion.origin_deg is None else Frame.around(*motion.origin_deg)
+        frame = None if motion.origin_deg is None else CoordinateFrame.around(*motion.origin_deg)
         if section is not None:
             roads = read_roads(section.path, section.origin_deg or motion.origin_deg)
             lanes, frame = lanes_around(roads, section, motion.position_m), roads.frame
@@ -91,7 +91,7 @@ def build_world(scenario: Scenario) -> World:
 
 
 @lru_cache(64)
-def _generated(layout: str, vehicles: int, seed: int) -> Network:
+def _generated(layout: str, vehicles: int, seed: int) -> PlacedVehicles:
     """Draw a network once a process: annealing one of 50 vehicles takes longer than many a run."""
     network = generate_network(layout, vehicles, seed)
     for array in (network.position_m, network.heading_rad):

@@ -21,6 +21,7 @@ from tests.vnet.transport.test_wire import agent_messages, emulator_messages, na
 from vnet.backbone import UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError
+from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import backbone_keys, keys, wire
 from vnet.transport.backbone_keys import Arrived, Sent
@@ -41,7 +42,7 @@ DECODERS = {
 PARTS = {
     "Step": wire.Step,
     "Traffic": wire.Traffic,
-    "Frame": wire.Frame,
+    "Frame": SentFrame,
     "Ending": wire.Ending,
     "Unhandled": wire.Unhandled,
     "Note": wire.Note,
@@ -198,7 +199,7 @@ def test_an_agent_that_knows_nothing_of_exceptions_is_understood() -> None:
     steps = [[0, [[["v01", b"x"]], [], []]]]
     message = wire.decode_tx(msgpack.packb(["Yield", b"n", 0, None, [], [], steps, 1]))
     assert isinstance(message, wire.Yield)
-    assert message.steps == [wire.Step(0, wire.Traffic([wire.Frame("v01", b"x")], [], []))]
+    assert message.steps == [wire.Step(0, wire.Traffic([SentFrame("v01", b"x")], [], []))]
 
 
 def test_a_reader_that_is_told_nonsense_says_so() -> None:

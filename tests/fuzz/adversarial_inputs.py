@@ -3,6 +3,7 @@
 import struct
 
 from tests.fuzz.seeds import OVERRIDE
+from vnet.radio import SentFrame
 from vnet.transport import wire
 
 _TWO_GB = struct.pack(">I", 2**31)
@@ -20,7 +21,7 @@ def _msgpack() -> dict[str, bytes]:
     """Return inputs with headers that claim 2 GB, at every position of a value of variable length."""
     whole = {
         "yield": wire.encode(
-            wire.Yield(b"n", 1, None, ["a"], [], [wire.Step(2, wire.Traffic([wire.Frame("a", b"b")]))], 1)
+            wire.Yield(b"n", 1, None, ["a"], [], [wire.Step(2, wire.Traffic([SentFrame("a", b"b")]))], 1)
         ),
         "grant": wire.encode(wire.Grant(1, 2, 3, [wire.WirePacket("a", "b", 1, 2, b"c")])),
         "observation": wire.encode_observation({"a": 1}),

@@ -12,6 +12,7 @@ from agents.cooperative import information_frame
 from emulator.drivers.hosts import messages
 from emulator.scenario.faults import KINDS
 from tests.support import maps
+from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire
 from vnet.transport.backbone_keys import Sent
@@ -40,7 +41,7 @@ def pbf() -> bytes:
 
 
 TRAFFIC = wire.Traffic(
-    [wire.Frame("v01", b"payload")],
+    [SentFrame("v01", b"payload")],
     [Report(5, "v01", (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), {"mean_m": [0.5, 0.5], "n": 3.0})],
     [wire.Ending("v01", "crashed", "boom", "Traceback")],
     [wire.Unhandled("v01", 5, "boom", "in a task", "Traceback")],

@@ -31,7 +31,7 @@ from emulator.scenario.scenario import Radio, Scenario
 from emulator.world.buildings import LEAST_CORNERS
 from emulator.world.maps.files import read_buildings, read_roads
 from emulator.world.networks import load_network
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from emulator.world.radio_inputs import LinkTable, load_links
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
@@ -207,7 +207,7 @@ def _read_links(data: bytes) -> None:
 
 
 def _read_buildings(name: str, data: bytes) -> None:
-    buildings = read_buildings(_file(name, data), lambda: Frame.around(42.0, -83.0))
+    buildings = read_buildings(_file(name, data), lambda: CoordinateFrame.around(42.0, -83.0))
     assert len(buildings) and np.isfinite(buildings.corner_m).all()
     assert (np.diff(buildings.first) >= LEAST_CORNERS).all() and len(buildings.edges_m()) == buildings.first[-1]
 

@@ -44,9 +44,9 @@ def add_to(name: str, before: str, added: str) -> None:
 def jam_every_second_frame() -> None:
     """Give the outcome to every reception of every second frame that comes as far as random loss."""
     from emulator.radio.outcomes import PENDING, Outcome
-    from emulator.radio.stages import Loss
+    from emulator.radio.stages import LossStage
 
-    lose = Loss.__call__
+    lose = LossStage.__call__
 
     def jam(self: Any, transmissions: Any, receptions: Any) -> None:
         for index, sent in enumerate(transmissions):
@@ -55,7 +55,7 @@ def jam_every_second_frame() -> None:
                 row[row == PENDING] = Outcome["jammed"]
         lose(self, transmissions, receptions)
 
-    Loss.__call__ = jam  # type: ignore[method-assign]
+    LossStage.__call__ = jam  # type: ignore[method-assign]
 
 
 def legend(vehicles: int) -> list[str]:

@@ -10,7 +10,7 @@ from emulator.faults.plan import FaultPlan, Nodes
 from emulator.radio.engine import Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.scenario.scenario import Scenario
-from vnet.radio import SendOptions
+from vnet.radio import SentFrame
 
 S = 1_000_000_000
 PERIOD_NS = S // 10
@@ -43,12 +43,10 @@ class FaultyEngine:
         self.delivered += self.engine.advance(time_ns)
         self.now_ns = time_ns
 
-    def send(self, time_ns: int, node: int, *payloads: bytes, options: SendOptions | None = None) -> None:
-        """Advance to `time_ns`, and let a node send frames, all of them with these options."""
+    def send(self, time_ns: int, node: int, *frames: SentFrame | bytes) -> None:
+        """Advance to `time_ns`, and let a node send frames."""
         self.go(time_ns)
-        self.engine.transmit(
-            time_ns, node, payloads, {} if options is None else dict.fromkeys(range(len(payloads)), options)
-        )
+        self.engine.transmit(time_ns, node, frames)
 
     def chat(self, periods: int, first: int = 0, size: int = 20) -> None:
         """Let every node send a different frame in each of `periods`."""

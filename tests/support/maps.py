@@ -13,10 +13,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import osmium
 
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 
 ORIGIN = (42.28, -83.74)
-FRAME = Frame.around(*ORIGIN)
+FRAME = CoordinateFrame.around(*ORIGIN)
 NODES = {1: (0.0, 0.0), 2: (200.0, 0.0), 3: (200.0, 150.0), 4: (400.0, 0.0)}
 WAYS: dict[int, tuple[Sequence[int], dict[str, str]]] = {
     10: ((1, 2, 4), {"highway": "primary", "name": "Main Street"}),

@@ -11,6 +11,7 @@ import threading
 import zenoh
 
 from vnet.errors import TransportError
+from vnet.radio import SentFrame
 from vnet.transport import keys, wire
 from vnet.transport.credentials import Credentials
 from vnet.transport.session import open_client, quiet_zenoh
@@ -32,7 +33,7 @@ def attack(session: zenoh.Session, run: str, seq: int) -> None:
     end = wire.encode(wire.End(None, "forged"))
     grant = wire.encode(wire.Grant(seq, seq * 100_000_000, seq * 100_000_000 + 1))
     hello = wire.encode(wire.Hello(VICTIM, VICTIM, b"forged", 1, "nowhere", version=wire.VERSION))
-    steps = [wire.Step(seq * 100_000_000, wire.Traffic([wire.Frame(VICTIM, b"forged")]))]
+    steps = [wire.Step(seq * 100_000_000, wire.Traffic([SentFrame(VICTIM, b"forged")]))]
     yielded = wire.encode(wire.Yield(b"forged", seq, None, [], [], steps, 1))
     for message in (grant, end):
         session.put(keys.node_rx(run, VICTIM), message)

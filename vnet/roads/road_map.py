@@ -51,7 +51,7 @@ _DEVIATIONS = ("sigma_m", "datum_sigma_m")
 """Numbers of a whole map."""
 
 
-class Grid:
+class PointGrid:
     """Points (P, 2) in squares of `side_m`; coordinates are within 10⁹ m.
 
     order: (P,), the indices of the points, sorted by square.
@@ -145,7 +145,7 @@ class RoadMap:
         segment = np.repeat(np.arange(len(self)), pieces)
         number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         along_m = (number + 0.5) / pieces[segment] * self.length_m[segment]
-        grid = Grid(self.point_m[segment] + along_m[:, None] * self.direction[segment], SQUARE_M)
+        grid = PointGrid(self.point_m[segment] + along_m[:, None] * self.direction[segment], SQUARE_M)
         segment = segment[grid.order]
         east_m, north_m = self.point_m[segment].T.copy()
         to_east, to_north = self.direction[segment].T.copy()
@@ -249,7 +249,7 @@ class _Index:
     one of its points.
     """
 
-    grid: Grid
+    grid: PointGrid
     half_m: float
     segment: NDArray[np.intp]
     east_m: Array

@@ -30,7 +30,7 @@ from vnet.driving import Action
 from vnet.errors import DeadlockError
 from vnet.mailbox import Mailbox
 from vnet.node import Fix, Node
-from vnet.radio import RadioAbilities, SendOptions
+from vnet.radio import RadioAbilities, SentFrame
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals, outside_loop
@@ -38,7 +38,7 @@ from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, 
 from vnet.runtime.own_asyncio import Task, current_node, present_node
 from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
-from vnet.runtime.ready_queue import Chooser, chooser_of, node_of
+from vnet.runtime.ready_queue import EventChooser, chooser_of, node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap
 from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, line_of_task, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
@@ -143,10 +143,10 @@ class Host:
         self._check_thread(node, "now_ns")
         return self._clocks.now_of(node)
 
-    def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
+    def send_frame(self, frame: SentFrame) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
-        self._check_thread(node, "radio.broadcast() or send()")
-        self._enqueue(node, "frames", wire.Frame(node, payload, *options))
+        self._check_thread(frame.node, "radio.broadcast() or send()")
+        self._enqueue(frame.node, "frames", frame)
 
     def send_message(self, node: str, to: str | None, payload: bytes) -> None:
         """Take a message for the backbone; a node that has ended is silent."""
@@ -239,7 +239,7 @@ class Host:
         main = self._main(node, self._programs[node.id])
         self._mains[node.id] = self._loop.create_task(main, name=f"{node.id} main", context=context)
 
-    def _chooser_of(self, node: Node) -> Chooser:
+    def _chooser_of(self, node: Node) -> EventChooser:
         order = self._orders[node.id]
         return chooser_of(Order("tape") if order is None else order)
 
@@ -583,7 +583,7 @@ class Host:
 class Outbox:
     """Traffic in the order in which it was made, by kind."""
 
-    frames: list[wire.Frame] = field(default_factory=list)
+    frames: list[SentFrame] = field(default_factory=list)
     reports: list[Report] = field(default_factory=list)
     endings: list[wire.Ending] = field(default_factory=list)
     notes: list[wire.Note] = field(default_factory=list)

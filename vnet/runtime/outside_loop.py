@@ -22,7 +22,7 @@ from typing import Any
 from vnet.node import Node
 from vnet.runtime import own_asyncio
 
-Taker = Callable[[Node, BaseException, str, "Job | None"], bool]
+Taker = Callable[[Node, BaseException, str, "ExecutorJob | None"], bool]
 """Takes an exception of a node, the place where it was raised, and the job that failed with it, if it was one.
 
 Returns False if it is not to be taken.
@@ -185,7 +185,7 @@ def has_threads(node: Node) -> bool:
     return any(owner is node and thread.is_alive() for thread, owner in list(_started_by.items()))
 
 
-class Job(Future[Any]):
+class ExecutorJob(Future[Any]):
     """A job that a program has given to an executor itself; `is_awaited` once anybody asks for its end."""
 
     is_awaited = False
@@ -217,7 +217,7 @@ def _noted(submit: Callable[..., Future[Any]]) -> Callable[..., Future[Any]]:
     def submit_noted(*args: Any, **options: Any) -> Future[Any]:
         owner, job = present_node(), submit(*args, **options)
         if owner is not None and type(job) is Future:
-            job.__class__ = Job
+            job.__class__ = ExecutorJob
             Future.add_done_callback(job, partial(_job_done, owner))
         return job
 
@@ -226,7 +226,7 @@ def _noted(submit: Callable[..., Future[Any]]) -> Callable[..., Future[Any]]:
 
 def _job_done(owner: Node, job: Future[Any]) -> None:
     error = None if job.cancelled() else Future.exception(job)
-    if isinstance(job, Job) and error is not None:
+    if isinstance(job, ExecutorJob) and error is not None:
         _taken(owner, error, "in an executor job", job)
 
 
@@ -253,7 +253,7 @@ def tell_failed_thread(owner: Node | None, error: BaseException, place: str) -> 
     _taken(owner, error, place)
 
 
-def _taken(owner: Node | None, error: BaseException, place: str, job: Job | None = None) -> bool:
+def _taken(owner: Node | None, error: BaseException, place: str, job: ExecutorJob | None = None) -> bool:
     reference = None if owner is None else _takers.get(owner)
     taker = None if reference is None else reference()
     if owner is None or taker is None or isinstance(error, KeyboardInterrupt | SystemExit):

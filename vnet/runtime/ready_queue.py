@@ -116,7 +116,7 @@ class _Event:
 class _NodeRounds:
     """The events and callbacks of one node that are due or ready, and who decides what is next."""
 
-    chooser: Chooser
+    chooser: EventChooser
     events: list[_Event] = field(default_factory=list)
     jobs: list[_Event] = field(default_factory=list)
     ready: deque[tuple[asyncio.Handle, str]] = field(default_factory=deque)
@@ -157,7 +157,7 @@ class OrderedQueue(ReadyQueue):
     def __init__(
         self,
         ready: Iterable[asyncio.Handle],
-        chooser_of: Callable[[Node], Chooser],
+        chooser_of: Callable[[Node], EventChooser],
         now_ns: Callable[[], int],
         on_deviation: Callable[[Node, Deviation], None],
     ) -> None:
@@ -344,7 +344,7 @@ class Option:
     source: str
 
 
-class Chooser(Protocol):
+class EventChooser(Protocol):
     """Interface of what makes the decisions of one node."""
 
     def choose(self, time_ns: int, decision: int, options: Sequence[Option]) -> int:
@@ -404,7 +404,7 @@ class Taped:
         return next((number for number, option in enumerate(options) if option.label == label), 0)
 
 
-def chooser_of(order: Order) -> Chooser:
+def chooser_of(order: Order) -> EventChooser:
     """Return what makes the decisions of a node whose welcome has this order."""
     if order.kind == "shuffle":
         return Shuffle(order.seed)

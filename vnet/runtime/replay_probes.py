@@ -13,16 +13,16 @@ from pathlib import Path
 from types import FrameType
 
 from vnet.driving import Action
+from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.runtime.unhandled import NOT_THE_PROGRAM
-from vnet.transport import wire
 from vnet.transport.wire import SentMessage
 
 CALLS_VARIABLE = "VNET_CALLS"
 """Folder to which each node writes its calls, a file a node."""
 SCATTER_VARIABLE = "VNET_SCATTER"
 """Seed of addresses that programs would not have otherwise."""
-_CALLS: dict[type, str] = {wire.Frame: "frame", SentMessage: "message", Report: "report", Action: "action"}
+_CALLS: dict[type, str] = {SentFrame: "frame", SentMessage: "message", Report: "report", Action: "action"}
 _SIZES = range(32, 513, 16)
 """Sizes in bytes of the blocks that Python's allocator keeps in pools, beyond the least."""
 _BYTES_HEADER = 33
@@ -40,7 +40,7 @@ class CallLog:
     def add(self, node: str, time_ns: int, item: object) -> None:
         """Write down a call of a node; at once, because the process may be killed."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        content = item.payload if isinstance(item, wire.Frame | SentMessage) else repr(item).encode()
+        content = item.payload if isinstance(item, SentFrame | SentMessage) else repr(item).encode()
         line = f"{time_ns}\t{_CALLS[type(item)]}\t{zlib.crc32(content):08x}\t{_program_line(sys._getframe(2))}\n"
         with (self._folder / node).open("a") as file:
             file.write(line)

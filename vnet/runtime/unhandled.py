@@ -20,7 +20,7 @@ from typing import Any
 
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
-from vnet.runtime.outside_loop import Job, collector
+from vnet.runtime.outside_loop import ExecutorJob, collector
 from vnet.runtime.own_asyncio import NOBODY, current_node, present_node
 from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import error_line, leaves
@@ -77,7 +77,7 @@ class UnhandledExceptions:
         self._ready: list[Unhandled] = []
         self._lock = threading.RLock()  # of `_ready`: threads of programs and `__del__` come at any time
         self._held: list[tuple[_Failure, BaseException]] = []  # nothing is formatted while the collector runs
-        self._jobs: list[tuple[_Failure, Job]] = []
+        self._jobs: list[tuple[_Failure, ExecutorJob]] = []
         """Jobs that a program has given to an executor itself, and that have failed."""
         self._silenced: weakref.WeakSet[Node] = weakref.WeakSet()
 
@@ -160,7 +160,7 @@ class UnhandledExceptions:
             self._loop = None
             outside_loop.detach()
 
-    def _failed_outside(self, owner: Node, error: BaseException, place: str, job: Job | None) -> bool:
+    def _failed_outside(self, owner: Node, error: BaseException, place: str, job: ExecutorJob | None) -> bool:
         """Take what has left a thread, a job or `__del__`; what comes after `close` is not taken.
 
         Whether somebody asks for the end of a job is known when the program ends.

@@ -32,7 +32,7 @@ from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NodeHandle, NumberedTimer
 from vnet.runtime.outside_loop import collected_by_schedule, collector
 from vnet.runtime.own_asyncio import Future, Task, current_node, present_node
-from vnet.runtime.ready_queue import Chooser, CpuMeter, OrderedQueue, ReadyQueue
+from vnet.runtime.ready_queue import CpuMeter, EventChooser, OrderedQueue, ReadyQueue
 from vnet.transport.wire import ClockError, Deviation
 from vnet.units import ANY_TIME, NS_PER_S, Grid
 
@@ -258,7 +258,7 @@ class VirtualTimeLoop(SkewedLoop):
 
     def order(
         self,
-        chooser_of: Callable[[Node], Chooser],
+        chooser_of: Callable[[Node], EventChooser],
         on_deviation: Callable[[Node, Deviation], None],
         timer_grid: Grid = ANY_TIME,
     ) -> OrderedQueue:

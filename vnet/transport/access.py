@@ -235,7 +235,7 @@ def _share(process_ids: Sequence[str], hosts: Sequence[str]) -> dict[str, tuple[
     """Return the processes of each host: parts whose lengths differ by at most one. Raise TransportError."""
     for host in hosts:
         if not keys.is_segment(host):
-            raise TransportError(f"host {shown(host)}: names are letters, digits, '_', '.', '-', at most 64")
+            raise TransportError(f"host {shown(host)}: {keys.SEGMENTS}")
         if hosts.count(host) > 1:
             raise TransportError(f"host {host}: named {hosts.count(host)} times; each host needs a name of its own")
     if len(hosts) > len(process_ids):

@@ -8,8 +8,12 @@ import re
 _SEGMENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z")
 
 
+SEGMENTS = "names are letters, digits, '_', '.', '-', at most 64"
+"""What `is_segment` allows, as errors say it."""
+
+
 def is_segment(name: str) -> bool:
-    """Return true if the name of a run, node or host is valid in a key: letters, digits, `_ . -`, at most 64."""
+    """Return true if the name of a run, node or host is valid in a key."""
     return _SEGMENT.match(name) is not None
 
 

@@ -22,7 +22,7 @@ from vnet.backbone import BackboneMessage, UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError, printable
 from vnet.node import NOTHING_SENSED, Fix, Reading
-from vnet.radio import Packet, SendResult
+from vnet.radio import Packet, SendResult, SentFrame
 from vnet.reports import Report
 
 TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
@@ -196,20 +196,6 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
         return Fix(self.time_ns, position_m, covariance_m2, *seen)
 
 
-class Frame(msgspec.Struct, frozen=True, array_like=True):
-    """One frame that `node` enqueues, with the scenario's power and bit rate where it has none of its own.
-
-    It is a broadcast, or addressed `to` one node; then `number` counts such frames of the sender.
-    """
-
-    node: str
-    payload: bytes
-    power_dbm: float | None = None
-    rate_mbps: float | None = None
-    to: str | None = None
-    number: Count = 0
-
-
 class Ending(msgspec.Struct, frozen=True, array_like=True):
     """The end of a program: it returned, raised, died, or did not let time advance (`details`: the stack)."""
 
@@ -249,7 +235,7 @@ class Note(msgspec.Struct, frozen=True, array_like=True):
 class Traffic(msgspec.Struct, frozen=True, array_like=True):
     """Frames and all else that the nodes of one process made, in order; `deviations` where orders are tried."""
 
-    frames: Sequence[Frame] = ()
+    frames: Sequence[SentFrame] = ()
     reports: Sequence[Report] = ()
     endings: Sequence[Ending] = ()
     unhandled: Sequence[Unhandled] = ()

@@ -30,6 +30,7 @@ from emulator.records.events import EventKind
 from vnet.errors import ProgramError, VnetError, first_names, shown
 from vnet.gateway.frames import CrossingReply, Fragments, Message, TooLargeError
 from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY, check_keys
+from vnet.radio import SentFrame
 from vnet.reports import Report, Reporter
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
 from vnet.transport import wire
@@ -58,7 +59,7 @@ class _Vehicle:
     is_ready: bool = False
     on_air: bool = False
     """True from time 0, or from its return, on: what programs put before stays in the vehicle."""
-    outbox: list[wire.Frame] = field(default_factory=list)
+    outbox: list[SentFrame] = field(default_factory=list)
     reports: list[Report] = field(default_factory=list)
     notes: list[wire.Note] = field(default_factory=list)
     endings: list[wire.Ending] = field(default_factory=list)
@@ -397,7 +398,7 @@ class Gateways:
             to = message.to
         try:
             for payload in vehicle.fragments.of(message):
-                vehicle.outbox.append(wire.Frame(node, payload, to=to, number=vehicle.unicasts))
+                vehicle.outbox.append(SentFrame(node, payload, to=to, number=vehicle.unicasts))
                 vehicle.unicasts += to is not None
         except TooLargeError as error:
             self._note(vehicle, "error", str(error))

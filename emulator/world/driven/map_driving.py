@@ -18,7 +18,7 @@ from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import lanes_in_box, notes_of, read_roads
 from emulator.world.maps.roads import NUMBER, Ints, Roads
 from emulator.world.neighbours import links_within
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from vnet.errors import ScenarioError, did_you_mean, first_names
 from vnet.roads.road_map import RoadMap, ranges
 from vnet.types import Array, Mask
@@ -62,7 +62,7 @@ Route = tuple[int, ...]
 Names = tuple[str, ...]
 
 
-class Links:
+class RoadLinks:
     """The links of `roads`, two for each piece of a road: number 2p in the road's direction, 2p + 1 against it.
 
     Pieces end where a road ends or meets another. Arrays (L,): `start` and `end` are points, `road` the road,
@@ -219,7 +219,7 @@ class Paths:
     `side` is 1 where people drive on the right, else -1; vehicles drive `aside_m` to the right of the lanes.
     """
 
-    def __init__(self, links: Links, side: float, aside_m: float) -> None:
+    def __init__(self, links: RoadLinks, side: float, aside_m: float) -> None:
         self._links, self._side, self._aside_m = links, side, aside_m
         self.paths: list[Path] = []
         self._of_link: dict[int, int] = {}
@@ -534,7 +534,7 @@ def elements_of(paths: Paths, links: Iterator[int], least_m: float) -> tuple[int
     return tuple(found)
 
 
-def drawn_links(links: Links, rng: np.random.Generator, first: int) -> Iterator[int]:
+def drawn_links(links: RoadLinks, rng: np.random.Generator, first: int) -> Iterator[int]:
     """Yield the links of a route that begins with `first`, and takes any exit of each junction but a U-turn.
 
     Dead ends and hairpins are taken only where there is no other exit. A route ends where there is none at all.
@@ -550,7 +550,7 @@ def drawn_links(links: Links, rng: np.random.Generator, first: int) -> Iterator[
 class NamedRoutes:
     """Routes that name their roads; `source` is the map. `-NAME` is the road NAME against its direction."""
 
-    def __init__(self, source: object, links: Links) -> None:
+    def __init__(self, source: object, links: RoadLinks) -> None:
         self._source, self._links = source, links
         self._of_name: dict[str, list[int]] = {}
         for link, road in enumerate(links.road.tolist()):
@@ -630,7 +630,7 @@ class MapStart:
 
     start: Start
     lanes: RoadMap
-    frame: Frame | None
+    frame: CoordinateFrame | None
     notes: tuple[str, ...]
 
 
@@ -646,7 +646,7 @@ def start_on_map(scenario: Scenario) -> MapStart:
         roads = city_roads(network.seed, network.size_m)
     else:
         source, roads = section.path, read_roads(section.path, section.origin_deg)
-    links = Links(roads, driven.vehicle_width_m)
+    links = RoadLinks(roads, driven.vehicle_width_m)
     paths = Paths(*((links, 1.0, 0.0) if section is None else (links, _side(section), section.aside_m)))
     reach_m = driven.max_speed_mps * scenario.run.duration_s
     if scenario.world.ranging is not None:
@@ -672,7 +672,7 @@ def _side(section: Map) -> float:
 class _Ways:
     """Routes of vehicles and their places on them; routes go on for `reach_m` behind the places if they can."""
 
-    def __init__(self, source: object, driven: Driven, paths: Paths, links: Links, reach_m: float) -> None:
+    def __init__(self, source: object, driven: Driven, paths: Paths, links: RoadLinks, reach_m: float) -> None:
         self._source, self._driven, self._paths, self._links = source, driven, paths, links
         self._reach_m = reach_m
 

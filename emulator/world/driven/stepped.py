@@ -17,9 +17,9 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.driven.road import Start, start_on_single_road
 from emulator.world.driven.vehicles import DrivenVehicles, Happening, Log
 from emulator.world.gnss import MotionSensors
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion
-from emulator.world.truth import World, periods_of
+from emulator.world.truth import World, periods_of, refuse_shared_processes
 from vnet.driving import Action
 from vnet.errors import ScenarioError
 from vnet.node import Fix
@@ -102,7 +102,7 @@ class SteppedWorld(World):
         node_ids: Sequence[str],
         lane_map: LaneMap | RoadMap,
         notes: tuple[str, ...] = (),
-        frame: Frame | None = None,
+        frame: CoordinateFrame | None = None,
     ) -> None:
         self._count, periods = len(node_ids), periods_of(scenario)
         self._units_m = [unit.position_m for unit in scenario.roadside]
@@ -224,11 +224,9 @@ class DrivenWorld(SteppedWorld):
         self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz), start)
         self._furthest_m = start.along_m + scenario.driven.max_speed_mps * scenario.run.duration_s
         super().__init__(scenario, node_ids, lanes, notes, frame)
-        if scenario.run.nodes_per_process > 1 and self.may_leave:
-            raise ScenarioError(
-                f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 where vehicles may leave: "
-                f"they may come to the end of the road, after {self.vehicles.road.end_m.min():g} m"
-            )
+        if self.may_leave:
+            end = f"they may come to the end of the road, after {self.vehicles.road.end_m.min():g} m"
+            refuse_shared_processes(scenario, f"where vehicles may leave: {end}")
 
     @property
     def may_leave(self) -> bool:
@@ -251,7 +249,9 @@ def _node_ids(vehicles: int) -> tuple[str, ...]:
     return tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
 
 
-def _start(scenario: Scenario, count: int) -> tuple[Start, LaneMap | RoadMap, Frame | None, tuple[str, ...]]:
+def _start(
+    scenario: Scenario, count: int
+) -> tuple[Start, LaneMap | RoadMap, CoordinateFrame | None, tuple[str, ...]]:
     """Return where vehicles are at the start, the lanes that programs know, their frame, and notes for the user."""
     if scenario.driven.road == "map":
         from emulator.world.driven.map_driving import start_on_map

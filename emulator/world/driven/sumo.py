@@ -30,20 +30,21 @@ from emulator.world.driven.sumo_process import (
     Answer,
     Begin,
     Begun,
+    Command,
     Failure,
     Find,
     Found,
-    Order,
     Request,
     State,
-    Step,
+    StepRequest,
     StepTo,
     Watch,
     decode_answer,
     write,
 )
 from emulator.world.driven.vehicles import COLLISION, LIMITED, Happening, Log
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
+from emulator.world.truth import refuse_shared_processes
 from vnet.driving import Action
 from vnet.errors import ScenarioError, VnetError, first_names, printable, shown
 from vnet.extras import require
@@ -246,7 +247,7 @@ def _begin(scenario: Scenario, path: Path, step_ns: int) -> tuple[SumoProcess, B
     while begin_s < start_s:
         begin_s = min(start_s, begin_s + STEPS * step_ns / NS_PER_S)
         process.ask(StepTo(begin_s), Found)
-    process.ask(Step([]), State)
+    process.ask(StepRequest([]), State)
     return process, begun
 
 
@@ -334,10 +335,10 @@ class SumoVehicles:
 
     def advance(self) -> list[Happening]:
         """Have SUMO make a step, to the next control instant; returns what happens."""
-        orders = self._orders()
+        commands = self._commands()
         self._record()
-        state = self._process.ask(Step(orders), State)
-        refused = [self._no_lane(orders, number) for number in state.refused]
+        state = self._process.ask(StepRequest(commands), State)
+        refused = [self._no_lane(commands, number) for number in state.refused]
         self.now_ns += self.step_ns
         self._take_state(state)
         return refused + self._collisions(state)
@@ -354,9 +355,9 @@ class SumoVehicles:
 
     # What programs have asked for.
 
-    def _orders(self) -> list[Order]:
+    def _commands(self) -> list[Command]:
         """Return what SUMO is to do in the next step: changes, and the next speed of each that is driven."""
-        orders = []
+        commands = []
         while self._pending and self._pending[0][0] <= self.now_ns:
             _, number, action = self._pending.popleft()
             if np.isnan(self.speed[number]):
@@ -365,21 +366,21 @@ class SumoVehicles:
                 self._command[number] = self._limited(number, action.acceleration_m_s2)
             elif action.release and not np.isnan(self._command[number]):
                 self._command[number] = np.nan
-                orders.append(Order(number, release=True))
+                commands.append(Command(number, release=True))
             if action.lane:
-                orders.append(Order(number, lane=action.lane))
+                commands.append(Command(number, lane=action.lane))
         target = self.speed + self._command * (self.step_ns / NS_PER_S)
         target = np.clip(target, 0.0, self._properties[3])
         driven = np.flatnonzero(np.isfinite(target)).tolist()
-        return orders + [Order(number, speed=target[number].item()) for number in driven]
+        return commands + [Command(number, speed=target[number].item()) for number in driven]
 
     def _limited(self, number: int, asked: float) -> float:
         """Return the acceleration nearest to what is asked for; an absent vehicle's limits are not known."""
         _, acceleration, braking, _ = self._properties[:, number].tolist()
         return asked if np.isnan(acceleration) else min(max(asked, -braking), acceleration)
 
-    def _no_lane(self, orders: Sequence[Order], number: int) -> Happening:
-        asked = next(order.lane for order in orders if order.number == number and order.lane)
+    def _no_lane(self, commands: Sequence[Command], number: int) -> Happening:
+        asked = next(command.lane for command in commands if command.number == number and command.lane)
         return Happening(self.now_ns, LIMITED, number, {"lane": asked, "reason": "there is no lane"})
 
     # What SUMO answers.
@@ -437,11 +438,7 @@ class SumoWorld(SteppedWorld):
         if unknown := [node for node in sumo.lights_to if node not in self.node_ids]:
             some = first_names(self.node_ids)
             raise ScenarioError(f"network.sumo.lights_to = {shown(unknown[0])}: no such node; there are {some}")
-        if scenario.run.nodes_per_process > 1:
-            raise ScenarioError(
-                f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 with network.step = true, "
-                "where vehicles enter and leave"
-            )
+        refuse_shared_processes(scenario, "with network.step = true, where vehicles enter and leave")
 
     @property
     def has_traffic(self) -> bool:
@@ -482,7 +479,7 @@ class SumoWorld(SteppedWorld):
         self.background.add(self.vehicles.now_ns, self.vehicles.others, self.vehicles.other_m)
 
 
-def _lanes(scenario: Scenario, begun: Begun) -> tuple[LaneMap | RoadMap, Frame | None, tuple[str, ...]]:
+def _lanes(scenario: Scenario, begun: Begun) -> tuple[LaneMap | RoadMap, CoordinateFrame | None, tuple[str, ...]]:
     """Return the lanes that programs know, their frame, and notes about them: those of `[map]`, or none."""
     section = scenario.map
     if section is None:

@@ -75,8 +75,8 @@ class Watch(msgspec.Struct, tag=True):
     lights: bool
 
 
-class Order(msgspec.Struct, array_like=True):
-    """Order for the vehicle of this number: a speed in m/s, to drive by itself again, or a change of lanes."""
+class Command(msgspec.Struct, array_like=True):
+    """Command for the vehicle of this number: a speed in m/s, to drive by itself again, or a change of lanes."""
 
     number: int
     speed: float | None = None
@@ -84,10 +84,10 @@ class Order(msgspec.Struct, array_like=True):
     lane: int = 0
 
 
-class Step(msgspec.Struct, tag=True):
-    """Make one step, with these orders."""
+class StepRequest(msgspec.Struct, tag=True):
+    """Make one step, with these commands."""
 
-    orders: list[Order]
+    commands: list[Command]
 
 
 class Vehicle(msgspec.Struct, array_like=True):
@@ -131,7 +131,7 @@ class Failure(msgspec.Struct, tag=True):
     reason: str
 
 
-Request = Begin | StepTo | Find | Watch | Step
+Request = Begin | StepTo | Find | Watch | StepRequest
 Answer = Begun | Found | State | Failure
 
 
@@ -185,8 +185,8 @@ class Simulation:
                 return self._find(steps)
             case Watch():
                 return self._watch(request)
-            case Step(orders):
-                refused = [order.number for order in orders if not self._obey(order)]
+            case StepRequest(commands):
+                refused = [command.number for command in commands if not self._obey(command)]
                 self._sumo.simulationStep()
                 return self._state(refused)
 
@@ -219,23 +219,23 @@ class Simulation:
         self._lights = sorted(self._sumo.trafficlight.getIDList()) if request.lights else []
         return self._state([])
 
-    def _obey(self, order: Order) -> bool:
+    def _obey(self, command: Command) -> bool:
         """Have a vehicle do what it is told; returns False if there is no lane to change to."""
-        vehicle, name = self._sumo.vehicle, self._vehicles[order.number]
+        vehicle, name = self._sumo.vehicle, self._vehicles[command.number]
         if name not in self._there:
             return True
-        if order.release:
+        if command.release:
             vehicle.setSpeed(name, -1)
             self._set_modes(name, ALL_CHECKS, ALL_LANE_CHANGES)
             self._driven.discard(name)
-        elif order.speed is not None:
+        elif command.speed is not None:
             if name not in self._driven:
                 self._set_modes(name, NO_CHECKS, ROUTE_LANE_CHANGES)
                 self._driven.add(name)
-            vehicle.setSpeed(name, order.speed)
-        if not order.lane:
+            vehicle.setSpeed(name, command.speed)
+        if not command.lane:
             return True
-        lane = vehicle.getLaneIndex(name) + order.lane
+        lane = vehicle.getLaneIndex(name) + command.lane
         if not 0 <= lane < self._sumo.edge.getLaneNumber(vehicle.getRoadID(name)):
             return False
         vehicle.changeLane(name, lane, LANE_S)

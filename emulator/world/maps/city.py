@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.world.maps.roads import LANE_WIDTH_M, LANES, NUMBER, Ints, Roads, RoadsBuilder
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from vnet.errors import ScenarioError
 from vnet.extras import require
 from vnet.types import Array
@@ -62,7 +62,7 @@ _RIVER_STEP_M = 11.0
 
 
 @dataclass
-class Street:
+class CityStreet:
     """A street through `points_m` (n, 2).
 
     A street `above` the ground meets others only at its `joints`, which are indices of points. A street on the
@@ -96,7 +96,7 @@ def divided(points_m: Array, step_m: float = STEP_M) -> Array:
     return np.column_stack([np.interp(along, number, axis) for axis in points_m.T])
 
 
-def add_streets(builder: RoadsBuilder, streets: Sequence[Street], warp: Callable[[Array], Array]) -> None:
+def add_streets(builder: RoadsBuilder, streets: Sequence[CityStreet], warp: Callable[[Array], Array]) -> None:
     """Cut streets into roads at their crossings, and add the largest connected component.
 
     Streets are drawn on a plan; `warp` maps points (n, 2) of the plan to metres.
@@ -119,7 +119,7 @@ def add_streets(builder: RoadsBuilder, streets: Sequence[Street], warp: Callable
 class _Plan:
     """All points of all streets, and the crossings of streets."""
 
-    def __init__(self, streets: Sequence[Street]) -> None:
+    def __init__(self, streets: Sequence[CityStreet]) -> None:
         count = [len(street.points_m) for street in streets]
         self._first = np.concatenate([[0], np.cumsum(count)])
         self._street = np.repeat(np.arange(len(streets)), count)
@@ -243,7 +243,7 @@ def city_roads(seed: int, size_m: float = SIZE_M) -> Roads:
     city = _City(rng, size_m / _MARGIN)
     builder = RoadsBuilder(f"city of seed {seed}")
     add_streets(builder, city.streets(), _Warp(rng, size_m))
-    return builder.build(builder.coordinates(), Frame.around(*ORIGIN_DEG))
+    return builder.build(builder.coordinates(), CoordinateFrame.around(*ORIGIN_DEG))
 
 
 class _Warp:
@@ -273,7 +273,7 @@ class _City:
         self._motorway_m = self._motorway_line()
         self._shops: list[tuple[Array, Array]] = []
 
-    def streets(self) -> list[Street]:
+    def streets(self) -> list[CityStreet]:
         """Return all streets of the city."""
         return [
             *self._arterials(),
@@ -296,7 +296,7 @@ class _City:
                 lines.append(side * at_m)
         return np.array(sorted(lines))
 
-    def _arterials(self) -> list[Street]:
+    def _arterials(self) -> list[CityStreet]:
         streets = []
         for axis, lines in enumerate(self._lines):
             middle = int(np.argmin(np.abs(lines)))
@@ -305,10 +305,10 @@ class _City:
                 line[:, 1 - axis] = -self._half_m, self._half_m
                 far = abs(number - middle)
                 kind = "primary" if not far else "secondary" if far % 2 == 0 or len(lines) < 4 else "tertiary"
-                streets.append(Street(f"{'Avenue' if axis else 'Road'} {number + 1}", kind, divided(line)))
+                streets.append(CityStreet(f"{'Avenue' if axis else 'Road'} {number + 1}", kind, divided(line)))
         return streets
 
-    def _diagonals(self) -> list[Street]:
+    def _diagonals(self) -> list[CityStreet]:
         """Return roads from near the core outwards, diagonal to the grid."""
         streets = []
         quadrants = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
@@ -322,7 +322,7 @@ class _City:
             bulge = np.array([end[1] - start[1], start[0] - end[0]]) * self._rng.uniform(-0.12, 0.12)
             part = np.linspace(0, 1, 60)[:, None]
             line = (1 - part) * start + part * end + 4 * part * (1 - part) * bulge
-            streets.append(Street(f"Cross Road {number + 1}", "secondary", divided(line)))
+            streets.append(CityStreet(f"Cross Road {number + 1}", "secondary", divided(line)))
         return streets
 
     def _next_line(self, axis: int, side: int) -> float:
@@ -335,10 +335,10 @@ class _City:
         at_m, (early, late) = self._river
         return np.asarray(at_m + 90 * np.sin(east_m / 330 + early) + 45 * np.sin(east_m / 130 + late))
 
-    def _river_road(self) -> list[Street]:
+    def _river_road(self) -> list[CityStreet]:
         east_m = np.arange(-self._half_m, self._half_m, _RIVER_STEP_M)
         line = np.column_stack([east_m, self._river_m(east_m) - 75])
-        return [Street("River Road", "tertiary", line[~self._near_motorway(line)])]
+        return [CityStreet("River Road", "tertiary", line[~self._near_motorway(line)])]
 
     def _motorway_line(self) -> Array:
         """Return the motorway's centre line: from the north edge along the east side, then along the south side."""
@@ -354,7 +354,7 @@ class _City:
         offset = points_m[:, None] - self._motorway_m[None, ::4]
         return np.asarray(np.hypot(offset[..., 0], offset[..., 1]).min(axis=1) < near_m)
 
-    def _motorway(self) -> list[Street]:
+    def _motorway(self) -> list[CityStreet]:
         """Return both carriageways, and ramps to a road on the east side and one on the south side."""
         line = self._motorway_m
         along = np.gradient(line, axis=0)
@@ -376,10 +376,10 @@ class _City:
                     curve = _curve(start, start + 130 * ahead, end - 130 * ahead, end, 30)
                     joint = 0 if kind == "off" else len(curve) - 1
                     label = f"Motorway {name}, ramp {kind} {number + 1}"
-                    streets.append(Street(label, "motorway_link", curve, True, joints=(joint,)))
+                    streets.append(CityStreet(label, "motorway_link", curve, True, joints=(joint,)))
             order = slice(None, None, side)
             numbers = tuple(n if side > 0 else len(line) - 1 - n for n in joints)
-            streets.append(Street(f"Motorway {name}", "motorway", carriageway[order], True, True, numbers))
+            streets.append(CityStreet(f"Motorway {name}", "motorway", carriageway[order], True, True, numbers))
         return streets
 
     def _crossing(self, line: Array, axis: int, after: int) -> int:
@@ -390,9 +390,9 @@ class _City:
 
     # Streets between the main roads.
 
-    def _services(self) -> list[Street]:
+    def _services(self) -> list[CityStreet]:
         """Return roads beside arterials, and the lanes of car parks in front of shops."""
-        streets: list[Street] = []
+        streets: list[CityStreet] = []
         for axis, lines in enumerate(self._lines):
             across = self._lines[1 - axis]
             for at_m in lines[np.abs(lines) > 1].tolist():
@@ -401,7 +401,7 @@ class _City:
                         streets += self._frontage(axis, at_m, low_m, high_m)
         return streets
 
-    def _frontage(self, axis: int, at_m: float, low_m: float, high_m: float) -> list[Street]:
+    def _frontage(self, axis: int, at_m: float, low_m: float, high_m: float) -> list[CityStreet]:
         """Return a road beside the arterial at `at_m`, half of the time with the rows of a car park behind it."""
         inwards = -math.copysign(1, at_m)
         start_m, end_m = low_m + 70, low_m + self._rng.uniform(0.5, 0.8) * (high_m - low_m)
@@ -416,7 +416,7 @@ class _City:
         if self._in_park(corners).any() or self._near_motorway(corners).any():
             return []
         self._shops.append((corners.min(axis=0) - 12, corners.max(axis=0) + 12))
-        return [Street("Service Road", "service", divided(line)) for line in plan]
+        return [CityStreet("Service Road", "service", divided(line)) for line in plan]
 
     def _in_park(self, points_m: Array) -> Array:
         """Return the mask (n,) of the points (n, 2) in the park along the river, which is not built up."""
@@ -429,7 +429,7 @@ class _City:
             return False
         return not any(((line > low) & (line < high)).all(axis=1).any() for low, high in self._shops)
 
-    def _cells(self) -> list[Street]:
+    def _cells(self) -> list[CityStreet]:
         """Return the streets in all cells between arterials."""
         edges = [np.concatenate([[-self._half_m], lines, [self._half_m]]) for lines in self._lines]
         streets = []
@@ -454,7 +454,7 @@ class _Cell:
         self._shift_m = np.zeros(2) if core else rng.uniform(-30, 30, 2)
         self._name = f"{'Core' if core else 'Quarter'} {low_m[0] / 100:.0f}/{low_m[1] / 100:.0f}"
 
-    def streets(self) -> list[Street]:
+    def streets(self) -> list[CityStreet]:
         """Return the streets of the cell, without the arterials at its edges."""
         found = []
         for axis in range(2):
@@ -476,7 +476,7 @@ class _Cell:
         before = abs(self._high_m[axis]) < 1 and line == self._count[axis] - 1
         return (1 if after else -1 if before else 0) * (1 if axis == 0 else -1)
 
-    def _street(self, axis: int, line: float, step: float, one_way: int) -> Street:
+    def _street(self, axis: int, line: float, step: float, one_way: int) -> CityStreet:
         """Return the street of the lattice on `line` of `axis`, from `step` to the next."""
         points = 2 if self._core else 13
         lattice = np.full((points, 2), float(line))
@@ -486,18 +486,18 @@ class _Cell:
             plan = plan[::-1]
         name = f"{self._name} {'Street' if axis == 0 else 'Place'} {line:g}"
         if one_way:
-            return Street(name, "secondary", divided(plan), True)
+            return CityStreet(name, "secondary", divided(plan), True)
         wide = self._core and line % 2 == 0
-        return Street(name, "tertiary" if wide else "residential", divided(plan))
+        return CityStreet(name, "tertiary" if wide else "residential", divided(plan))
 
-    def _alleys(self) -> list[Street]:
+    def _alleys(self) -> list[CityStreet]:
         """Return service streets in the middle of some blocks."""
         alleys = []
         for line in range(int(self._count[0])):
             for step in range(int(self._count[1])):
                 if self._rng.random() < 0.25:
                     alley = self._street(0, line + 0.5, step, 0)
-                    alleys.append(Street(alley.name, "service", alley.points_m))
+                    alleys.append(CityStreet(alley.name, "service", alley.points_m))
         return alleys
 
     def _twisted(self, part: Array) -> Array:

@@ -25,7 +25,7 @@ from emulator.world.maps.graph import read_graph, write_graph
 from emulator.world.maps.roads import MAX_POINTS, Roads, RoadsBuilder, street
 from emulator.world.maps.sumo import read_sumo, read_sumo_polygons
 from emulator.world.networks import MAX_COORDINATE_M
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from vnet.counted import counted
 from vnet.errors import ScenarioError, printable, shown
 from vnet.extras import require
@@ -179,7 +179,7 @@ def _extent(roads: Roads) -> tuple[Array, Array]:
     return roads.node_m.min(axis=0), roads.node_m.max(axis=0)
 
 
-def read_buildings(path: Path, frame: Callable[[], Frame]) -> Buildings:
+def read_buildings(path: Path, frame: Callable[[], CoordinateFrame]) -> Buildings:
     """Read buildings. `frame` returns the frame of the run's metres; it is called for a file in degrees.
 
     Raise ScenarioError, in one line that names the file and the line or feature, for a bad file.
@@ -206,7 +206,7 @@ def _some(path: Path, buildings: list[Rings]) -> list[Rings]:
     return buildings
 
 
-def _projected(path: Path, degrees: Buildings, frame: Frame) -> Buildings:
+def _projected(path: Path, degrees: Buildings, frame: CoordinateFrame) -> Buildings:
     """Return buildings in metres; their corners are longitudes and latitudes."""
     longitude, latitude = degrees.corner_m.T
     corner_m = frame.to_local(latitude, longitude)

@@ -30,7 +30,7 @@ from emulator.world.maps.roads import (
     check_extent,
 )
 from emulator.world.networks import MAX_COORDINATE_M
-from emulator.world.projection import Frame, project
+from emulator.world.projection import CoordinateFrame, project
 from vnet.errors import ScenarioError, shown
 from vnet.types import Array
 
@@ -90,7 +90,7 @@ def _metres(path: Path, arrays: Arrays) -> Array:
     return np.column_stack([x, _within(path, arrays, "node_y_m", len(x), -MAX_COORDINATE_M, MAX_COORDINATE_M)])
 
 
-def _frame(path: Path, arrays: Arrays) -> Frame | None:
+def _frame(path: Path, arrays: Arrays) -> CoordinateFrame | None:
     if "frame_proj" not in arrays:
         return None
     proj = arrays["frame_proj"]
@@ -98,7 +98,7 @@ def _frame(path: Path, arrays: Arrays) -> Frame | None:
         raise ScenarioError(f"{path}: frame_proj: one text is needed, not {proj.dtype} {proj.shape}")
     x, y = _within(path, arrays, "frame_offset_m", 2, -MAX_COORDINATE_M, MAX_COORDINATE_M).tolist()
     try:
-        return Frame.named(str(proj), (x, y))
+        return CoordinateFrame.named(str(proj), (x, y))
     except ScenarioError as error:
         raise ScenarioError(f"{path}: frame_proj: {error}") from None
 
@@ -163,7 +163,7 @@ def _kinds(path: Path, arrays: Arrays, count: int) -> Ints:
 class _Merger:
     """Merger of edges into roads: both directions of an edge, then chains of edges without crossings."""
 
-    def __init__(self, path: Path, node_m: Array, edges: _Edges, frame: Frame | None) -> None:
+    def __init__(self, path: Path, node_m: Array, edges: _Edges, frame: CoordinateFrame | None) -> None:
         self._path, self._node_m, self._frame = path, node_m, frame
         self._notes: dict[str, int] = {}
         ends = self._undirected(edges)

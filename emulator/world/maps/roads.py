@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.world.projection import MAX_FROM_ORIGIN_M, Frame, outlier_index, project
+from emulator.world.projection import MAX_FROM_ORIGIN_M, CoordinateFrame, outlier_index, project
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap, touch_box
 from vnet.types import Array
@@ -158,7 +158,7 @@ class Roads:
     backward: Ints
     lane_width_m: Array
     one_way: NDArray[np.bool_]
-    frame: Frame | None = None
+    frame: CoordinateFrame | None = None
     notes: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -369,7 +369,7 @@ class RoadsBuilder:
         """Return the name of a road that runs through a point."""
         return self._rows[bisect(self._first, self._node.index(point)) - 1].name
 
-    def build(self, node_m: Array, frame: Frame | None) -> Roads:
+    def build(self, node_m: Array, frame: CoordinateFrame | None) -> Roads:
         """Return the roads, with the points at `node_m` (N, 2). Raise ScenarioError as `check_extent` does."""
         check_extent(self._source, node_m, len(self._rows), self._name_of)
         return Roads(

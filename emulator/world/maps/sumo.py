@@ -24,7 +24,7 @@ from emulator.world.maps.roads import (
     RoadsBuilder,
 )
 from emulator.world.networks import MAX_COORDINATE_M
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from vnet.errors import ScenarioError, printable, shown
 
 LARGEST_BYTES = 2**31
@@ -59,7 +59,7 @@ class _Reader:
         self._parser.StartDoctypeDeclHandler = self._refuse_doctype
         self._depth = 0
         self._edge: dict[str, str] | None = None
-        self.frame: Frame | None = None
+        self.frame: CoordinateFrame | None = None
         self.lanes: list[_Lane] = []
         self._points_left = MAX_POINTS
         self.edge_ends: set[tuple[str, str]] = set()
@@ -115,7 +115,7 @@ class _Reader:
             if len(points) != 1:
                 raise self.wrong("netOffset: one x,y in metres is needed")
             try:
-                self.frame = Frame.named(proj, points[0])
+                self.frame = CoordinateFrame.named(proj, points[0])
             except ScenarioError as error:
                 raise self.wrong(str(error)) from None
 

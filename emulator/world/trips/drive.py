@@ -16,7 +16,7 @@ from emulator.scenario.program import Program
 from emulator.scenario.sections import DAY_S
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import lanes_around, notes_of, read_roads
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.files import drive_sumo, read_csv, read_fcd, read_npz, read_parquet
 from emulator.world.trips.generate import RIGHT, Side, generate_motion
 from emulator.world.trips.motion import Motion, Rules, Selection, motion_of
@@ -137,7 +137,7 @@ def whole_motion(path: Path, origin_deg: tuple[float, float] | None, rate_hz: fl
 
 def drive_through_city(
     network: Network, section: Map | None, periods: int, period_ns: int
-) -> tuple[Motion, RoadMap, Frame | None]:
+) -> tuple[Motion, RoadMap, CoordinateFrame | None]:
     """Return generated trips through a generated city, or through the map of `section`, and its lanes and frame.
 
     Raise ScenarioError if the map cannot be read, or no vehicle can drive on it.

@@ -84,7 +84,7 @@ class Streets:
     time_s: Array
 
 
-class Network:
+class StreetNetwork:
     """The largest strongly connected component of a map's streets."""
 
     def __init__(self, source: object, roads: Roads) -> None:
@@ -218,7 +218,7 @@ def generate_motion(
     """
     if vehicles * periods > MOST_STATES:
         raise ScenarioError(f"{vehicles} vehicles for {periods} periods: at most {MOST_STATES:,} states")
-    network = Network(source, roads)
+    network = StreetNetwork(source, roads)
     time_s = np.asarray(np.arange(periods) * (period_ns / NS_PER_S), dtype=np.float64)
     states = np.full((periods, vehicles, 3), np.nan)
     for number in range(vehicles):
@@ -237,7 +237,7 @@ def generate_motion(
 class _Trip:
     """One vehicle's trajectory: points `point_m` (S, 2), and the times of arrival and departure there."""
 
-    def __init__(self, network: Network, rng: np.random.Generator, duration_s: float, side: Side) -> None:
+    def __init__(self, network: StreetNetwork, rng: np.random.Generator, duration_s: float, side: Side) -> None:
         self._rng = rng
         parked, late, early = rng.random(3) < (PARKED, LATE, EARLY)
         enters_s = duration_s * rng.uniform(0, 0.5) * late
@@ -303,7 +303,7 @@ class _Trip:
 class _Lane:
     """The lane of a route: on each street lane `number` from the right, modulo the lanes in this direction."""
 
-    def __init__(self, network: Network, edge: Ints, number: int, side: Side) -> None:
+    def __init__(self, network: StreetNetwork, edge: Ints, number: int, side: Side) -> None:
         streets = network.streets
         roads = streets.roads
         self._network, self._node_m = network, roads.node_m

@@ -9,13 +9,13 @@ import pytest
 
 from docs.generate import checks as check_page
 from emulator.checks import registry
-from emulator.checks.judge import NotExercised, RecordedRun, Verdict, check_run, judge
+from emulator.checks.judge import RecordedRun, Verdict, check_run, judge
 from emulator.checks.registry import CHECKS, Check, Subject, WithoutPositions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
-from emulator.records.verdicts import CheckResult, Finding, result, unknown
+from emulator.records.verdicts import CheckResult, Finding, invalid, not_exercised, result, unknown
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import count_verdicts
 from emulator.world.world import build_world
@@ -25,15 +25,14 @@ LIMIT_BYTES = 100
 
 def check_frame_size(recorded: RecordedRun) -> Finding:
     """Check that no frame is longer than the limit: the example of CONTRIBUTING.md."""
-    name = "frame_size"
     if recorded.scenario.program.entry == "agents.averaging:main":
-        return NotExercised(name, "frames of this program grow with the network")
+        return not_exercised("frames of this program grow with the network")
     if not len(recorded.trace):
-        return unknown(name, "no frame was sent")
+        return unknown("no frame was sent")
     longer = recorded.column("size_bytes") > LIMIT_BYTES
     text = f"{len(longer):,} receptions of frames of {LIMIT_BYTES} bytes or less"
     broken_text = f"{int(longer.sum()):,} receptions of longer frames"
-    return result(name, int(longer.sum()), text, broken_text, recorded.rows(longer), limit_bytes=LIMIT_BYTES)
+    return result(int(longer.sum()), text, broken_text, recorded.rows(longer), limit_bytes=LIMIT_BYTES)
 
 
 FRAME_SIZE = Check(
@@ -129,11 +128,7 @@ def test_names_are_unique_and_documented() -> None:
 def test_a_check_of_the_machine_is_never_invalid(tmp_path: Path) -> None:
     recorded = RecordedRun.open(simulated(tmp_path / "run"))
     for check in CHECKS:
-
-        def finds(recorded: RecordedRun, name: str = check.name) -> Finding:
-            return CheckResult(name, Verdict.INVALID, "as bad as can be")
-
-        found = list(replace(check, function=finds).findings(recorded))
+        found = list(replace(check, function=lambda recorded: invalid("as bad as can be")).findings(recorded))
         expected = Verdict.UNKNOWN if check.subject is Subject.MACHINE else Verdict.INVALID
         assert [finding.verdict for finding in found if isinstance(finding, CheckResult)] == [expected]
         assert not (check.subject is Subject.MACHINE and check.invalid)

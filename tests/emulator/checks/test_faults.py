@@ -530,4 +530,4 @@ def test_in_real_time_what_was_sent_near_a_change_may_be_replayed_later() -> Non
 
 @pytest.mark.parametrize(("count", "text"), [(1, "1 fix is missing, "), (2000, "2,000 fixes are missing, ")])
 def test_what_shows_an_effect_is_counted_properly(count: int, text: str) -> None:
-    assert _wrong_fixes("effect:gnss_outage-0", count).text.startswith(text)
+    assert _wrong_fixes(count).text.startswith(text)

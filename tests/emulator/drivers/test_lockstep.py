@@ -16,7 +16,7 @@ from emulator.drivers.lockstep import Lockstep, run_in_lockstep
 from emulator.drivers.processes import Heard, Processes, ProtocolError
 from emulator.radio.outcomes import Outcome
 from tests.support.multi_loop_driver import emulation_of, scenario_of
-from vnet.radio import Packet
+from vnet.radio import Packet, SentFrame
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 
@@ -44,7 +44,7 @@ def yielded(
     timer_ns: int | None = None,
     radio: Sequence[str] = (),
     gnss: Sequence[str] = (),
-    frames: Sequence[wire.Frame] = (),
+    frames: Sequence[SentFrame] = (),
 ) -> wire.Yield:
     steps = [wire.Step(grant.time_ns, wire.Traffic(frames))] if frames else []
     return wire.Yield(b"n", grant.seq, timer_ns, radio, gnss, steps, 1)
@@ -127,7 +127,7 @@ def test_a_task_that_waits_for_fixes_is_woken_by_each_and_gets_what_it_has_misse
 def test_a_frame_wakes_whoever_waits_for_it_when_it_arrives_and_waits_for_the_others() -> None:
     lockstep, _ = barrier()
     for process_id, grant in lockstep.start().items():
-        frames = [wire.Frame("v01", b"hello")] if process_id == "v01" else []
+        frames = [SentFrame("v01", b"hello")] if process_id == "v01" else []
         radio = [process_id] if process_id in ("v01", "v02") else []
         timer_ns = 900 * MS if process_id == "v03" else None
         lockstep.receive(process_id, yielded(grant, timer_ns, radio, frames=frames))
@@ -146,7 +146,7 @@ def test_a_frame_wakes_whoever_waits_for_it_when_it_arrives_and_waits_for_the_ot
     ("seq", "traffic", "radio", "gnss"),
     [
         (1, wire.Traffic(), [], []),
-        (0, wire.Traffic([wire.Frame("v02", b"x")]), [], []),
+        (0, wire.Traffic([SentFrame("v02", b"x")]), [], []),
         (0, wire.Traffic((), (), [wire.Ending("v02", "finished")]), [], []),
         (0, wire.Traffic(), ["v02"], []),
         (0, wire.Traffic(), [], ["v02"]),
@@ -283,7 +283,7 @@ def test_a_step_outside_its_window_or_out_of_order_is_refused(times_ms: list[int
     lockstep, _ = barrier(radio={"latency_ms": 30.0})
     yield_all(lockstep, lockstep.start(), v01=50 * MS)
     (grant,) = lockstep.step().values()
-    steps = [wire.Step(time_ms * MS, wire.Traffic([wire.Frame("v01", b"x")])) for time_ms in times_ms]
+    steps = [wire.Step(time_ms * MS, wire.Traffic([SentFrame("v01", b"x")])) for time_ms in times_ms]
     with pytest.raises(ProtocolError, match=message):
         lockstep.receive("v01", wire.Yield(b"n", grant.seq, None, [], [], steps, 1))
 
@@ -291,7 +291,7 @@ def test_a_step_outside_its_window_or_out_of_order_is_refused(times_ms: list[int
 def test_packets_of_a_window_are_shown_before_it_and_decided_after_it() -> None:
     lockstep, emulation = barrier(radio={"latency_ms": 30.0, "jitter_ms": 20.0, "access_jitter_ms": 0.0})
     for process_id, grant in lockstep.start().items():
-        frames = [wire.Frame("v01", b"x")] if process_id == "v01" else []
+        frames = [SentFrame("v01", b"x")] if process_id == "v01" else []
         lockstep.receive(process_id, yielded(grant, 30 * MS if process_id == "v01" else 31 * MS, frames=frames))
     grants = lockstep.step()
     assert window(grants) == (30, 60)
@@ -319,7 +319,7 @@ def test_a_window_longer_than_the_least_latency_is_noticed() -> None:
     lockstep._lookahead_ns = 4 * MS
     grants = lockstep.start()
     for process_id, grant in grants.items():
-        lockstep.receive(process_id, yielded(grant, 150 * MS, frames=[wire.Frame(process_id, b"x")]))
+        lockstep.receive(process_id, yielded(grant, 150 * MS, frames=[SentFrame(process_id, b"x")]))
     with pytest.raises(AssertionError, match="foreseen up to 3999999 ns"):
         lockstep.step()
 
@@ -336,7 +336,7 @@ def test_a_flood_that_nobody_takes_is_bounded_and_that_of_a_window_is_not(monkey
     }
     lockstep, _ = barrier(radio=radio)
     for process_id, grant in lockstep.start().items():
-        frames = [wire.Frame("v01", bytes([n])) for n in range(20)] if process_id == "v01" else []
+        frames = [SentFrame("v01", bytes([n])) for n in range(20)] if process_id == "v01" else []
         timers_ns = {"v01": 100 * MS, "v02": 30 * MS, "v03": 110 * MS}
         lockstep.receive(process_id, yielded(grant, timers_ns.get(process_id), frames=frames))
     grants = lockstep.step()
@@ -374,7 +374,7 @@ class Vehicle:
         arrivals_ns = [packet.received_ns for packet in self.packets] if self.hears else []
         return min([math.inf if self.timer_ns is None else self.timer_ns, *arrivals_ns])
 
-    def wake(self, now_ns: int, diary: list[tuple[Any, ...]]) -> list[wire.Frame]:
+    def wake(self, now_ns: int, diary: list[tuple[Any, ...]]) -> list[SentFrame]:
         """Do what is to be done at this instant, and write it down."""
         come = [packet for packet in self.packets if packet.received_ns <= now_ns]
         packets, fixes = (come if self.hears else []), (self.fixes if self.locates else [])
@@ -392,7 +392,7 @@ class Vehicle:
         # An answer to every packet would be answered without end.
         sent = self.draw.choice([0, 0, 1, 2]) if fixes or rings else self.draw.choice([0] * 9 + [1])
         return [
-            wire.Frame(self.node, f"{self.node} {self.incarnation} {len(diary)} {n}".encode()) for n in range(sent)
+            SentFrame(self.node, f"{self.node} {self.incarnation} {len(diary)} {n}".encode()) for n in range(sent)
         ]
 
 

@@ -11,6 +11,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.scenario.faults import KINDS, parse_fault
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
 from vnet import Node
+from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire
 
@@ -304,7 +305,7 @@ def test_reports_of_who_was_killed_at_that_instant_are_discarded_with_its_frames
     emulation = emulation_of(scenario_of([fault("kill", 1.0, 1.0, "v02")], ORDERED))
     emulation.act(1_000_000_000)
     late = Report(999_999_999, "v02", (0.0, 0.0), None, {})
-    emulation.take(1_000_000_000, [wire.Traffic([wire.Frame("v02", b"x")], [late])])
+    emulation.take(1_000_000_000, [wire.Traffic([SentFrame("v02", b"x")], [late])])
     emulation.finish(3_000_000_000)
     assert len(emulation.engine.trace) == 0
     assert all(row["estimate_m"] is None for row in emulation.metrics.states_table().to_pylist())

@@ -10,6 +10,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, scenario_of
+from vnet.radio import SentFrame
 from vnet.transport import wire
 from vnet.transport.wire import MessageRef, SentMessage, arrived_in_full
 
@@ -40,7 +41,7 @@ def test_a_result_in_a_batch_that_was_missed_goes_out_again() -> None:
     plan = scenario_of((), "agents.beacon:main", run={"pacing": "realtime"}, radio={"mac": {}})
     realtime = RealTime(emulation_of(plan), [[node] for node in IDS])
     realtime.start(0)
-    traffic = wire.Traffic([wire.Frame("v01", b"x", to="v02", number=7)])
+    traffic = wire.Traffic([SentFrame("v01", b"x", to="v02", number=7)])
     realtime.receive(10 * MS, "v01", wire.Frames(b"n", 0, 1, [], traffic))
     batch = realtime.due(100 * MS)["v01"]
     (result,) = batch.results
@@ -143,7 +144,7 @@ def test_who_is_killed_again_before_it_was_back_is_killed_and_comes_back_once_mo
 def test_what_a_killed_process_still_says_counts_for_nothing() -> None:
     realtime, emulation = started(fault("kill", 0.5, 1.0))
     realtime.due(500 * MS)
-    realtime.receive(501 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic([wire.Frame("v02", b"x")])))
+    realtime.receive(501 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v02", b"x")])))
     realtime.due(600 * MS)
     assert len(emulation.engine.trace) == 0
     assert realtime.gaps == 0
@@ -186,7 +187,7 @@ def test_frames_that_come_after_an_interruption_are_no_part_of_the_run() -> None
     realtime, emulation = started()
     realtime.due(450 * MS)
     emulation.finish(500 * MS)
-    late = wire.Frames(b"n", 0, 1, [], wire.Traffic([wire.Frame("v02", b"x")]), None, final=True)
+    late = wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v02", b"x")]), None, final=True)
     realtime.receive(501 * MS, "v02", late)
     realtime.finish()
     assert emulation.engine.counts[Outcome.pending] == 0
@@ -196,7 +197,7 @@ def test_frames_that_come_after_an_interruption_are_no_part_of_the_run() -> None
 
 def test_the_true_latency_of_a_late_delivery_is_in_the_trace() -> None:
     realtime, emulation = started()
-    realtime.receive(10 * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic([wire.Frame("v01", b"x")])))
+    realtime.receive(10 * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v01", b"x")])))
     batches = {node: batch for node, batch in realtime.due(60 * MS).items() if batch.packets}
     arrived_ns = {node: batch.packets[0].received_ns for node, batch in batches.items()}
     # v02 was late by 40 ms, v03 by 19 ms; v04 speaks of the future, and of a batch that it has never been sent

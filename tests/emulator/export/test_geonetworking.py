@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 import emulator
 from docs.examples.its.station import EMERGENCY_BRAKE, ORIGIN_DEG, Message, decode, encode_cam, encode_denm
 from emulator.cli.export import export
-from emulator.export.geonetworking import Router, Station, station_of
-from emulator.export.pcapng import write_pcapng
+from emulator.export.pcapng import Router, Station, station_of, write_pcapng
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from tests.support.cli import command_app
 from tests.support.paths import ROOT

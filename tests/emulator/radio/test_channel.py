@@ -15,7 +15,7 @@ from emulator.radio.faults import ActiveLinkFaults
 from emulator.radio.frames import Frame, Receptions, Stage, Transmission
 from emulator.radio.mac import TransmitQueue
 from emulator.radio.outcomes import Outcome
-from emulator.radio.stages import Latency, Loss, in_range, peer_cap, sender_side
+from emulator.radio.stages import LatencyStage, LossStage, in_range, peer_cap, sender_side
 from emulator.radio.topology import Disc, Topology
 from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of
 from emulator.scenario.scenario import Radio
@@ -270,7 +270,7 @@ def test_access_is_delayed_by_up_to_the_jitter_and_differently_each_time() -> No
 @pytest.mark.parametrize("loss", [0.01, 0.1, 0.5, 0.93])
 @pytest.mark.parametrize("seed", [0, 1, 2**62])
 def test_loss_lies_in_its_band_for_the_run_and_for_each_receiver(loss: float, seed: int) -> None:
-    stage, frames, receivers = Loss(seed, loss), 400, 25
+    stage, frames, receivers = LossStage(seed, loss), 400, 25
     lost = np.array([sent(stage, receivers, seq).outcome == Outcome.lost for seq in range(frames)])
     low, high = binom.interval(0.999, frames * receivers, loss)
     assert low <= lost.sum() <= high
@@ -281,10 +281,10 @@ def test_loss_lies_in_its_band_for_the_run_and_for_each_receiver(loss: float, se
 @settings(max_examples=30, deadline=None)
 @given(seeds, st.floats(0, 1), st.floats(0, 1))
 def test_more_loss_loses_more_of_the_same_pairs(seed: int, one: float, other: float) -> None:
-    few, many = (sent(Loss(seed, loss), 50).outcome == Outcome.lost for loss in sorted((one, other)))
+    few, many = (sent(LossStage(seed, loss), 50).outcome == Outcome.lost for loss in sorted((one, other)))
     assert np.all(many[few])
-    assert not (sent(Loss(seed, 0.0), 50).outcome == Outcome.lost).any()
-    assert (sent(Loss(seed, 1.0), 50).outcome == Outcome.lost).all()
+    assert not (sent(LossStage(seed, 0.0), 50).outcome == Outcome.lost).any()
+    assert (sent(LossStage(seed, 1.0), 50).outcome == Outcome.lost).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -293,8 +293,8 @@ def test_latency_is_within_its_bounds_and_rounded_up_by_less_than_a_tick(
     seed: int, tick_us: int, latency_ms: float, jitter_ms: float, sent_ns: int
 ) -> None:
     shape = {"latency_ms": latency_ms, "jitter_ms": jitter_ms}
-    exact = sent(Latency(seed, radio(**shape)), 20, sent_ns=sent_ns).arrival_ns
-    ticked = sent(Latency(seed, radio(**shape, delivery_tick_us=tick_us)), 20, sent_ns=sent_ns).arrival_ns
+    exact = sent(LatencyStage(seed, radio(**shape)), 20, sent_ns=sent_ns).arrival_ns
+    ticked = sent(LatencyStage(seed, radio(**shape, delivery_tick_us=tick_us)), 20, sent_ns=sent_ns).arrival_ns
     delay_ns = exact - sent_ns
     assert np.all(delay_ns >= max(1000, int(latency_ms * MS)))
     assert np.all(delay_ns <= max(1000, (latency_ms + jitter_ms) * MS))
@@ -307,7 +307,7 @@ def test_latency_is_within_its_bounds_and_rounded_up_by_less_than_a_tick(
 
 
 def test_receivers_of_one_frame_hear_it_at_different_times() -> None:
-    arrivals = sent(Latency(3, radio(latency_ms=2, jitter_ms=4)), 500).arrival_ns
+    arrivals = sent(LatencyStage(3, radio(latency_ms=2, jitter_ms=4)), 500).arrival_ns
     assert len(set(arrivals.tolist())) == 500
     assert arrivals.min() < 2.2 * MS
     assert arrivals.max() > 5.8 * MS

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.radio.congestion import BusyRatioMeter, LimericControl, ReactiveControl
+from emulator.radio.csma import BusyRatioMeter, LimericControl, ReactiveControl
 from emulator.radio.engine import Engine
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.outcomes import Outcome

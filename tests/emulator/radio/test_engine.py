@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.radio.engine import Delivery, Engine
-from emulator.radio.in_flight import INITIAL_CAPACITY
+from emulator.radio.engine import INITIAL_CAPACITY, Delivery, Engine
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.scenario.scenario import Radio

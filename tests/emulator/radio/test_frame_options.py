@@ -16,20 +16,22 @@ from emulator.scenario.scenario import Radio as RadioSection
 from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, fault
 from tests.support.radio import engine, line
 from vnet import Node
-from vnet.radio import Radio, SendOptions
+from vnet.radio import Radio, SentFrame
 
 MS = 1_000_000
 PHYSICAL: dict[str, Any] = {"path_loss": {"kind": "log_distance"}, "mac": {}, "max_peers": 1000}
+KINDS: list[dict[str, Any]] = [{"to": "v1"}, {}, {"power_dbm": 19.0, "rate_mbps": 9.0}]
+"""Choices of frames: to v1 alone, none, and less power at another rate."""
 
 
 class Sink:
     """A transport that keeps what is sent."""
 
     def __init__(self) -> None:
-        self.sent: list[tuple[bytes, SendOptions]] = []
+        self.sent: list[SentFrame] = []
 
-    def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
-        self.sent.append((payload, options))
+    def send_frame(self, frame: SentFrame) -> None:
+        self.sent.append(frame)
 
     def busy_ratio(self, node: str) -> float | None:
         return None
@@ -51,7 +53,7 @@ def test_power_shifts_the_received_one_and_rate_the_airtime(
     gain_db: float, rate_mbps: float, distance_m: int
 ) -> None:
     subject = engine(line(0, distance_m), **PHYSICAL)
-    subject.transmit(0, 0, [bytes(300)] * 2, {1: SendOptions(20 + gain_db, rate_mbps)})
+    subject.transmit(0, 0, [bytes(300), SentFrame("v0", bytes(300), 20 + gain_db, rate_mbps)])
     subject.drain()
     usual, chosen = subject.trace.to_table().to_pylist()
     assert chosen["rssi_dbm"] - usual["rssi_dbm"] == pytest.approx(gain_db, abs=0.011)
@@ -64,8 +66,8 @@ def test_power_shifts_the_received_one_and_rate_the_airtime(
 
 def test_a_weak_frame_is_in_range_but_fades_and_a_fast_one_needs_a_better_signal() -> None:
     subject = engine(line(0, 300), **PHYSICAL)
-    options = {1: SendOptions(power_dbm=5.0), 2: SendOptions(rate_mbps=27.0), 3: SendOptions(rate_mbps=3.0)}
-    subject.transmit(0, 0, [bytes(300)] * 4, options)
+    choices: list[dict[str, Any]] = [{}, {"power_dbm": 5.0}, {"rate_mbps": 27.0}, {"rate_mbps": 3.0}]
+    subject.transmit(0, 0, [SentFrame("v0", bytes(300), **chosen) for chosen in choices])
     subject.drain()
     outcomes = [row["outcome"] for row in subject.trace.to_table().to_pylist()]
     assert outcomes == ["delivered", "faded", "faded", "delivered"]
@@ -75,7 +77,7 @@ def test_a_weak_frame_keeps_the_medium_free_beyond_its_own_range() -> None:
     """v1 is 300 m away: it senses v0 at 20 dBm, and not at 0 dBm."""
     for power_dbm, together in ((20.0, False), (0.0, True)):
         subject = engine(line(0, 300), **PHYSICAL)
-        subject.transmit(0, 0, [bytes(1000)], {0: SendOptions(power_dbm=power_dbm)})
+        subject.transmit(0, 0, [SentFrame("v0", bytes(1000), power_dbm)])
         subject.transmit(MS, 1, [bytes(100)])
         subject.drain()
         first, second = subject.trace.to_table().to_pylist()
@@ -85,7 +87,7 @@ def test_a_weak_frame_keeps_the_medium_free_beyond_its_own_range() -> None:
 def test_without_choices_the_trace_is_what_it_was() -> None:
     plain, same = (engine(line(0, 100), **PHYSICAL) for _ in range(2))
     plain.transmit(0, 0, [b"a", b"b"])
-    same.transmit(0, 0, [b"a", b"b"], {0: SendOptions(20.0, 6.0), 1: SendOptions(None, None)})
+    same.transmit(0, 0, [SentFrame("v0", b"a", 20.0, 6.0), SentFrame("v0", b"b")])
     plain.drain()
     same.drain()
     assert same.trace.to_table().equals(plain.trace.to_table())
@@ -95,7 +97,7 @@ def test_without_choices_the_trace_is_what_it_was() -> None:
 def test_an_agent_that_asks_for_what_the_radio_cannot_do_gets_the_scenarios() -> None:
     subject, disc = engine(line(0, 100), **PHYSICAL), engine(line(0, 100), range_m=500.0)
     for each in (subject, disc):
-        each.transmit(0, 0, [b"a", b"b"], {0: SendOptions(60.0, 7.5), 1: SendOptions(math.nan, math.nan)})
+        each.transmit(0, 0, [SentFrame("v0", b"a", 60.0, 7.5), SentFrame("v0", b"b", math.nan, math.nan)])
         each.drain()
         assert "gain_db" not in each.trace.to_table().column_names
 
@@ -105,7 +107,7 @@ def test_programs_learn_what_the_radio_can_do() -> None:
     assert radio.max_power_dbm == 20 and radio.rates_mbps == RATES_MBPS
     run(radio.broadcast(b"x", power_dbm=10, rate_mbps=np.float64(12)))
     run(radio.broadcast(b"y"))
-    assert sink.sent == [(b"x", SendOptions(10.0, 12.0)), (b"y", SendOptions(None, None))]
+    assert sink.sent == [SentFrame("v01", b"x", 10.0, 12.0), SentFrame("v01", b"y")]
 
 
 @pytest.mark.parametrize(
@@ -161,40 +163,34 @@ def test_the_checks_know_of_powers_and_rates(mac: bool, tmp_path: Path) -> None:
 def test_a_replayed_frame_has_the_addressee_power_and_rate_of_the_old_one() -> None:
     """Frames are sent in turn to v1 alone, to all, and to all with less power at another rate."""
     air = FaultyEngine([fault("DataReplay", nodes={"ids": ["v0"]}, age_s=0.1)], count=3, **PHYSICAL)
-    kinds = [SendOptions(to="v1"), None, SendOptions(19.0, 9.0)]
     for period in range(9):
-        air.send(period * PERIOD_NS, 0, bytes([period]) * 20, options=kinds[period % 3])
+        air.send(period * PERIOD_NS, 0, SentFrame("v0", bytes([period]) * 20, **KINDS[period % 3]))
     rows = air.rows()
     replayed = [row for row in rows if row["cause"] and row["attempt"] < 2]
     assert len({row["seq"] for row in replayed}) == 8
     for row in replayed:
-        kind = kinds[row["seq"] % 3]
         assert bool(row["attempt"]) == (row["seq"] % 3 == 0)
-        assert (row["gain_db"], row["bitrate_mbps"]) == ((-1, 9) if kind and kind.power_dbm else (0, 6))
+        assert (row["gain_db"], row["bitrate_mbps"]) == ((-1, 9) if row["seq"] % 3 == 2 else (0, 6))
     assert {packet.receiver for packet in air.delivered if not packet.packet.payload[0] % 3} == {1}
 
 
 def test_a_stale_frame_has_the_addressee_power_and_rate_of_the_old_one_and_its_sender_is_told() -> None:
     """Each is the frame before the last: of those sent in turn as above, whose senders await some of them."""
     air = FaultyEngine([fault("StaleMessages", nodes={"ids": ["v0"]}, age_s=0.1)], count=3, **PHYSICAL)
-    kinds = [SendOptions(to="v1"), None, SendOptions(19.0, 9.0)]
     for period in range(9):
-        kind = kinds[period % 3]
-        options = SendOptions(to=kind.to, number=period) if kind and kind.to else kind
-        air.send(period * PERIOD_NS, 0, bytes([period]) * 20, options=options)
+        air.send(period * PERIOD_NS, 0, SentFrame("v0", bytes([period]) * 20, number=period, **KINDS[period % 3]))
     stale = [row for row in air.rows() if row["cause"] and row["attempt"] < 2]
     assert len({row["seq"] for row in stale}) == 8
     for row in stale:
-        kind = kinds[(row["seq"] - 1) % 3]
         assert bool(row["attempt"]) == ((row["seq"] - 1) % 3 == 0)
-        assert (row["gain_db"], row["bitrate_mbps"]) == ((-1, 9) if kind and kind.power_dbm else (0, 6))
+        assert (row["gain_db"], row["bitrate_mbps"]) == ((-1, 9) if (row["seq"] - 1) % 3 == 2 else (0, 6))
     results = [(result.number, result.delivered, result.attempts) for result in air.engine.take_results(10**12)]
     assert results == [(0, True, 1), (3, False, 0), (6, False, 0)], "those to v1 were broadcast, all but the first"
 
 
 def test_a_frame_to_nobody_leaves_no_columns_for_its_choices() -> None:
     subject = engine(line(0, 50), **PHYSICAL)
-    subject.transmit(0, 0, [b"x", b"y"], {0: SendOptions(5.0, 12.0, to="v9")})
+    subject.transmit(0, 0, [SentFrame("v0", b"x", 5.0, 12.0, to="v9"), b"y"])
     subject.drain()
     (row,) = subject.trace.to_table().to_pylist()
     assert not {"gain_db", "attempt"} & row.keys()

@@ -20,7 +20,7 @@ from emulator.scenario.scenario import Scenario
 from tests.support import rules
 from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, Row, S, digest, fault
 from vnet.errors import ScenarioError
-from vnet.radio import SendOptions
+from vnet.radio import SentFrame
 
 
 def rule(function: str, at_s: float = 0.0, duration_s: float = 100.0, kind: str = "custom", **more: Any) -> Row:
@@ -75,7 +75,7 @@ def test_a_rule_sees_power_and_bit_rate_of_the_frame(kind: str) -> None:
     for radio in (physical, {"range_m": 250.0, "bitrate_mbps": 2.5}):
         air = FaultyEngine([rule("looks", kind=kind)], **radio)
         air.go(0)
-        air.engine.transmit(0, 1, [b"a", b"b"], {1: SendOptions(power_dbm=10.5, rate_mbps=3.0)})
+        air.engine.transmit(0, 1, [b"a", SentFrame("v1", b"b", power_dbm=10.5, rate_mbps=3.0)])
         air.rows()
     assert [(frame.power_dbm, frame.rate_mbps) for frame in rules.SEEN] == [(23, 12), (10.5, 3), *[(None, 2.5)] * 2]
 

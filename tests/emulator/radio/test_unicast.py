@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from emulator.radio.dot11p import AIFSN_AND_CW, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.engine import Engine
-from emulator.radio.frames import Receptions, Result, Transmission
+from emulator.radio.frames import Receptions, Transmission, UnicastResult
 from emulator.radio.unicast import ACK_BYTES, ACK_TIMEOUT_NS, EIFS_NS, MOST_ATTEMPTS, ack_airtime_ns
 from tests.support.radio import engine, line
-from vnet.radio import SendOptions
+from vnet.radio import SentFrame
 
 MS = 1_000_000
 LATENCY_NS = 2 * MS
@@ -42,7 +42,9 @@ radios = st.fixed_dictionaries(
 )
 
 
-def transmit(subject: Engine, frames: list[tuple[int, int, int]], stops: list[int] | None = None) -> list[Result]:
+def transmit(
+    subject: Engine, frames: list[tuple[int, int, int]], stops: list[int] | None = None
+) -> list[UnicastResult]:
     """Send, with looks at the engine at `stops`; returns the results."""
     results = []
     numbers = [0] * 5
@@ -51,9 +53,10 @@ def transmit(subject: Engine, frames: list[tuple[int, int, int]], stops: list[in
             subject.advance(time_ns)
             results += subject.take_results(time_ns)
         for _, sender, to in [frame for frame in frames if frame[0] == time_ns]:
-            options = {0: SendOptions(to=f"v{to}", number=numbers[sender])} if to < 6 else {}
+            payload = bytes([sender]) * 200
+            alone = SentFrame(f"v{sender}", payload, to=f"v{to}", number=numbers[sender])
             numbers[sender] += to < 6
-            subject.transmit(time_ns, sender, [bytes([sender]) * 200], options)
+            subject.transmit(time_ns, sender, [alone if to < 6 else payload])
     subject.drain()
     return results + subject.take_results(10**12)
 
@@ -137,14 +140,14 @@ def test_a_result_comes_a_lookahead_after_the_acknowledgement() -> None:
     (result,) = transmit(subject, [(0, 0, 1)])
     (row,) = rows_of(subject)
     assert row["left_ns"] == AIFS_NS + airtime_ns(200, 6.0)
-    assert result == Result(row["left_ns"] + SIFS_NS + ACK_NS + LATENCY_NS, 0, 0, True, 1)
+    assert result == UnicastResult(row["left_ns"] + SIFS_NS + ACK_NS + LATENCY_NS, 0, 0, True, 1)
 
 
 def test_others_keep_silent_until_an_acknowledgement_that_they_cannot_sense_has_ended() -> None:
     """v2 hears v0, and not v1: its frame waits for AIFS after the reserved time, and not after what it senses."""
     for to, silent_ns in ((1, SIFS_NS + ACK_NS), (6, 0)):
         subject = engine(line(0, 350, -350), **PHYSICAL)
-        subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to=f"v{to}", number=0)} if to < 6 else {})
+        subject.transmit(0, 0, [SentFrame("v0", bytes(200), to=f"v{to}" if to < 6 else None)])
         subject.transmit(AIFS_NS + 50_000, 2, [bytes(200)])
         subject.drain()
         first, second = (next(row for row in rows_of(subject) if row["sender"] == f"v{n}") for n in (0, 2))
@@ -159,7 +162,7 @@ def test_a_backoff_that_counts_stops_where_a_frame_is_read_and_not_sensed() -> N
     for start_ns in range(330_000, 420_000, 5_000):
         subject = engine(line(0, -50, 300), start_ns, **radio)
         subject.transmit(0, 2, [bytes(200)])
-        subject.transmit(start_ns, 0, [bytes(20)], {0: SendOptions(to="v1")})
+        subject.transmit(start_ns, 0, [SentFrame("v0", bytes(20), to="v1")])
         subject.transmit(start_ns, 2, [bytes(200)])
         subject.drain()
         rows = rows_of(subject)
@@ -187,7 +190,7 @@ def test_no_frame_overlaps_an_acknowledgement_where_all_can_read_its_frame() -> 
 def test_who_cannot_decode_a_broadcast_waits_longer_only_if_asked_to(eifs: bool) -> None:
     """v1 detects the frame of v0 at 27 Mbit/s, and cannot decode it."""
     subject = engine(line(0, 400), **{**PHYSICAL, "mac": {"eifs": eifs}})
-    subject.transmit(0, 0, [bytes(300)], {0: SendOptions(rate_mbps=27.0)})
+    subject.transmit(0, 0, [SentFrame("v0", bytes(300), rate_mbps=27.0)])
     subject.transmit(AIFS_NS + 50_000, 1, [bytes(200)])
     subject.drain()
     first, second = rows_of(subject)
@@ -214,7 +217,7 @@ def test_a_vehicle_that_is_down_acknowledges_nothing_and_is_told_nothing() -> No
     subject.set_up(1, False)
     assert transmit(subject, [(0, 0, 1)])[0][3:] == (False, MOST_ATTEMPTS)
     subject = engine(line(0, 50), **PHYSICAL)
-    subject.transmit(0, 0, [b"x"], {0: SendOptions(to="v1")})
+    subject.transmit(0, 0, [SentFrame("v0", b"x", to="v1")])
     subject.set_up(0, False)
     subject.drain()
     assert subject.take_results(10**12) == [] and rows_of(subject)[0]["acked"]
@@ -224,7 +227,7 @@ def test_a_vehicle_that_is_down_acknowledges_nothing_and_is_told_nothing() -> No
 def test_a_vehicle_that_comes_back_between_attempts_receives_the_first_that_finds_it() -> None:
     """Attempts that reach it while it is down are `receiver_down`, and none of them has been received."""
     subject = engine(line(0, 50), **PHYSICAL)
-    subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to="v1")})
+    subject.transmit(0, 0, [SentFrame("v0", bytes(200), to="v1")])
     subject.advance(200_000)
     subject.set_up(1, False)  # while the first attempt is on air
     arrived = list(subject.advance(3 * MS))
@@ -259,7 +262,7 @@ def test_an_attempt_after_one_that_found_nobody_in_the_end_is_no_duplicate(comes
     """Its addressee acknowledges it and goes down before it arrives; its sender misses the acknowledgement."""
     subject = engine(line(0, 50), **PHYSICAL)
     hear_again = lose_acknowledgements(subject)
-    subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to="v1")})
+    subject.transmit(0, 0, [SentFrame("v0", bytes(200), to="v1")])
     subject.advance(LATENCY_NS)
     rows = rows_of(subject)
     assert len(rows) > 1 and {row["outcome"] for row in rows[1:]} == {"duplicate"}
@@ -286,7 +289,7 @@ def test_what_becomes_of_an_attempt_does_not_depend_on_the_looks_at_the_engine(s
     def outcomes(stops: Iterable[int]) -> list[str]:
         subject = engine(line(0, 50), seed, **{**PHYSICAL, "jitter_ms": 20.0})
         lose_acknowledgements(subject)
-        subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to="v1")})
+        subject.transmit(0, 0, [SentFrame("v0", bytes(200), to="v1")])
         subject.advance(LATENCY_NS - 500_000)
         subject.set_up(1, False)
         for stop_ns in stops:

@@ -16,7 +16,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
     Canvas,
-    Period,
+    PeriodArrays,
     drawable,
     ellipses,
     in_length,
@@ -83,9 +83,9 @@ def entities(path: Path) -> dict[str, Entity]:
     return read_back(path)
 
 
-def periods(told: Told) -> list[Period]:
+def periods(told: Told) -> list[PeriodArrays]:
     node_ids = told[0][1]["node_ids"]
-    return [Period(message, node_ids) for stream, message in told if stream == "period"]
+    return [PeriodArrays(message, node_ids) for stream, message in told if stream == "period"]
 
 
 def test_the_file_is_whole_and_says_so(path: Path) -> None:
@@ -223,7 +223,7 @@ def test_a_link_is_delivered_if_a_frame_got_through_and_else_what_befell_most(to
         (1, 0, Outcome.lost, 1),
         (1, 0, Outcome.peer_cap, 2),
     ]
-    period = Period({"pairs": np.array(rows, dtype="<i4").tobytes()}, ["a", "b"])
+    period = PeriodArrays({"pairs": np.array(rows, dtype="<i4").tobytes()}, ["a", "b"])
     sender, receiver, state = link_states(period)
     assert list(zip(sender, receiver, state, strict=True)) == [(0, 1, Outcome.delivered), (1, 0, Outcome.peer_cap)]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.world.networks import Network, generate_network, load_network
+from emulator.world.networks import PlacedVehicles, generate_network, load_network
 from vnet.errors import ScenarioError
 
 pytestmark = pytest.mark.slow
@@ -24,7 +24,7 @@ PUBLISHED = {
 }  # fmt: skip
 
 
-def links(network: Network) -> NDArray[np.bool_]:
+def links(network: PlacedVehicles) -> NDArray[np.bool_]:
     """Return the mask (N, N) of vehicles in range of each other."""
     position_m = network.position_m
     distance_m = np.sqrt(((position_m[:, None] - position_m[None]) ** 2).sum(axis=2))

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from vnet.driving import Action
 from vnet.errors import WireError
 from vnet.node import Fix
+from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire
 from vnet.transport.backbone_keys import Arrived, Sent
@@ -38,7 +39,7 @@ reports = st.builds(
     st.none() | st.tuples(reals, reals, reals, reals),
     st.dictionaries(names, reals | st.lists(reals, max_size=4), max_size=3),
 )
-frames = st.builds(wire.Frame, names, st.binary(max_size=64), powers, powers, st.none() | names, times)
+frames = st.builds(SentFrame, names, st.binary(max_size=64), powers, powers, st.none() | names, times)
 results = st.lists(st.builds(WireSendResult, names, times, times, st.booleans(), times), max_size=2)
 actions = st.builds(Action, names, st.none() | st.floats(-1e6, 1e6), st.integers(-1, 1))
 endings = st.builds(wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names)

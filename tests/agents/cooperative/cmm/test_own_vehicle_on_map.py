@@ -9,9 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from agents.cooperative.cmm.information import NOTHING, Information
-from agents.cooperative.cmm.own_vehicle_on_map import OwnVehicleOnMap
+from agents.cooperative.cmm.own_vehicle_on_map import OFF_ROAD, OwnVehicleOnMap
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
-from agents.cooperative.cmm.road_hypotheses import OFF_ROAD
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 

@@ -11,6 +11,7 @@ from emulator.drivers.lockstep import Lockstep, run_in_lockstep
 from emulator.drivers.processes import Stalled
 from emulator.drivers.realtime import RealTime, run_in_real_time
 from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
+from vnet.radio import SentFrame
 from vnet.transport import backbone_keys, wire
 from vnet.transport.backbone_keys import Sent
 from vnet.transport.wire import MessageRef, SentMessage
@@ -63,7 +64,7 @@ def yields(node: str, message: Any, nonce: bytes = b"1") -> wire.AgentMessage | 
         return wire.StackDump(nonce, f"{node} is here")
     if not isinstance(message, wire.Grant):
         return None
-    frames = [wire.Frame(node, b"x")] if node == "v01" else []
+    frames = [SentFrame(node, b"x")] if node == "v01" else []
     steps = [wire.Step(message.time_ns, wire.Traffic(frames))]
     return wire.Yield(nonce, message.seq, message.time_ns + 100 * MS, (), (), steps, 1)
 
@@ -341,7 +342,7 @@ async def test_a_message_of_the_backbone_that_never_comes_is_named(unit: str, no
 def frames(node: str, message: Any) -> wire.AgentMessage | None:
     """A process in real time that acknowledges every batch, and sends a final message when it is told to end."""
     if isinstance(message, wire.Batch):
-        sent = [wire.Frame(node, b"x")] if message.fixes else []
+        sent = [SentFrame(node, b"x")] if message.fixes else []
         return wire.Frames(b"1", message.seq, message.seq + 1, [], wire.Traffic(sent))
     return None
 

@@ -20,6 +20,7 @@ from emulator.testing.conformance.play import SCENES, Conformance
 from emulator.testing.conformance.scene import Said, Scene, SceneOverError
 from tests.support.paths import ROOT
 from vnet.errors import VnetError
+from vnet.radio import SentFrame
 from vnet.transport import wire
 
 pytestmark = pytest.mark.slow
@@ -77,7 +78,7 @@ def test_a_program_that_awaits_the_results_of_its_sends_is_told_them() -> None:
 
 
 def test_two_frames_to_single_vehicles_with_one_number_are_found() -> None:
-    findings, frame = Findings(), wire.Frame("v01", b"", to="v02", number=3)
+    findings, frame = Findings(), SentFrame("v01", b"", to="v02", number=3)
     bench: Any = SimpleNamespace(node="v01")
     emulation: Any = SimpleNamespace(scenario=Scenario())
     scene = Scene(bench, findings, emulation, "realtime", LONG_S)

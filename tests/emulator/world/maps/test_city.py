@@ -20,7 +20,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
 from emulator.world.maps.roads import Roads
-from emulator.world.trips.generate import LATERAL_MPS2, LEFT, Network, Side, generate_motion
+from emulator.world.trips.generate import LATERAL_MPS2, LEFT, Side, StreetNetwork, generate_motion
 from emulator.world.trips.motion import Motion
 from emulator.world.world import build_world
 from tests.support.paths import ROOT
@@ -50,7 +50,7 @@ def test_a_seed_is_a_city(city: Roads) -> None:
 
 def test_its_streets_hang_together_and_point_everywhere(city: Roads) -> None:
     """A common error is seen across roads only: where all of them point the same two ways, less is seen."""
-    network = Network("the city", city)
+    network = StreetNetwork("the city", city)
     assert len(network.streets.start) > 500
     lanes = city.lane_map()
     axis = np.mod(lanes.heading_rad, np.pi)

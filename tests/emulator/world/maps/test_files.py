@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from emulator.world.maps.files import read_roads, write_roads
 from emulator.world.maps.roads import NAMES, Roads
-from emulator.world.projection import Frame
+from emulator.world.projection import CoordinateFrame
 from tests.support import maps
 from tests.support.maps import NODES, ORIGIN
 
@@ -63,7 +63,7 @@ TOWN = {
 def test_every_kind_of_file_gives_the_town(tmp_path: Path, kind: str) -> None:
     roads = read_roads(write_town(tmp_path, kind), ORIGIN)
     assert directed(roads) == TOWN
-    assert roads.frame == Frame.around(*ORIGIN)
+    assert roads.frame == CoordinateFrame.around(*ORIGIN)
     assert roads.length_m.sum() == pytest.approx(550.0, abs=0.05)  # OpenStreetMap's degrees have 7 decimals
     assert roads.one_way.tolist() == [False, True] or kind == "npz"
     if kind != "npz":
@@ -78,9 +78,9 @@ def test_metres_start_in_the_middle_unless_an_origin_is_given(tmp_path: Path, ki
     assert low + high == pytest.approx(np.zeros(2), abs=0.1) and high - low == pytest.approx([400, 150], abs=0.1)
     assert roads.frame is not None
     lat, lon = roads.frame.to_wgs84(roads.node_m)
-    assert Frame.around(*ORIGIN).to_local(lat, lon).round(1).tolist() == [list(NODES[n]) for n in (1, 2, 4, 3)] or (
-        kind == "npz"
-    )
+    assert CoordinateFrame.around(*ORIGIN).to_local(lat, lon).round(1).tolist() == [
+        list(NODES[n]) for n in (1, 2, 4, 3)
+    ] or (kind == "npz")
 
 
 # OpenStreetMap.
@@ -195,8 +195,8 @@ def test_a_network_of_sumo_says_where_it_is(tmp_path: Path) -> None:
     lat, lon = roads.frame.to_wgs84(roads.node_m)
     assert (lat[0], lon[0]) == pytest.approx(ORIGIN, abs=0.1)
     moved = read_roads(path, ORIGIN)
-    assert moved.frame == Frame.around(*ORIGIN)
-    assert moved.node_m == pytest.approx(Frame.around(*ORIGIN).to_local(lat, lon), abs=1e-6)
+    assert moved.frame == CoordinateFrame.around(*ORIGIN)
+    assert moved.node_m == pytest.approx(CoordinateFrame.around(*ORIGIN).to_local(lat, lon), abs=1e-6)
     assert moved.length_m == pytest.approx(roads.length_m, rel=1e-3)  # UTM is not true to scale
 
 
