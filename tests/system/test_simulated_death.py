@@ -5,13 +5,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
+from tests.support.processes import wait_until
+from tests.system.by_hand import line_of
 from tests.system.conftest import TIMEOUT_S
 
 PROGRAM = """
@@ -188,19 +189,12 @@ def test_one_interrupt_ends_the_run_once(tmp_path: Path, to_all: bool) -> None:
         arguments, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
-        while not (tmp_path / "reached").exists():
-            assert process.poll() is None
-            time.sleep(0.01)
+        wait_until((tmp_path / "reached").exists, process)
         os.kill(process.pid, signal.SIGSTOP)  # so that a child in its group would see to the signal first
         (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)
         os.kill(process.pid, signal.SIGCONT)
-        assert process.stderr is not None
-        told = ""
-        while "vnet: interrupted" not in told:
-            told = process.stderr.readline()
-            assert told
-        while not waits(process.pid):  # what the command passed on now would be a second one
-            time.sleep(0.01)
+        line_of(process, "vnet: interrupted")
+        wait_until(lambda: waits(process.pid), process)  # what the command passed on now would be a second one
         (tmp_path / "go").touch()
         _, errors = process.communicate(timeout=TIMEOUT_S)
     finally:
@@ -227,9 +221,7 @@ def test_an_interrupt_at_the_terminal_comes_once(tmp_path: Path) -> None:
         text=True,
     )
     try:
-        while not (tmp_path / "reached").exists():
-            assert process.poll() is None
-            time.sleep(0.01)
+        wait_until((tmp_path / "reached").exists, process)
         os.write(terminal, b"\x03")
         _, errors = process.communicate(timeout=TIMEOUT_S)
     finally:
@@ -255,9 +247,7 @@ def test_a_signal_that_ends_the_command_ends_its_child(tmp_path: Path, number: s
         command(tmp_path, ENDLESS), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
-        while not pid_file.exists():
-            assert process.poll() is None
-            time.sleep(0.01)
+        wait_until(pid_file.exists, process)
         assert int(pid_file.read_text()) != process.pid
         process.send_signal(number)
         assert process.wait(TIMEOUT_S) == -number
