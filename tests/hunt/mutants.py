@@ -114,6 +114,7 @@ def found_by(tree: Path, paths: list[str]) -> str:
     environment = {**os.environ, "PYTHONPATH": str(tree)}
     for which in ("not slow", "slow"):
         options = ["-x", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-o", "addopts=", "-m", which]
+        options.append("--hypothesis-profile=first")
         words = ["prlimit", f"--cpu={LIMIT_S}", sys.executable, "-m", "pytest", *options, *paths]
         done = subprocess.run(words, cwd=tree, env=environment, capture_output=True, text=True, timeout=1800)
         if failed := re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE):
