@@ -15,7 +15,7 @@ import pytest
 import tomli_w
 import zenoh
 
-from tests.support.forked_commands import VNET
+from tests.support.forked_commands import VNET, run
 from tests.support.namespaces import NetworkHost, network, why_impossible
 from tests.support.paths import ROOT
 from tests.system.by_hand import line_of
@@ -80,7 +80,7 @@ def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str,
     access, folder = tmp_path / "access", tmp_path / "run"
     endpoint = f"{scheme}/{hosts[0].address}:7447"
     command = [*VNET, "access", scenario, "--hosts", ",".join(NAMES), "--listen", endpoint, "--out", str(access)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=TIMEOUT_S)
+    assert run(command, cwd=ROOT, capture_output=True, timeout=TIMEOUT_S).returncode == 0
     with ExitStack() as stack:
         words = [*VNET, "emulator", scenario, "--access", str(access), "--listen", endpoint, "--out", str(folder)]
         emulator = subprocess.Popen(

@@ -19,7 +19,7 @@ from tests.system.conftest import TIMEOUT_S, killed_at_last
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
 LONG: dict[str, dict[str, Any]] = {
-    "run": {"duration_s": 60.0, "name": "watched"},
+    "run": {"duration_s": 30.0, "name": "watched"},
     "program": {"entry": "agents.beacon:main"},
 }
 
@@ -37,7 +37,7 @@ def observer_of(folder: Path) -> int:
     raise AssertionError("there is no observer")
 
 
-def wait_for_recording(folder: Path, process: subprocess.Popen[str], least_bytes: int = 700_000) -> None:
+def wait_for_recording(folder: Path, process: subprocess.Popen[str], least_bytes: int = 350_000) -> None:
     """Wait until something of the run has been recorded."""
     path = folder / "recording.rrd"
     wait_until(lambda: path.exists() and path.stat().st_size >= least_bytes, process)
