@@ -43,7 +43,7 @@ coverage: $(READY)
 	@$(BIN)/coverage report --sort=cover | sed -n '1,12p;$$p'
 
 quick: $(READY)
-	$(PYTEST) auto -m "not slow"
+	$(PYTEST) auto -m "not slow" --ignore=tests/system
 
 test-all:
 	@tested=; failed=; for version in $(PYTHONS); do \

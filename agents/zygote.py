@@ -52,7 +52,9 @@ def main() -> None:
     gc.disable()
     for module in filter(None, sys.argv[2:]):
         with suppress(Exception):  # the agents tell what is wrong with it
-            importlib.import_module(module)
+            imported = importlib.import_module(module)
+            for name in getattr(imported, "__all__", ()):  # programs that are imported when first asked for
+                getattr(imported, name)
     _show_arguments(sys.orig_argv[:4])
     gc.collect()
     gc.freeze()  # so that collections of the agents do not write to the memory that they share

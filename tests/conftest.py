@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 from vnet.runtime.environment import use_same_arithmetic
 
@@ -16,6 +16,8 @@ use_same_arithmetic()  # as in the commands, whose results some tests compare wi
 # Others: --hypothesis-profile=default.
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.load_profile("same")
+# For mutants: the first example that fails is enough, and looking for a smaller one takes minutes.
+settings.register_profile("first", settings.get_profile("same"), phases=[Phase.explicit, Phase.generate])
 
 
 def pytest_collection_finish() -> None:

@@ -137,6 +137,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_block_that_is_broken_fails(name: str, page: Page) -> None:
     text, complaint = BROKEN[name]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -25,8 +24,9 @@ from emulator.drivers.session import Local, Session, with_order_steps
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import scenario_of
 from emulator.scenario.scenario import Scenario
+from tests.support import forked_commands
+from tests.support.forked_commands import VNET
 
-VNET = [sys.executable, "-P", "-W", "ignore", "-m", "emulator.cli"]
 FAULTS: list[dict[str, Any]] = [
     {"kind": "pause", "at_s": 0.9, "duration_s": 0.3, "nodes": ["v03"]},  # while garbage is collected
     {"kind": "restart", "at_s": 1.1, "duration_s": 0.2, "nodes": ["v02"]},
@@ -105,7 +105,7 @@ def live(seed: int) -> Iterator[tuple[str, str]]:
             path, out = Path(folder) / "random.toml", Path(folder) / "run"
             path.write_text(tomli_w.dumps(settings_of(seed)))
             words = [*VNET, command, str(path), "--out", str(out), "--no-report", "--quiet", *options]
-            done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+            done = forked_commands.run(words, capture_output=True, timeout=300)
             try:
                 verdict = json.loads((out / "verdict.json").read_text())
                 yield name, digest(verdict["trace_sha256"], pq.read_table(out / "states.parquet"))

@@ -49,7 +49,7 @@ class Mutant:
 
 TABLE = r"""
 emulator/radio
-detection | medium | if other.on_air_ns + DETECTION_NS > frame | if other.on_air_ns > frame
+detection | medium | if other.on_air_ns + DETECTION_NS > sent | if other.on_air_ns > sent
 idle | medium | self.idle_ns, time_ns, where=before & ~sensed | self.idle_ns, time_ns, where=~sensed
 reflection | propagation | (here_m + there_m) / reflected_m, dist | (here_m + there_m) / direct_m, dist
 shadowing | propagation | np.exp(-2 * distance_m / self._dec | np.exp(-distance_m / self._dec
@@ -68,7 +68,7 @@ show | lockstep | self._show(self._end_ns - 1) | self._show(self._end_ns)
 control | lockstep | control_ns is None or control_ns > next_ns | control_ns is None or control_ns >= next_ns
 planned | lockstep | is not None and next_ns < self._end_ns: | is not None and next_ns <= self._end_ns:
 emulator/scenario
-backbone | lookahead | return min(radio_ns, max(int( | return max(radio_ns, max(int(
+backbone | scenario | return min(radio_ns, max(int( | return max(radio_ns, max(int(
 emulator/checks
 killed | run | p.start_ns <= event.time_ns <= p.end_ns + recorded.guard_ns | p.start_ns <= event.time_ns
 late | run | if at_least <= LATE_SHARE_LIMIT else Verdict.UNKNOWN | if at_least <= 1 else Verdict.UNKNOWN
@@ -76,8 +76,9 @@ states | run |  or len(recorded.states) != due * len(recorded.node_ids): | :
 band | radio | not expected - away <= seen <= expected + away | not seen <= expected + away
 arrival | channel | there & (recorded.arrival_ns <= recorded.sent_ns) | there & (recorded.arrival_ns < 0)
 misbehaviour | senders | originals[times_sent != _due( | originals[times_sent < _due(
+agents/cooperative
+gate | estimator | np.einsum("nii->n", covariances_m2) / 2 | np.einsum("nii->n", covariances_m2)
 agents/cooperative/cmm
-gate | robust | np.einsum("nii->n", covariances_m2) / 2 | np.einsum("nii->n", covariances_m2)
 walk | rbpf | config.common_sigma_m * np.sqrt(1 - keep**2) | config.common_sigma_m * np.sqrt(1 - keep)
 acceleration | tracks | half = elapsed_s**2 / 2 | half = elapsed_s**2
 metropolis | weights | weights[0] = 1 - (count - 1) / (1 + max_degree) | weights[0] = 1 / (1 + max_degree)
@@ -113,6 +114,7 @@ def found_by(tree: Path, paths: list[str]) -> str:
     environment = {**os.environ, "PYTHONPATH": str(tree)}
     for which in ("not slow", "slow"):
         options = ["-x", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-o", "addopts=", "-m", which]
+        options.append("--hypothesis-profile=first")
         words = ["prlimit", f"--cpu={LIMIT_S}", sys.executable, "-m", "pytest", *options, *paths]
         done = subprocess.run(words, cwd=tree, env=environment, capture_output=True, text=True, timeout=1800)
         if failed := re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE):

@@ -7,9 +7,9 @@ from tests.hunt.layouts import differences
 
 @pytest.mark.slow
 def test_random_programs_give_one_trace_in_simulated_layouts() -> None:
-    assert [*differences(range(20))] == []
+    assert [*differences(range(8))] == []
 
 
 @pytest.mark.slow
 def test_a_random_program_gives_one_trace_in_all_layouts() -> None:
-    assert [*differences([2, 3], all_layouts=True)] == []
+    assert [*differences([3], all_layouts=True)] == []

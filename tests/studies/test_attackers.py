@@ -27,6 +27,7 @@ def _excepted(scenario: Scenario) -> list[str]:
     return [node for exception in scenario.program.exceptions for node in exception.nodes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("attack", "harms"), [("offset 50 m", False), ("offset 50 m, no defence", True)])
 def test_figures_are_those_of_the_others(attack: str, harms: bool) -> None:
     cells = {str(cell.labels["attack"]): cell for cell in attack_cells(TINY, [1], 6.0)}

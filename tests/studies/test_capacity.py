@@ -50,6 +50,7 @@ def test_frames_that_have_been_sent_are_not_kept(monkeypatch: pytest.MonkeyPatch
     assert kept[0] <= 100
 
 
+@pytest.mark.slow
 def test_a_road_has_hidden_terminals_and_a_control_that_gives_way() -> None:
     free, open_, held = (measure(variant, 1400, 30, seconds=0.5, seed=1) for variant in (HERE, ROAD, ETSI))
     assert free.delivered > open_.delivered + 0.1

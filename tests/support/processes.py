@@ -1,7 +1,23 @@
-"""Waiting for processes that are not this process's children."""
+"""Waiting for processes, and for what they do."""
 
 import os
 import select
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+TIMEOUT_S = 300
+"""Only against hanging for ever; nothing is judged by how long it takes."""
+
+
+def wait_until(is_so: Callable[[], bool], process: subprocess.Popen[Any] | None = None) -> None:
+    """Wait until something is so, which must be as long as `process` runs."""
+    deadline = time.monotonic() + TIMEOUT_S
+    while not is_so():
+        assert process is None or process.poll() is None, process.communicate(timeout=TIMEOUT_S)
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def has_ended(pid: int, timeout_s: float) -> bool:

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -41,8 +42,18 @@ def start_emulator(stack: ExitStack, folder: Path, *options: str) -> tuple[subpr
         Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     )
     stack.callback(emulator.kill)
-    assert emulator.stderr is not None
-    for line in emulator.stderr:
-        if found := re.search(r"listening at (\S+); waiting for 4 vehicles", line):
-            return emulator, found[1]
-    pytest.fail("the emulator ended early")
+    return emulator, line_of(emulator, r"listening at (\S+); waiting for 4 vehicles")[1]
+
+
+def line_of(process: subprocess.Popen[str], pattern: str) -> re.Match[str]:
+    """Wait until a process has written a line with this pattern on standard error; return the match."""
+    assert process.stderr is not None
+    watchdog = threading.Timer(TIMEOUT_S, process.kill)
+    watchdog.start()
+    try:
+        for line in process.stderr:
+            if found := re.search(pattern, line):
+                return found
+    finally:
+        watchdog.cancel()
+    pytest.fail(f"it has ended, or has not said {pattern!r} in time")

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,13 @@ import pytest
 
 from emulator.cli.commands import app
 from emulator.terminal.console import run_app
-from tests.support import forked_commands
+from tests.support import forked_commands, processes
 from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
+from tests.support.processes import wait_until
 
 AGENT = [sys.executable, "-P", "-m", "agents.cli"]
-TIMEOUT_S = 300
-"""Only against hanging for ever; nothing here is judged by how long it takes."""
+TIMEOUT_S = processes.TIMEOUT_S
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -130,11 +129,7 @@ def run_until(enough: Callable[[], bool], folder: Path, scenario: str, *options:
     command = [*VNET, "run", scenario, "--out", str(folder), "--no-report", *PATIENT, *options]
     with Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            deadline = time.monotonic() + TIMEOUT_S
-            while not enough():
-                assert process.poll() is None, process.communicate()
-                assert time.monotonic() < deadline
-                time.sleep(0.05)
+            wait_until(enough, process)
             process.send_signal(signal.SIGINT)
             stdout, stderr = process.communicate(timeout=TIMEOUT_S)
         finally:

@@ -2,7 +2,6 @@
 
 import json
 import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.control import CONTROL_FILE, OPERATOR_FILE, ask
+from tests.support.processes import wait_until
 from tests.system.conftest import TIMEOUT_S, Finished, Vnet, in_this_process
 from tests.system.test_failures import long_run
 from vnet.errors import VnetError
@@ -20,11 +20,9 @@ from vnet.transport.session import open_client
 LOSS = {"kind": "loss", "duration_s": 3000.0, "probability": 1.0}
 
 
-def ask_until(folder: Path, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+def ask_until(folder: Path, wanted: Callable[[dict[str, Any]], bool]) -> None:
     """Ask for the status until it is as wanted: emulated time passes meanwhile, at whatever pace."""
-    while not wanted(status := ask(folder, "status")):
-        time.sleep(0.05)
-    return status
+    wait_until(lambda: wanted(ask(folder, "status")))
 
 
 def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Path, vnet: Vnet) -> None:

@@ -14,6 +14,7 @@ from emulator.checks.judge import check_run
 from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.processes import has_ended
+from tests.system.by_hand import line_of
 from tests.system.conftest import TIMEOUT_S, Finished, Vnet, killed_at_last, running_agents
 
 LONG = [
@@ -32,9 +33,7 @@ def long_run(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`vnet run` of a run that would take very long, once it has emulated its first periods."""
     command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(folder), *LONG, *options]
     with Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        while "real time" not in (line := process.stderr.readline()):
-            assert line, "it ended early"
+        line_of(process, "real time")
         try:
             yield process
         finally:
@@ -70,9 +69,7 @@ def test_an_interruption_before_the_start_is_as_clean(tmp_path: Path) -> None:
         Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
         killed_at_last(process),
     ):
-        assert process.stderr is not None
-        while "waiting for 10 vehicles" not in (line := process.stderr.readline()):
-            assert line, "it ended early"
+        line_of(process, "waiting for 10 vehicles")
         process.send_signal(signal.SIGINT)
         stdout, stderr = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 130

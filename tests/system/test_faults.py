@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,7 @@ import tomli_w
 
 from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
-from tests.support.processes import has_ended
+from tests.support.processes import has_ended, wait_until
 from tests.system.conftest import TIMEOUT_S, Vnet, heard_by, run_until, zygote_of
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
@@ -94,11 +93,7 @@ def started(scenario: str, folder: Path, *options: str, after: str) -> Iterator[
     command = [*VNET, "run", scenario, "--out", str(folder), *options]
     with Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            deadline = time.monotonic() + TIMEOUT_S
-            while not events_of(folder, after):
-                assert process.poll() is None, process.communicate()
-                assert time.monotonic() < deadline
-                time.sleep(0.02)
+            wait_until(lambda: bool(events_of(folder, after)), process)
             yield process
         finally:
             process.kill()
@@ -138,10 +133,8 @@ def kill_zygote(emulator: subprocess.Popen[str]) -> int:
     """Kill the process from which a run's agents are forked; returns the one that takes its place."""
     former = zygote_of(emulator.pid)
     os.kill(former, signal.SIGKILL)
-    while (zygote := zygote_of(emulator.pid)) in (0, former):
-        assert emulator.poll() is None
-        time.sleep(0.02)
-    return zygote
+    wait_until(lambda: zygote_of(emulator.pid) not in (0, former), emulator)
+    return zygote_of(emulator.pid)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
@@ -150,8 +143,7 @@ def test_vehicles_that_stand_still_do_not_outlive_the_run(tmp_path: Path, number
     scenario = write(tmp_path, [pause], run={"pacing": "realtime", "duration_s": 7200})
     folder = tmp_path / "run"
     with started(scenario, folder, after="fault_started") as process:
-        while sorted(processes_of(folder).values()).count("T") < 2:
-            assert process.poll() is None
+        wait_until(lambda: [*processes_of(folder).values()].count("T") == 2, process)
         assert len(processes_of(folder)) == 4
         zygote = kill_zygote(process)
         assert sorted(processes_of(folder).values()).count("T") == 2, "they are paused without their zygote, too"
@@ -171,8 +163,7 @@ def test_a_killed_lockstep_run_leaves_no_process_and_no_router(tmp_path: Path) -
     scenario = write(tmp_path, faults, run={"duration_s": 7200})
     folder = tmp_path / "run"
     with started(scenario, folder, "--router", "separate", after="fault_ended") as process:
-        while len(processes_of(folder)) != 4:  # three agents and the router
-            assert process.poll() is None
+        wait_until(lambda: len(processes_of(folder)) == 4, process)  # three agents and the router
         process.kill()
         wait_until_all_are_gone(folder)
 

@@ -4,7 +4,6 @@ import ast
 import signal
 import subprocess
 import sys
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO
@@ -12,8 +11,9 @@ from typing import IO
 import pytest
 
 from tests.support.paths import ROOT
+from tests.support.processes import wait_until
 from tests.system.by_hand import NODES, finish, start_emulator
-from tests.system.conftest import AGENT, Finished, heard_by
+from tests.system.conftest import AGENT, TIMEOUT_S, Finished, heard_by
 
 FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py"]
 WRONG = [sys.executable, "-P", "-m", "tests.emulator.testing.conformance.wrong_agent"]
@@ -54,7 +54,7 @@ def test_foreign_agents_and_those_of_vnet_take_part_in_one_run(tmp_path: Path) -
             start(stack, AGENT, node, endpoint, folder)
         foreign = [start(stack, FOREIGN, node, endpoint, folder) for node in NODES[2:]]
         done = finish(emulator, folder)
-        assert [agent.wait() for agent in foreign] == [0, 0]
+        assert [agent.wait(TIMEOUT_S) for agent in foreign] == [0, 0]
     assert done.verdict["verdict"] == "valid", done.stdout
     sent = {node: len({row["seq"] for row in done.trace() if row["sender"] == node}) for node in NODES}
     assert set(sent.values()) == {20}
@@ -71,12 +71,10 @@ def test_in_real_time_they_take_part_as_well(tmp_path: Path) -> None:
             start(stack, AGENT, node, endpoint, folder, log)
         foreign = [start(stack, FOREIGN, node, endpoint, folder) for node in NODES[2:]]
         pairs = [("v01", "v02"), ("v01", "v03"), ("v02", "v01"), ("v02", "v04")]
-        while not all(len(seconds_heard(folder, *pair)) >= 2 for pair in pairs):
-            assert emulator.poll() is None
-            time.sleep(0.05)
+        wait_until(lambda: all(len(seconds_heard(folder, *pair)) >= 2 for pair in pairs), emulator)
         emulator.send_signal(signal.SIGINT)
         done = finish(emulator, folder)
-        assert [agent.wait() for agent in foreign] == [0, 0]
+        assert [agent.wait(TIMEOUT_S) for agent in foreign] == [0, 0]
     assert done.verdict["verdict"] == "unknown", "it was interrupted, and everything else is as it should be"
     assert done.events_of("died") == done.events_of("refused") == []
     assert {"v01", "v02", "v04"} >= receivers_of(done, "v03") >= {"v01"}
@@ -108,9 +106,7 @@ def test_a_killed_foreign_agent_is_named_and_the_others_go_on(tmp_path: Path) ->
     with ExitStack() as stack:
         emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--duration", "20")
         agents = {node: start(stack, FOREIGN, node, endpoint, folder) for node in NODES}
-        assert emulator.stderr is not None
-        while '"started"' not in (folder / "events.jsonl").read_text():
-            assert emulator.poll() is None
+        wait_until(lambda: '"started"' in (folder / "events.jsonl").read_text(), emulator)
         agents["v04"].send_signal(signal.SIGKILL)
         done = finish(emulator, folder)
     assert done.verdict["verdict"] == "invalid"
@@ -132,9 +128,8 @@ def test_misbehaving_foreign_agents_are_refused_and_the_run_is_unknown(tmp_path:
         emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--set", "run.stall_timeout_s=3600")
         for node, (mistake, _) in mistakes.items():
             start(stack, [*WRONG, mistake], node, endpoint, folder)
-        while (folder / "events.jsonl").read_text().count('"refused"') < len(mistakes):
-            assert emulator.poll() is None
-            time.sleep(0.05)
+        events = folder / "events.jsonl"
+        wait_until(lambda: events.read_text().count('"refused"') >= len(mistakes), emulator)
         emulator.send_signal(signal.SIGINT)
         done = finish(emulator, folder)
     assert done.verdict["verdict"] == "unknown", done.stdout
@@ -151,9 +146,7 @@ def test_a_message_of_a_hundred_megabytes_is_refused_by_name(tmp_path: Path) -> 
         start(stack, [*WRONG, "SendsHundredMegabytes"], "v01", endpoint, folder)
         for node in NODES[1:]:
             start(stack, FOREIGN, node, endpoint, folder)
-        while '"refused"' not in (folder / "events.jsonl").read_text():
-            assert emulator.poll() is None
-            time.sleep(0.05)
+        wait_until(lambda: '"refused"' in (folder / "events.jsonl").read_text(), emulator)
         emulator.send_signal(signal.SIGINT)
         done = finish(emulator, folder)
     (refused,) = done.events_of("refused")

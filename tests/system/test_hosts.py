@@ -15,9 +15,10 @@ import pytest
 import tomli_w
 import zenoh
 
-from tests.support.forked_commands import VNET
+from tests.support.forked_commands import VNET, run
 from tests.support.namespaces import NetworkHost, network, why_impossible
 from tests.support.paths import ROOT
+from tests.system.by_hand import line_of
 from tests.system.conftest import PATIENT, TIMEOUT_S, Finished, Vnet
 from vnet.transport import keys
 from vnet.transport.access import Access, host_user
@@ -79,7 +80,7 @@ def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str,
     access, folder = tmp_path / "access", tmp_path / "run"
     endpoint = f"{scheme}/{hosts[0].address}:7447"
     command = [*VNET, "access", scenario, "--hosts", ",".join(NAMES), "--listen", endpoint, "--out", str(access)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=TIMEOUT_S)
+    assert run(command, cwd=ROOT, capture_output=True, timeout=TIMEOUT_S).returncode == 0
     with ExitStack() as stack:
         words = [*VNET, "emulator", scenario, "--access", str(access), "--listen", endpoint, "--out", str(folder)]
         emulator = subprocess.Popen(
@@ -87,11 +88,7 @@ def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str,
         )
         stack.enter_context(emulator)
         stack.callback(emulator.kill)
-        assert emulator.stderr is not None
-        heading = ""
-        while "waiting for 3 hosts" not in heading:
-            heading = emulator.stderr.readline()
-            assert heading, "it ended early"
+        line_of(emulator, "waiting for 3 hosts")
         for name, host in zip(NAMES, hosts, strict=True):
             words = [*VNET, "host", "--connect", endpoint, "--run", Path(scenario).stem]
             words += ["--credentials", str(access / "credentials" / f"host-{name}.json")]

@@ -1,6 +1,5 @@
 """Vehicles that drive in whole runs: five of them, of which one enters late and one leaves early."""
 
-import re
 import subprocess
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,6 +11,7 @@ import tomli_w
 from tests.support.forked_commands import VNET, Command
 from tests.support.motion import Stay, along, still, write_trips
 from tests.support.paths import ROOT
+from tests.system.by_hand import line_of
 from tests.system.conftest import AGENT, TIMEOUT_S, Finished, Vnet, running_agents
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
@@ -74,8 +74,7 @@ def test_agents_started_by_hand_wait_until_they_enter(vnet: Vnet, scenario: str,
             Command(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         )
         stack.callback(emulator.kill)
-        assert emulator.stderr is not None
-        found = next(filter(None, (re.search(r"at (tcp\S+); waiting for 4", line) for line in emulator.stderr)))
+        found = line_of(emulator, r"at (tcp\S+); waiting for 4")
         agents = {}
         for node in VEHICLES:
             credentials = folder / "access" / "credentials" / f"{node}.json"

@@ -5,13 +5,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
-from tests.support.forked_commands import VNET
+from tests.support.forked_commands import VNET, run
 from tests.support.paths import ROOT
+from tests.support.processes import wait_until
+from tests.system.by_hand import line_of
 from tests.system.conftest import TIMEOUT_S
 
 PROGRAM = """
@@ -45,7 +46,7 @@ def scenario(folder: Path) -> None:
     ],
 )
 def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end: str) -> None:
-    done = subprocess.run(command(tmp_path, end), cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = run(command(tmp_path, end), cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == 1, done.stderr
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
     assert verdict["verdict"] == "invalid"
@@ -62,7 +63,7 @@ def test_a_program_that_stalls_ends_the_run_with_its_name(
     tmp_path: Path, endless: str, kind: str, status: int, processes: str
 ) -> None:
     words = [*command(tmp_path, endless), "--set", "run.stall_timeout_s=1", "--processes", processes]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = run(words, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == status, done.stderr
     assert "v02" in {event["node"] for event in events(tmp_path / "run") if event["kind"] == kind}
 
@@ -74,7 +75,7 @@ def test_what_ends_the_process_after_the_run_is_a_death_then_and_no_earlier(tmp_
     ending = f"    finally:\n        if node.id == 'v02':\n            {end}\n"
     program = program.replace("    async for", "    try:\n     async for") + ending
     (tmp_path / "deadly.py").write_text(program)
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = run(words, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == 1, done.stderr
     assert died(tmp_path / "run") == {"v02"}
     checks = json.loads((tmp_path / "run" / "verdict.json").read_text())["checks"]
@@ -98,7 +99,7 @@ async def main(node):
 def later(folder: Path, begin: str, end: str) -> subprocess.CompletedProcess[str]:
     words = command(folder, "")
     (folder / "deadly.py").write_text(LATER.replace("BEGIN", begin).replace("END", end))
-    return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=TIMEOUT_S)
+    return run(words, cwd=folder, capture_output=True, timeout=TIMEOUT_S)
 
 
 @pytest.mark.parametrize("end", ["os._exit(0)", "ctypes.CDLL(None)._exit(0)"])
@@ -123,13 +124,11 @@ def died(folder: Path) -> set[object]:
 
 def test_vehicles_that_end_the_process_die_and_no_others(tmp_path: Path) -> None:
     end = f"pass\n        if node.id in ('v04', 'v07') and fix.time_ns == 700_000_000:\n            {FAULT}"
-    done = subprocess.run(command(tmp_path, end), cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = run(command(tmp_path, end), cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == 1, done.stderr
     assert died(tmp_path / "run") == {"v04", "v07"}
     end = end.replace("pass", FAULT, 1)
-    done = subprocess.run(
-        [*command(tmp_path, end), "--out", "all"], cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S
-    )
+    done = run([*command(tmp_path, end), "--out", "all"], cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert died(tmp_path / "all") == {"v02", "v04", "v07"}
 
 
@@ -138,9 +137,7 @@ def test_vehicles_that_end_the_process_die_and_no_others(tmp_path: Path) -> None
 )
 def test_options_hold_for_the_run_that_is_made_again(tmp_path: Path, options: list[str]) -> None:
     """Standard output has one result, and the folder what was asked for."""
-    done = subprocess.run(
-        [*command(tmp_path, FAULT), *options], cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S
-    )
+    done = run([*command(tmp_path, FAULT), *options], cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == 1, done.stderr
     assert done.stdout.count('"verdict": "invalid"' if "json" in options else "verdict: invalid") >= 1
     if options[0] in ("--quiet", "--log-format"):
@@ -156,7 +153,7 @@ def test_options_hold_for_the_run_that_is_made_again(tmp_path: Path, options: li
 
 def test_no_folder_is_left_of_the_first_attempt(tmp_path: Path) -> None:
     without_out = [each for each in command(tmp_path, FAULT) if each not in ("--out", "run")]
-    done = subprocess.run(without_out, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    done = run(without_out, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == 1, done.stderr
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["beacon-1", "latest"]
     assert died(tmp_path / "runs" / "latest") == {"v02"}
@@ -188,19 +185,12 @@ def test_one_interrupt_ends_the_run_once(tmp_path: Path, to_all: bool) -> None:
         arguments, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
-        while not (tmp_path / "reached").exists():
-            assert process.poll() is None
-            time.sleep(0.01)
+        wait_until((tmp_path / "reached").exists, process)
         os.kill(process.pid, signal.SIGSTOP)  # so that a child in its group would see to the signal first
         (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)
         os.kill(process.pid, signal.SIGCONT)
-        assert process.stderr is not None
-        told = ""
-        while "vnet: interrupted" not in told:
-            told = process.stderr.readline()
-            assert told
-        while not waits(process.pid):  # what the command passed on now would be a second one
-            time.sleep(0.01)
+        line_of(process, "vnet: interrupted")
+        wait_until(lambda: waits(process.pid), process)  # what the command passed on now would be a second one
         (tmp_path / "go").touch()
         _, errors = process.communicate(timeout=TIMEOUT_S)
     finally:
@@ -227,9 +217,7 @@ def test_an_interrupt_at_the_terminal_comes_once(tmp_path: Path) -> None:
         text=True,
     )
     try:
-        while not (tmp_path / "reached").exists():
-            assert process.poll() is None
-            time.sleep(0.01)
+        wait_until((tmp_path / "reached").exists, process)
         os.write(terminal, b"\x03")
         _, errors = process.communicate(timeout=TIMEOUT_S)
     finally:
@@ -255,9 +243,7 @@ def test_a_signal_that_ends_the_command_ends_its_child(tmp_path: Path, number: s
         command(tmp_path, ENDLESS), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
-        while not pid_file.exists():
-            assert process.poll() is None
-            time.sleep(0.01)
+        wait_until(pid_file.exists, process)
         assert int(pid_file.read_text()) != process.pid
         process.send_signal(number)
         assert process.wait(TIMEOUT_S) == -number

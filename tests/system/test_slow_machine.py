@@ -27,7 +27,7 @@ def run_slowly(folder: Path, *words: str) -> Finished:
 
 
 def test_a_slow_machine_gives_the_same_verdict(vnet: Vnet, tmp_path: Path) -> None:
-    words = ["scenarios/faults.toml", "--duration", "20"]  # the faults have healed by then
+    words = ["scenarios/faults.toml", "--duration", "15"]  # the faults have healed by then
     fast, slow = vnet("simulate", *words), run_slowly(tmp_path / "slow", *words)
     assert slow.status == fast.status == 0, slow.stderr + slow.stdout
     assert slow.fingerprint == fast.fingerprint

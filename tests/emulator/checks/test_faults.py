@@ -15,7 +15,7 @@ from emulator.checks.faults import _wrong_fixes
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
 from emulator.records.events import Event
 from emulator.records.tables import STATES
-from emulator.scenario.faults import KINDS, DataReplay, parse_fault
+from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
 from vnet.node import Node
@@ -369,12 +369,16 @@ def test_a_frame_that_was_not_sent_as_often_as_it_should_be_is_found(kind: str) 
     assert found["copies"].figures["miscounted"] == 1
 
 
-def test_a_replay_of_another_age_is_found() -> None:
-    replay = with_fault("DataReplay").scenario.fault[0]
-    assert isinstance(replay, DataReplay) and replay.age_s == 1.0
-    scenario = with_fault("DataReplay").scenario
-    older = scenario.model_copy(update={"fault": (scenario.fault[0].model_copy(update={"age_s": 0.9}),)})
-    assert not_valid(replace(with_fault("DataReplay"), scenario=older)) == {"copies": Verdict.INVALID}
+@pytest.mark.parametrize(
+    ("kind", "planned"), [("DoS", {"factor": 9}), ("Sybil", {"ghosts": 2}), ("DataReplay", {"age_s": 0.9})]
+)
+def test_a_frame_that_was_sent_more_often_or_later_than_planned_is_found(
+    kind: str, planned: dict[str, Any]
+) -> None:
+    scenario = with_fault(kind).scenario
+    assert {key: getattr(scenario.fault[0], key) for key in planned} != planned
+    other = scenario.model_copy(update={"fault": (scenario.fault[0].model_copy(update=planned),)})
+    assert not_valid(replace(with_fault(kind), scenario=other)) == {"copies": Verdict.INVALID}
 
 
 @pytest.mark.parametrize(("kind", "key"), [("gnss_jump", "offset_m"), ("gnss_ramp", "rate_m_s")])

@@ -22,6 +22,8 @@ from tests.emulator.checks.test_judge import run_scenario
 from tests.support import rules
 from vnet.errors import ScenarioError
 
+pytestmark = pytest.mark.slow
+
 SCENARIO = """
 [run]
 name = "ruled"
@@ -105,7 +107,6 @@ def test_a_changed_rule_is_told_when_the_run_is_run_again(here: Path) -> None:
     assert "the functions rule_of_mine:drops changed since this run was recorded" in output
 
 
-@pytest.mark.slow
 def test_looking_at_a_run_imports_no_rule(here: Path) -> None:
     assert simulate(here / "ruled.toml")[0] == 0
     sys.modules.pop("rule_of_mine")

@@ -50,6 +50,7 @@ def braked(moment: Moment) -> bool:
     return moment.event == "braked"
 
 
+@pytest.mark.slow
 def test_always_and_never_ask_at_each_period_of_each_vehicle(run: Run) -> None:
     assert always(run, "counts", lambda m: m["count"] >= 0).verdict == "valid"
     assert never(run, "far", lambda m: np.abs(m["position_m"]).max() > 1e7).text == "false at 80 moments"
@@ -168,6 +169,7 @@ def dead(moment: Moment, cause: Moment) -> bool:
     return bool(moment.node != cause.node and moment["dead"] >= 1)
 
 
+@pytest.mark.slow
 def test_a_fault_is_an_event_of_each_of_its_nodes(faulty: Run) -> None:
     told = [
         (m.time_s, m.node, m.event, m["kind"], m["fault"])
@@ -226,6 +228,7 @@ def test_moments_are_periods_or_events(run: Run) -> None:
         moments(run, "second")
 
 
+@pytest.mark.slow
 def test_the_result_is_one_of_a_check_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checks = tmp_path / "promises.py"
     checks.write_text(

@@ -85,6 +85,7 @@ def test_checks_accept_what_the_radio_does(more: Any, faults: Any, tmp_path: Pat
     assert 0 < figures.acknowledged < figures.sent
 
 
+@pytest.mark.slow
 def test_checks_accept_vehicles_that_come_back_between_attempts(tmp_path: Path) -> None:
     """Each is down for a millisecond or nine, in turn, while the others send to it."""
     kills = [

@@ -82,6 +82,7 @@ def test_a_message_meets_the_same_fate_whatever_others_send() -> None:
     assert 60 < sum(arrival_ns is None for _, _, arrival_ns in alone) < 140
 
 
+@pytest.mark.slow
 def test_units_hear_the_same_together_apart_and_without_windows() -> None:
     section = {"latency_ms": 0.7, "jitter_ms": 3.0, "loss": 0.1}
     together = run_together(scenario(backbone=section))

@@ -23,6 +23,7 @@ def test_the_threshold_is_raised_and_put_back(threshold: tuple[int, int, int]) -
         gc.set_threshold(*before)
 
 
+@pytest.mark.slow
 def test_collections_of_a_period_do_not_grow_with_the_vehicles() -> None:
     counted: Counter[int] = Counter()
     vehicles = 0

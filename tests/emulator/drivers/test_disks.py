@@ -37,6 +37,7 @@ def concluded(emulation: Emulation) -> tuple[str, str]:
     return verdict["trace_sha256"], verdict["metrics_sha256"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nodes_per_process", [1, 2])
 def test_what_was_written_is_there_after_a_kill_and_in_the_run_at_its_end(nodes_per_process: int) -> None:
     scenario = scenario_of(

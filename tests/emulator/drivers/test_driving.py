@@ -22,6 +22,8 @@ from vnet import Node
 from vnet.errors import ScenarioError
 from vnet.types import Array
 
+pytestmark = pytest.mark.slow
+
 PLATOON = "tests.support.driving_programs:platoon"
 RESTLESS = "tests.support.driving_programs:restless"
 NOISELESS: dict[str, Any] = {"sigma_m": 0.0, "speed_sigma_mps": 0.0}
@@ -42,7 +44,6 @@ def fingerprint(emulation: Emulation) -> tuple[Any, ...]:
     return emulation.engine.trace.sha256(), emulation.metrics.sha256(), repr(table.to_pydict()), states, events
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("control_hz", [10.0, 50.0])
 def test_windows_and_processes_do_not_change_how_vehicles_drive(control_hz: float) -> None:
     faults = [{"kind": "restart", "at_s": 0.72, "duration_s": 0.6, "nodes": {"ids": ["v03", "v04"]}}]
@@ -208,7 +209,6 @@ SETTLE_S, MEASURE_S = 50, 100
 KP, KD, FEED, HEADWAY_S = 0.4, 0.9, 0.6, 0.8
 
 
-@pytest.mark.slow
 def test_a_platoon_answers_as_the_closed_form_of_the_sampled_system(tmp_path: Path) -> None:
     """Gain and phase from the first to each other vehicle, with hold, latency of a period and actuator lag."""
 

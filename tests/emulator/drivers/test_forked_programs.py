@@ -28,7 +28,7 @@ from vnet.errors import VnetError
 from vnet.node import Node
 from vnet.runtime.programs import given_programs
 
-pytestmark = pytest.mark.usefixtures("default_signals")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("default_signals")]
 
 AT_NS = 500_000_000
 

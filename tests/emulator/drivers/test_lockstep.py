@@ -142,6 +142,24 @@ def test_a_frame_wakes_whoever_waits_for_it_when_it_arrives_and_waits_for_the_ot
     assert [packet.payload for packet in packets_of(lockstep, "v03")] == [b"hello"]
 
 
+def test_a_frame_that_arrives_as_a_window_ends_is_heard_in_the_next() -> None:
+    lockstep, _ = barrier(
+        radio={"latency_ms": 30.0, "jitter_ms": 0.0, "access_jitter_ms": 0.0, "bitrate_mbps": 8.0}
+    )
+    for process_id, grant in lockstep.start().items():
+        timer_ns = {"v01": 100 * MS, "v02": 130 * MS}.get(process_id)
+        lockstep.receive(process_id, yielded(grant, timer_ns, ["v03"] if process_id == "v03" else []))
+    (grant,) = lockstep.step().values()
+    airtime_ns = 1_000  # of a byte
+    steps = [wire.Step(130 * MS - airtime_ns, wire.Traffic([wire.Frame("v01", b"x")]))]
+    lockstep.receive("v01", wire.Yield(b"n", grant.seq, None, [], [], steps, 1))
+    grants = lockstep.step()
+    assert list(grants) == ["v02"] and window(grants) == (130, 160)
+    yield_all(lockstep, grants)
+    assert times(lockstep.step()) == {"v03": 160 * MS}
+    assert [packet.received_ns for packet in packets_of(lockstep, "v03")] == [160 * MS]
+
+
 @pytest.mark.parametrize(
     ("seq", "traffic", "radio", "gnss"),
     [

@@ -51,6 +51,7 @@ def told(emulation: Emulation) -> list[tuple[Any, ...]]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nodes_per_process", [1, 2])
 def test_logs_and_events_are_the_same_live_and_simulated(nodes_per_process: int) -> None:
     scenario = scenario_of([], f"{__name__}:talks", vehicles=2, run={"nodes_per_process": nodes_per_process})

@@ -17,6 +17,8 @@ from tests.support.multi_loop_driver import run_apart, run_forked, run_together,
 from vnet.errors import VnetError
 from vnet.transport.wire import Deviation
 
+pytestmark = pytest.mark.slow
+
 IMPROVISES = "tests.support.window_programs:improvises"
 
 
@@ -33,7 +35,6 @@ def taped(scenario: Scenario, run: Emulation, folder: Path) -> Scenario:
     return ordered(scenario, order="fifo", tape=path)
 
 
-@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(
     scenario=scenarios(),
@@ -69,7 +70,6 @@ def test_a_timer_that_was_cancelled_is_no_option_wherever_a_vehicle_runs(kind: s
     assert together.orders.in_order() == apart.orders.in_order() != []
 
 
-@pytest.mark.slow
 @settings(max_examples=2, deadline=None)
 @given(scenario=scenarios())
 def test_an_empty_tape_is_fifo(scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> None:

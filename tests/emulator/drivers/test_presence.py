@@ -92,6 +92,7 @@ steps = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(absent=nodes, steps=steps)
 def test_in_any_course_of_events_what_is_said_is_what_is_so(
     absent: set[str], steps: list[tuple[str, set[str], set[str]]]

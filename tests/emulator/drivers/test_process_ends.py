@@ -18,6 +18,8 @@ from emulator.records.verdicts import Verdict
 from tests.support.multi_loop_driver import run_forked, run_together, scenario_of
 from vnet.node import Node
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[[Any], Emulation]
 Program = Callable[[Node], Awaitable[None]]
 

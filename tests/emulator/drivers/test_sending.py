@@ -127,6 +127,7 @@ def test_a_live_process_that_gives_up_a_send_goes_on(nodes_per_process: int) -> 
     assert told(run_apart(plan)) == expected
 
 
+@pytest.mark.slow
 def test_a_result_is_that_of_the_trace() -> None:
     emulation = run_together(scenario(loss=0.3))
     rows = [row for row in emulation.engine.trace.to_table().to_pylist() if row["attempt"]]

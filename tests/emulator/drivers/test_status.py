@@ -63,6 +63,7 @@ def test_time_and_speed(shots: list[Snapshot]) -> None:
         assert shot.idle_s == 0.0
 
 
+@pytest.mark.slow
 def test_the_speed_is_that_of_late(tmp_path: Path) -> None:
     emulation = emulate(tmp_path / "run", run={"duration_s": 30.0})
     clock = Clock()

@@ -25,6 +25,8 @@ from tests.support.multi_loop_driver import run_apart, run_forked, run_together,
 from vnet.node import Node
 from vnet.runtime.unhandled import UnhandledExceptions
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[[Any], Emulation]
 held: list[object] = []
 """Objects that a program's process holds when the run ends."""

@@ -13,7 +13,7 @@ import pytest
 from emulator.drivers import zygote as zygotes
 from emulator.drivers.launch import MOST_ZYGOTES, Exit, Launcher
 from emulator.drivers.zygote import ForkedProcess, Zygote, ZygoteGoneError
-from tests.support.processes import has_ended
+from tests.support.processes import has_ended, wait_until
 from vnet.errors import VnetError
 from vnet.runtime import forking
 from vnet.transport.access import Access
@@ -94,6 +94,13 @@ def test_the_zygote_has_no_thread_and_no_connection(zygote: Zygote, launcher: La
     assert len([link for link in links if link.startswith("socket:")]) == 1, "to the emulator"
     assert [link for link in links if link.startswith("pipe:")] == [], "credentials of an agent"
     end_of(launcher, "v01")
+
+
+def test_what_a_program_imports_when_first_asked_for_is_imported_before_agents_are_forked() -> None:
+    with closing(Zygote(["agents.cooperative"])) as zygote:
+        zygote.start()
+        wait_until(zygote.is_ready)
+        assert "/daqp" in Path(f"/proc/{zygote.pid}/maps").read_text()
 
 
 def test_an_agent_that_gets_no_credentials_ends_and_does_nothing(zygote: Zygote, tmp_path: Path) -> None:

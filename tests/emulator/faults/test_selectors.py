@@ -75,6 +75,7 @@ def test_a_disc_holds_those_within_its_radius(seed: int, x: float, y: float, rad
     assert chosen(nodes, disc=(x, y, radius_m)) == inside
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(
     seeds,

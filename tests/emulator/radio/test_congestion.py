@@ -98,6 +98,7 @@ def test_limeric_takes_the_mean_of_two_windows() -> None:
     assert by_turns.share[0] == pytest.approx(steady.share[0], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_limeric_settles_where_its_equation_does() -> None:
     """K senders of airtime a: share* = β (target - K share) / α, as the busy ratio is the sum of all shares."""
     control = LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1))
@@ -114,6 +115,7 @@ def test_limerics_pause_is_the_airtime_over_the_share_within_bounds() -> None:
         assert pause_ms(control) == expected_ms
 
 
+@pytest.mark.slow
 def test_a_congested_channel_thins_out_what_is_sent() -> None:
     """Sixty vehicles send 1 000 bytes every 50 ms each: two thirds more than the capacity of the medium."""
     position_m = np.random.default_rng(3).uniform(0, 200, (60, 2))

@@ -80,6 +80,7 @@ options = st.fixed_dictionaries(
     optional={
         "congestion": st.sampled_from([{"kind": "etsi", "pause_ms": (1, 2, 4, 8, 16)}, {"kind": "limeric"}]),
         "shadowing": st.just({"sigma_db": 6.0}),
+        "mac": st.just({"eifs": True}),
     },
 )
 
@@ -90,7 +91,7 @@ def test_however_time_is_cut_the_same_happens(
     seed: int, sends: list[Send], radio: dict[str, Any], stops: list[int]
 ) -> None:
     position_m = scattered(6, seed)
-    one, other = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
+    one, other = (engine(position_m, seed, **PHYSICAL | radio) for _ in range(2))
     assert run(one, sends) == run(other, sends, stops)
     assert one.trace.sha256() == other.trace.sha256()
     assert one.counts == other.counts
@@ -134,7 +135,7 @@ def test_however_time_is_cut_copies_have_the_same_numbers(
     position_m = scattered(6, seed, side_m=600.0)
     duplicate = Duplicate(kind="duplicate", probability=0.8, delay_ms=2.0, **ACT)
     plan = [planned(0, duplicate, twice, 6), planned(1, fault, span, 6, 0, 1)]
-    one, other = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
+    one, other = (engine(position_m, seed, **PHYSICAL | radio) for _ in range(2))
     assert run(one, sends, plan=plan) == run(other, sends, stops, plan)
     assert rows(one) == rows(other)
 
@@ -146,7 +147,7 @@ def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
 ) -> None:
     """Predict the first arrival at some nodes before each send, as lockstep does."""
     position_m = scattered(6, seed)
-    plain, asked = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
+    plain, asked = (engine(position_m, seed, **PHYSICAL | radio) for _ in range(2))
     told = []
     times_ns = sorted({time for time, _, _ in sends})
     for time_ns, until_ns in zip(times_ns, [*times_ns[1:], 10**10], strict=True):
@@ -174,7 +175,7 @@ def test_at_one_instant_it_does_not_matter_whom_the_drivers_ask_first(
     seed: int, sends: list[Send], order: list[int], radio: dict[str, Any]
 ) -> None:
     position_m = scattered(6, seed)
-    one, other = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
+    one, other = (engine(position_m, seed, **PHYSICAL | radio) for _ in range(2))
     first = sorted(sends, key=lambda send: (send[0], send[1]))
     second = sorted(first, key=lambda send: (send[0], order.index(send[1])))
     run(one, first)
@@ -190,7 +191,7 @@ def test_others_far_away_change_nothing(
     """Bit by bit, though they talk all the time, among themselves."""
     near = scattered(6, seed)
     far = np.vstack([near, near[:3] + 1e5])
-    one, other = engine(near, seed, **PHYSICAL, **radio), engine(far, seed, **PHYSICAL, **radio)
+    one, other = engine(near, seed, **PHYSICAL | radio), engine(far, seed, **PHYSICAL | radio)
     run(one, sends)
     run(other, sends + [(time, node, 400) for time, node in elsewhere])
     ours = [row for row in rows(other) if int(row["sender"][1:]) < 6]
@@ -345,7 +346,7 @@ def test_every_pair_has_one_outcome_and_what_collided_met_a_frame_in_its_receive
 ) -> None:
     """Another's that overlapped it, or its receiver's own."""
     position_m = scattered(6, seed, side_m=3000.0)
-    subject = engine(position_m, seed, **PHYSICAL, **radio)
+    subject = engine(position_m, seed, **PHYSICAL | radio)
     run(subject, sends)
     table = rows(subject)
     keys = {(row["sender"], row["seq"], row["receiver"]) for row in table}

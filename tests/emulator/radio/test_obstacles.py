@@ -18,6 +18,8 @@ from emulator.scenario.scenario import Radio
 from emulator.world.buildings import Buildings
 from emulator.world.radio_inputs import RadioInputs
 
+pytestmark = pytest.mark.slow
+
 SQUARE: list[tuple[float, float]] = [(0, 0), (10, 0), (10, 10), (0, 10)]
 COURT: list[tuple[float, float]] = [(4, 4), (6, 4), (6, 6), (4, 6)]
 U_SHAPE: list[tuple[float, float]] = [(0, 0), (30, 0), (30, 20), (20, 20), (20, 10), (10, 10), (10, 20), (0, 20)]

@@ -22,6 +22,8 @@ from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, Row, S, digest,
 from vnet.errors import ScenarioError
 from vnet.radio import SentFrame
 
+pytestmark = pytest.mark.slow
+
 
 def rule(function: str, at_s: float = 0.0, duration_s: float = 100.0, kind: str = "custom", **more: Any) -> Row:
     return fault(kind, at_s, duration_s, rule=f"tests.support.rules:{function}", **more)

@@ -118,6 +118,7 @@ def test_the_noise_decides_where_it_is_loud() -> None:
     assert arrived == {"v1"}
 
 
+@pytest.mark.slow
 def test_delivery_against_distance_is_the_integral_over_the_fading() -> None:
     """Twenty receivers, two thousand frames, without a medium: Monte Carlo against quadrature."""
     east_m = np.linspace(30, 900, 20)

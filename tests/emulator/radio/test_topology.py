@@ -48,6 +48,7 @@ def hashed(
     return subject.engine.trace.sha256(), packets, str(subject.engine.counts)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     st.integers(0, 2**32),

@@ -115,6 +115,7 @@ def simulate(scenario: Path, out: Path, *options: str) -> Any:
     return done
 
 
+@pytest.mark.slow
 def test_a_changed_program_is_told_in_one_line_and_recorded_and_the_run_goes_on(
     program: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

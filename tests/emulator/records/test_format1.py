@@ -32,6 +32,7 @@ def give_inputs(run: Path) -> None:
     path.write_text(path.read_text().replace("/nowhere/", f"{FOLDER}/inputs/"))
 
 
+@pytest.mark.slow
 def test_with_its_inputs_every_reader_reads_it(run: Path, tmp_path: Path) -> None:
     give_inputs(run)
     judgement = check_run(run)

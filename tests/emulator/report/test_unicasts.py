@@ -47,6 +47,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
+@pytest.mark.slow
 def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> None:
     whole = RecordedRun.open(run)
     assert (whole.attempt > 1).any() and whole.outcome_is("duplicate").any() and whole.outcome_is("delivered").any()

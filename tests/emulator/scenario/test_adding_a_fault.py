@@ -80,6 +80,7 @@ def test_a_scenario_states_it_and_says_what_is_wrong_with_it(tmp_path: Path, spi
         parse_fault({"kind": "latency_spike", "duration_s": 1.0, "longst_ms": 5.0})
 
 
+@pytest.mark.slow
 def test_the_reference_page_describes_it(spike: type[Fault]) -> None:
     page = fault_page.page()
     assert "| `latency_spike` | links | Some frames arrive much later" in page

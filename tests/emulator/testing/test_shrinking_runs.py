@@ -18,6 +18,8 @@ from emulator.testing.shrinking import fewest, order_text
 from tests.emulator.testing.test_campaign import said_by_pytest
 from vnet.transport.wire import Deviation
 
+pytestmark = pytest.mark.slow
+
 
 @given(st.sets(st.integers(0, 199), min_size=1, max_size=4))
 def test_what_fails_together_is_left(needed: set[int]) -> None:
@@ -61,7 +63,6 @@ def test_an_order_is_a_phrase() -> None:
     assert order_text([line] * 7).endswith("; and 2 more")
 
 
-@pytest.mark.slow
 def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(
     tmp_path: Path, pytester: pytest.Pytester
 ) -> None:

@@ -88,6 +88,7 @@ def periods(told: Told) -> list[PeriodArrays]:
     return [PeriodArrays(message, node_ids) for stream, message in told if stream == "period"]
 
 
+@pytest.mark.slow
 def test_the_file_is_whole_and_says_so(path: Path) -> None:
     assert is_closed(path)
     assert rrd("verify", str(path)).returncode == 0

@@ -192,6 +192,7 @@ def arrivals(recorded: RecordedRun) -> dict[tuple[Any, ...], bool]:
     }
 
 
+@pytest.mark.slow
 def test_a_row_for_each_frame_replays_exactly_what_was_received(measured: RecordedRun, tmp_path: Path) -> None:
     links = measured_links(measured, 0)
     assert set(links.loss[~np.isnan(links.loss)].tolist()) == {0.0, 1.0} and np.isnan(links.loss).any()

@@ -22,6 +22,7 @@ def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[s
     return subprocess.run([sys.executable, "-P", *arguments], env=environment, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packages", ["emulator, agents, vnet", "emulator.drivers.live, agents.host"])
 def test_importing_vnet_changes_nothing_in_the_caller_s_environment(packages: str) -> None:
     program = f"import os; before = dict(os.environ); import {packages}; assert dict(os.environ) == before"

@@ -153,6 +153,7 @@ def test_arbitrary_bytes_never_do_harm(data: bytes) -> None:
             continue
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(agent_messages, st.data())
 def test_damaged_messages_never_do_harm(message: wire.AgentMessage, data: st.DataObject) -> None:

@@ -17,6 +17,8 @@ from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY, check_keys
 from vnet.transport.wire import WireFix
 from vnet.units import NS_PER_S
 
+pytestmark = pytest.mark.slow
+
 PATIENCE_S = 60.0
 QUIET = ZenohSessions()
 

@@ -242,6 +242,7 @@ def test_routes_in_a_network_of_sumo_need_not_name_the_inside_of_intersections(t
     assert_allclose(world.vehicles.place()[0], [[151.75, 0], [100, -43.5]], atol=1.0)
 
 
+@pytest.mark.slow
 def test_the_vehicle_ahead_is_the_nearest_on_the_way_by_brute_force() -> None:
     world = world_on(None, 60, {"gap_m": 2.0}, size_m=1000.0)
     rng = np.random.default_rng(1)

@@ -158,6 +158,7 @@ def fingerprint(emulation: Emulation) -> tuple[Any, ...]:
     return emulation.engine.trace.sha256(), emulation.metrics.sha256(), repr(table.to_pydict()), kept
 
 
+@pytest.mark.slow
 def test_a_run_is_the_same_in_every_division_and_again(tmp_path: Path) -> None:
     run = {"control_hz": 20.0}
     data = write_scenario(tmp_path, network={"max_vehicles": 3}, run=run, program={"entry": BRAKES})
