@@ -44,9 +44,10 @@ from vnet.gateway.frames import (
     decode_fragment,
     decode_message,
 )
-from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY
 from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
-from vnet.node import Node
+from vnet.node import Fix, Node
+from vnet.radio import Packet
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
@@ -288,6 +289,7 @@ class Vehicle:
 
     def tokens(self, key: zenoh.KeyExpr) -> list[zenoh.KeyExpr]:
         """Return the keys of tokens that are there, each once: this vehicle's first."""
+        self._listen()
         keys = dict.fromkeys(str(each.key) for each in self._tokens) | self._heard_tokens.keys
         return [key_of(each) for each in keys if key_of(each).intersects(key)]
 
@@ -330,10 +332,10 @@ class Vehicle:
         keys = {str(each.key) for each in self._tokens}
         self._send(CrossingTokens(tuple(sorted(key for key in keys if self.crosses(key)))))
 
-    def _hear_tokens(self, sender: str, tokens: CrossingTokens) -> None:
+    def _hear_tokens(self, sender: str, tokens: CrossingTokens, heard_ns: int) -> None:
         for text in tokens.keys:
             key_of(text)  # which raises for what is no key
-        for text, alive in self._heard_tokens.hear(sender, tokens.keys, self.node.now_ns):
+        for text, alive in self._heard_tokens.hear(sender, tokens.keys, heard_ns):
             self._tell_watchers(key_of(text), alive)
         self._has_tokens.set()
 
@@ -356,9 +358,9 @@ class Vehicle:
     def _listen(self) -> None:
         """Have the radio's packets wake this vehicle from now on; of what it has heard before tokens count."""
         if not self._hears.is_set():
-            for packet in self.node.radio.drain():
-                self._hear(packet.sender, packet.payload, only_tokens=True)
             self._hears.set()
+            for packet in self.node.radio.drain():
+                self._hear(packet, only_tokens=True)
 
     def tasks(self) -> list[Coroutine[Any, Any, None]]:
         """Return what is to run beside the programs."""
@@ -369,16 +371,16 @@ class Vehicle:
         await self._hears.wait()
         radio = self.node.radio
         while True:
-            packet = await radio.receive()
-            self._hear(packet.sender, packet.payload)
+            self._hear(await radio.receive())
             for packet in radio.drain():
-                self._hear(packet.sender, packet.payload)
+                self._hear(packet)
 
-    def _hear(self, sender: str, payload: bytes, only_tokens: bool = False) -> None:
+    def _hear(self, packet: Packet, only_tokens: bool = False) -> None:
+        sender = packet.sender
         try:
-            heard = _whole(payload)
+            heard = _whole(packet.payload)
             if heard is None:
-                message = self._reassembly.take(sender, payload)
+                message = self._reassembly.take(sender, packet.payload)
                 sample = sample_of(message) if isinstance(message, CrossingSample) else None
             else:
                 message, sample = heard
@@ -387,7 +389,7 @@ class Vehicle:
                     if entity.is_remote and entity.sink is not None:
                         entity.sink.push(sample)
             elif isinstance(message, CrossingTokens):
-                self._hear_tokens(sender, message)
+                self._hear_tokens(sender, message, packet.received_ns)
             elif isinstance(message, CrossingQuery) and not only_tokens:
                 self._answer(sender, message)
             elif isinstance(message, CrossingReply):
@@ -405,12 +407,23 @@ class Vehicle:
         async for fix in self.node.gnss:
             sample = Sample(
                 key_of(FIX_KEY),
-                zenoh.ZBytes(fix_content(fix)),
+                zenoh.ZBytes(msgspec.msgpack.encode(told_of(fix))),
                 zenoh.SampleKind.PUT,
                 _NO_ENCODING,
                 self.new_timestamp(self.zid),
             )
             self._deliver([each for each in self._takers_of(FIX_KEY) if each.is_remote], sample)
+
+
+def told_of(fix: Fix) -> dict[str, Any]:
+    """Return what programs are told of a fix."""
+    return {
+        "time_ns": fix.time_ns,
+        "position_m": fix.position_m.tolist(),
+        "covariance_m2": fix.covariance_m2.tolist(),
+        "heading_rad": fix.heading_rad,
+        "speed_m_s": fix.speed_m_s,
+    }
 
 
 def token_sample(key: zenoh.KeyExpr, alive: bool) -> Sample:
