@@ -131,7 +131,7 @@ def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Dr
         "['alive/v02', 'alive/v03']",
         "0.4 alive/v02 SampleKind.PUT",
         "0.4 alive/v03 SampleKind.PUT",
-        "1.6 alive/v03 SampleKind.DELETE",
+        "1.4 alive/v03 SampleKind.DELETE",
         "2.0 alive/v02 SampleKind.DELETE",
     ]
 

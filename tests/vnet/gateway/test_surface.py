@@ -4,7 +4,7 @@ import ast
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -13,7 +13,7 @@ import zenoh
 from vnet.gateway.emulated.programs import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
-MODULES = zenoh_modules(cast(Any, None), count().__next__)
+MODULES = zenoh_modules(cast(Any, SimpleNamespace(due=None)), count().__next__)
 
 
 def declared(module: str) -> Iterator[ast.stmt]:

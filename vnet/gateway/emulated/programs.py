@@ -89,7 +89,7 @@ EXTENDED = (
 
 def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, ModuleType]:
     """Return the package `zenoh` of a program, by the names of its modules."""
-    outlet = Outlet(new_number)
+    outlet = Outlet(vehicle.due, new_number)
 
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
         if timestamp_callback is not None:

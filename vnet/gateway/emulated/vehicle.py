@@ -20,6 +20,7 @@ import zenoh
 from vnet.errors import VnetError
 from vnet.gateway.emulated.modules import EPOCH_NS
 from vnet.gateway.emulated.values import (
+    DueCallbacks,
     Reply,
     ReplyError,
     Sample,
@@ -92,6 +93,7 @@ class Vehicle:
         self._loop = asyncio.get_running_loop()
         self._fragments = Fragments(node.radio.max_payload)
         self._reassembly = Reassembly()
+        self.due = DueCallbacks()
         self._subscribers: list[Entity] = []
         self._queryables: list[Entity] = []
         self._tokens: list[Entity] = []
@@ -371,9 +373,10 @@ class Vehicle:
         await self._hears.wait()
         radio = self.node.radio
         while True:
-            self._hear(await radio.receive())
-            for packet in radio.drain():
-                self._hear(packet)
+            packet, self.due.is_held = await radio.receive(), True
+            self._hear(packet)
+            self.due.is_held = False
+            self.due.run()
 
     def _hear(self, packet: Packet, only_tokens: bool = False) -> None:
         sender = packet.sender
@@ -385,7 +388,8 @@ class Vehicle:
             else:
                 message, sample = heard
             if sample is not None and not only_tokens:
-                for entity in self._takers_of(str(sample.key_expr)):
+                assert isinstance(message, CrossingSample)
+                for entity in self._takers_of(message.key):
                     if entity.is_remote and entity.sink is not None:
                         entity.sink.push(sample)
             elif isinstance(message, CrossingTokens):
