@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextvars import copy_context
 from functools import lru_cache
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import msgspec
 import zenoh
@@ -78,10 +78,7 @@ class Sample(_Value, frozen=True, eq=False, gc=False):
     attachment: zenoh.ZBytes | None = None
     source_info: SourceInfo | None = None
 
-    @property
-    def timestamp_stack(self) -> None:
-        """None: instrumentation of timestamps is refused."""
-        return
+    timestamp_stack: ClassVar[None] = None
 
 
 class ReplyError(_Value, frozen=True, eq=False, gc=False):
@@ -90,10 +87,7 @@ class ReplyError(_Value, frozen=True, eq=False, gc=False):
     payload: zenoh.ZBytes
     encoding: zenoh.Encoding
 
-    @property
-    def timestamp_stack(self) -> None:
-        """None: instrumentation of timestamps is refused."""
-        return
+    timestamp_stack: ClassVar[None] = None
 
 
 class Reply(_Value, frozen=True, eq=False, gc=False):
@@ -194,13 +188,38 @@ def name_of(member: zenoh.Priority | zenoh.CongestionControl) -> Any:
     return str(member).rpartition(".")[2]
 
 
-@lru_cache(maxsize=1024)
-def key_of(text: str) -> zenoh.KeyExpr:
-    """Return a key expression. Raises ZError."""
-    return zenoh.KeyExpr(text)
+PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
+NOTHING = zenoh.ZBytes(b"")
+NO_ENCODING = zenoh.Encoding.ZENOH_BYTES
+_key = lru_cache(maxsize=1024)(zenoh.KeyExpr)
+_encoding = lru_cache(maxsize=256)(zenoh.Encoding)
 
 
-encoding_of = lru_cache(maxsize=256)(zenoh.Encoding)
+def key_of(key: Any) -> zenoh.KeyExpr:
+    """Return what a program has given as a key expression as one. Raises ZError."""
+    return key if isinstance(key, zenoh.KeyExpr) else _key(key)
+
+
+def encoding_of(encoding: Any, default: zenoh.Encoding = NO_ENCODING) -> zenoh.Encoding:
+    """Return what a program has given as an encoding as one."""
+    if encoding is None:
+        return default
+    return encoding if isinstance(encoding, zenoh.Encoding) else _encoding(encoding)
+
+
+def zbytes_of(content: Any) -> zenoh.ZBytes:
+    """Return what a program has given as a payload as one."""
+    return content if isinstance(content, zenoh.ZBytes) else zenoh.ZBytes(content)
+
+
+def bytes_or_none(content: Any) -> zenoh.ZBytes | None:
+    """Return the same, None for None."""
+    return None if content is None else zbytes_of(content)
+
+
+def token_sample(key: zenoh.KeyExpr, alive: bool) -> Sample:
+    """Return the sample that says that a token has come or gone."""
+    return Sample(key, NOTHING, PUT if alive else DELETE, NO_ENCODING)
 
 
 def sample_of(crossing: CrossingSample) -> Sample:
@@ -402,10 +421,7 @@ class Outlet(NamedTuple):
     """Numbers the program's threads."""
 
 
-Sink = Handler | CallbackSink
-
-
-def sink_of(handler: Any, outlet: Outlet) -> tuple[Sink, Any, bool]:
+def sink_of(handler: Any, outlet: Outlet) -> tuple[Handler | CallbackSink, Any, bool]:
     """Return where items go, the handler that the program sees, and whether they go to a callback alone.
 
     Raises ValueError for what is no handler.
