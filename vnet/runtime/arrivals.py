@@ -191,10 +191,10 @@ class Window:
         """True if packets are yet to be taken."""
         return bool(self._new or self._packets)
 
-    def first_packet_ns(self, nodes: Collection[str]) -> int:
-        """Return the arrival of the first packet at one of these nodes, or the window's end."""
+    def first_packet_ns(self, awaits: Callable[[str], bool]) -> int:
+        """Return the arrival of the first packet at a node that `awaits` one, or the window's end."""
         self._queue_new()
-        return next((received_ns for received_ns, node, _ in self._packets if node in nodes), self.end_ns)
+        return next((received_ns for received_ns, node, _ in self._packets if awaits(node)), self.end_ns)
 
     def take_packets(self, time_ns: int, paused: Collection[str]) -> dict[str, list[Packet]]:
         """Remove and return the packets that have arrived by then, oldest first; those of paused nodes wait."""

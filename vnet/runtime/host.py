@@ -363,12 +363,14 @@ class Host:
         next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
         next_ns = self.news.first_ns(self._paused, next_ns)
         if window.has_packets:
-            awaiting = {id for id, node in self.nodes.items() if self._active[id] and node.radio.inbox.waiting}
-            next_ns = min(next_ns, window.first_packet_ns(awaiting - self._paused))
+            next_ns = min(next_ns, window.first_packet_ns(self._awaits_packet))
         if next_ns >= window.end_ns:
             return None
         self._deliver_due(next_ns)
         return next_ns
+
+    def _awaits_packet(self, node: str) -> bool:
+        return self._active[node] and node not in self._paused and self.nodes[node].radio.inbox.waiting
 
     def _deliver_due(self, time_ns: int, fixes: Sequence[tuple[str, Fix]] = ()) -> None:
         packets = self._window.take_packets(time_ns, self._paused)

@@ -19,17 +19,9 @@ import zenoh
 from zenoh.ext import UInt32, z_deserialize, z_serialize
 
 from vnet.gateway.emulated.modules import EPOCH_NS
-from vnet.gateway.emulated.sessions import (
-    Listening,
-    LivelinessToken,
-    Publisher,
-    Query,
-    Session,
-    Subscriber,
-    Watcher,
-)
+from vnet.gateway.emulated.queries import ANY_KEY, Asking, Direct, Entity, Query
+from vnet.gateway.emulated.sessions import Listening, LivelinessToken, Publisher, Session, Watcher
 from vnet.gateway.emulated.values import EntityGlobalId, Reply, Sample, SourceInfo, ZenohId, key_of, sink_of
-from vnet.gateway.emulated.vehicle import ANY_KEY, LOCAL, REMOTE, Asking, Entity
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
@@ -97,16 +89,6 @@ class Miss(msgspec.Struct, frozen=True):
     nb: int
 
 
-class _Direct:
-    """A sink that calls a function at once."""
-
-    def __init__(self, push: Callable[[Any], object]) -> None:
-        self.push = push
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
 def _every(seconds: float, act: Callable[[], object]) -> asyncio.Task[None]:
     async def repeat() -> None:
         while True:
@@ -120,45 +102,52 @@ def _every(seconds: float, act: Callable[[], object]) -> asyncio.Task[None]:
 class AdvancedPublisher(Publisher):
     """A publisher whose samples can be asked for later."""
 
-    def __init__(self, session: Session, key: Any, options: dict[str, Any]) -> None:
-        super().__init__(session, key, options)
-        cache, misses = options["cache"], options["sample_miss_detection"]
-        if misses is None and cache is not None and session.stamp() is None:
+    def __init__(
+        self,
+        session: Session,
+        key: Any,
+        *,
+        cache: CacheConfig | None = None,
+        sample_miss_detection: MissDetectionConfig | None = None,
+        publisher_detection: bool | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(session, key, **options)
+        misses = sample_miss_detection
+        if misses is None and cache is not None and not session.stamps:
             self._is_declared = False
             raise zenoh.ZError(
-                f"Cannot create AdvancedPublisher {self._key} with Sequencing::Timestamp: the 'timestamping' "
+                f"Cannot create AdvancedPublisher {self.key_expr} with Sequencing::Timestamp: the 'timestamping' "
                 "setting must be enabled in the Zenoh configuration."
             )
         self._number: int | None = None if misses is None else 0
-        eid = self._eid if misses is not None else _WITHOUT_ID
-        own_key = key_of(f"{self._key}/@adv/pub/{session.zid()}/{eid}/_")
+        eid = self.id.eid if misses is not None else _WITHOUT_ID
+        own_key = key_of(f"{self.key_expr}/@adv/pub/{session.zid()}/{eid}/_")
         self._cache = None if cache is None else _Cache(session, own_key, cache)
-        self._token = LivelinessToken(session, own_key) if options["publisher_detection"] else None
+        self._token = LivelinessToken(session, own_key) if publisher_detection else None
         self._heart: asyncio.Task[None] | None = None
         self._told = 0
         if misses is not None and (period_s := misses.heartbeat or misses.sporadic_heartbeat) is not None:
-            beat = partial(self._beat, own_key, misses.heartbeat is None)
-            self._heart = _every(period_s, beat)
+            self._heart = _every(period_s, partial(self._beat, own_key, misses.heartbeat is None))
             session.at_close(self._heart.cancel)
+        self._end = self._end_all
 
     def _beat(self, key: zenoh.KeyExpr, sporadic: bool) -> None:
         number = self._number or 0
         if number > (self._told if sporadic else 0):
             self._told = number
-            self._session.put(key, z_serialize(UInt32(number - 1)))
+            self.session.put(key, z_serialize(UInt32(number - 1)))
 
-    def _put(
-        self, kind: Any, payload: zenoh.ZBytes, encoding: zenoh.Encoding, attachment: Any, time: Any, source: Any
-    ) -> Sample:
+    def _publish(self, kind: zenoh.SampleKind, payload: Any, **options: Any) -> Sample:
         if self._number is not None:
-            source = SourceInfo(self.id, self._number)
+            options["source_info"] = SourceInfo(self.id, self._number)
             self._number += 1
-        sample = super()._put(kind, payload, encoding, attachment, time, source)
+        sample = super()._publish(kind, payload, **options)
         if self._cache is not None:
             self._cache.samples.append(sample)
         return sample
 
-    def _end(self) -> None:
+    def _end_all(self) -> None:
         if self._heart is not None:
             self._heart.cancel()
         if self._token is not None:
@@ -173,7 +162,7 @@ class _Cache:
     def __init__(self, session: Session, key: zenoh.KeyExpr, config: CacheConfig) -> None:
         self.samples: deque[Sample] = deque(maxlen=config.max_samples or 1)
         self._replies = config.replies_config or RepliesConfig()
-        entity = Entity(session, key, _Direct(self._answer))  # type: ignore[arg-type]
+        entity = Entity(session, key, Direct(self._answer))
         session.declare("queryable", entity)
         self._node = session.vehicle.node
         self.end = partial(session.vehicle.undeclare, "queryable", entity)
@@ -238,73 +227,69 @@ class _Source:
 class AdvancedSubscriber(Listening):
     """A subscriber that asks caches for what it has missed."""
 
-    def __init__(self, session: Session, key: Any, handler: Any, options: dict[str, Any]) -> None:
-        self._is_declared = False
-        self._history: HistoryConfig | None = options["history"]
-        self._recovery: RecoveryConfig | None = options["recovery"]
-        for name, value in (("max_samples", self._most), ("max_age", self._history and self._history.max_age)):
+    def __init__(
+        self,
+        session: Session,
+        key: Any,
+        handler: Any,
+        *,
+        allowed_origin: zenoh.Locality | None = None,
+        history: HistoryConfig | None = None,
+        recovery: RecoveryConfig | None = None,
+        subscriber_detection: bool | None = None,
+    ) -> None:
+        session.check_open()
+        self._history, self._recovery, self.session = history, recovery, session
+        for name, value in (("max_samples", self._most), ("max_age", history and history.max_age)):
             if value == 0:
                 raise zenoh.ZError(f"{name} must not be zero")
-        self._session = session
-        self._sink, self._handler, self._is_background = sink_of(handler, session.outlet)
+        self._sink, self.handler, self._is_background = sink_of(handler, session.outlet)
         self._sources: dict[EntityGlobalId, _Source] = {}
         self._stamped: dict[bytes, _Source] = {}
-        self._queries = 0 if self._history is None else 1
+        self._queries = 0 if history is None else 1
         self._misses: list[SampleMissListener] = []
-        self._ends: list[Callable[[], object]] = []
-        origin = options["allowed_origin"]
-        self._main = Entity(
-            session,
-            _key(key),
-            _Ending(self._take, self._sink.close),  # type: ignore[arg-type]
-            origin != REMOTE,
-            origin != LOCAL,
-            eid=next(session.entity_numbers),
-        )
-        session.declare("subscriber", self._main)
-        self._is_declared = True
-        self._ends.append(partial(session.vehicle.undeclare, "subscriber", self._main))
-        publishers = f"{self.key_expr}/@adv/pub/**"
-        if self._history is not None:
-            self._ask(f"{self.key_expr}/@adv/**", self._history.parameters(), self._initial_done)
-            if self._history.detect_late_publishers:
-                self._detects_publishers(publishers)
-        if self._recovery is not None and self._recovery.heartbeat:
-            beats = Entity(session, key_of(publishers), _Direct(self._hear_heartbeat), self._main.is_local)  # type: ignore[arg-type]
-            beats.is_remote = self._main.is_remote
-            session.declare("subscriber", beats)
-            self._ends.append(partial(session.vehicle.undeclare, "subscriber", beats))
-        if options["subscriber_detection"]:
-            token = LivelinessToken(session, f"{self.key_expr}/@adv/sub/{session.zid()}/{self._main.eid}/_")
+        self._ends: list[Callable[[], object]] = [self._stop_timers]
+        self._end, self._is_declared = self._end_all, True
+        sink = Direct(self._take, self._sink.close)
+        self._main = Entity(session, key_of(key), sink, allowed_origin, eid=next(session.entity_numbers))
+        self.id, self.key_expr = self._main.id, self._main.key
+        self._declare("subscriber", self._main)
+        publishers = key_of(f"{self.key_expr}/@adv/pub/**")
+        if history is not None:
+            self._ask(f"{self.key_expr}/@adv/**", history.parameters(), self._initial_done)
+            if history.detect_late_publishers:
+                watcher = Entity(session, publishers, Direct(self._publisher_changed))
+                self._declare("watcher", watcher)
+                session.vehicle.tell_present(watcher)
+        if recovery is not None and recovery.heartbeat:
+            self._declare("subscriber", Entity(session, publishers, Direct(self._hear_heartbeat), allowed_origin))
+        if subscriber_detection:
+            token = LivelinessToken(session, f"{self.key_expr}/@adv/sub/{session.zid()}/{self.id.eid}/_")
             self._ends.append(token.undeclare_if_declared)
         session.at_close(self._stop_timers)
+
+    id: EntityGlobalId
+    key_expr: zenoh.KeyExpr
+
+    def _declare(self, kind: str, entity: Entity) -> None:
+        self.session.declare(kind, entity)
+        self._ends.append(partial(self.session.vehicle.undeclare, kind, entity))
+
+    def _end_all(self) -> None:
+        for end in self._ends:
+            end()
 
     @property
     def _most(self) -> int | None:
         return None if self._history is None else self._history.max_samples
 
-    @property
-    def id(self) -> EntityGlobalId:
-        """The id of the subscriber."""
-        return EntityGlobalId(self._session.zid(), self._main.eid)
-
-    @property
-    def key_expr(self) -> zenoh.KeyExpr:
-        """The key expression."""
-        return self._main.key
-
     def sample_miss_listener(self, handler: Any = None) -> SampleMissListener:
         """Declare a listener that is told of samples that are missed for good."""
         return SampleMissListener(self, handler)
 
-    def detect_publishers(self, handler: Any = None, *, history: bool | None = None) -> Subscriber:
+    def detect_publishers(self, handler: Any = None, *, history: bool | None = None) -> Watcher:
         """Declare a subscriber of the tokens of advanced publishers."""
-        return Watcher(self._session, f"{self.key_expr}/@adv/pub/**", handler, bool(history))
-
-    def _end_of(self) -> None:
-        for end in self._ends:
-            end()
-        self._stop_timers()
+        return Watcher(self.session, f"{self.key_expr}/@adv/pub/**", handler, history)
 
     def _stop_timers(self) -> None:
         for source in self._sources.values():
@@ -379,7 +364,7 @@ class AdvancedSubscriber(Listening):
 
     def _miss(self, source_id: EntityGlobalId, count: int) -> None:
         for listener in self._misses:
-            listener._sink.push(Miss(source_id, count))
+            listener.push(Miss(source_id, count))
 
     def _flush(self, source_id: EntityGlobalId, source: _Source) -> None:
         """Pass on what waits: what is not there by now is missed."""
@@ -407,11 +392,9 @@ class AdvancedSubscriber(Listening):
             zenoh.Selector(key, parameters),
             self._replied,
             on_end,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
         )
         asking.expire_after(RECOVERY_TIMEOUT_S)
-        self._session.vehicle.ask(asking, self._session, to_own=True, to_others=True)
+        self.session.vehicle.ask(asking, self.session, to_own=True, to_others=True)
 
     def _replied(self, reply: Reply) -> None:
         if reply.ok is not None and self.key_expr.intersects(reply.ok.key_expr):
@@ -465,13 +448,6 @@ class AdvancedSubscriber(Listening):
 
     # Publishers that come later.
 
-    def _detects_publishers(self, key: str) -> None:
-        session = self._session
-        watcher = Entity(session, key_of(key), _Direct(self._publisher_changed))  # type: ignore[arg-type]
-        session.declare("watcher", watcher)
-        self._ends.append(partial(session.vehicle.undeclare, "watcher", watcher))
-        session.vehicle.tell_present(watcher)
-
     def _publisher_changed(self, token: Sample) -> None:
         assert self._history is not None
         source_id = _source_of(token.key_expr)
@@ -495,22 +471,6 @@ class AdvancedSubscriber(Listening):
             self._flush_stamped(source)
 
 
-class _Ending(_Direct):
-    """A sink that calls a function at once, and another at its end."""
-
-    def __init__(self, push: Callable[[Any], object], close: Callable[[], object]) -> None:
-        super().__init__(push)
-        self._close = close
-
-    def close(self) -> None:
-        """Take nothing more."""
-        self._close()
-
-
-def _key(key: Any) -> zenoh.KeyExpr:
-    return key if isinstance(key, zenoh.KeyExpr) else key_of(key)
-
-
 def _source_of(key: zenoh.KeyExpr) -> EntityGlobalId | ZenohId | None:
     """Return the publisher that a key `…/@adv/pub/ZID/EID/_` names; its session alone if it has no number."""
     found = re.search(r"(?:^|/)@adv/pub/([0-9a-f]+)/(\w+)(?:/|$)", str(key))
@@ -524,43 +484,27 @@ class SampleMissListener(Listening):
     """A listener that is told of samples that are missed for good."""
 
     def __init__(self, subscriber: AdvancedSubscriber, handler: Any) -> None:
-        self._subscriber = subscriber
-        self._sink, self._handler, self._is_background = sink_of(handler, subscriber._session.outlet)
-        subscriber._misses.append(self)
+        self._listeners = subscriber._misses
+        self._sink, self.handler, self._is_background = sink_of(handler, subscriber.session.outlet)
+        self._listeners.append(self)
+        self._end, self._is_declared = self._stop, True
 
-    def _end_of(self) -> None:
-        if self in self._subscriber._misses:
-            self._subscriber._misses.remove(self)
+    def push(self, miss: Miss) -> None:
+        """Tell of a miss."""
+        self._sink.push(miss)
+
+    def _stop(self) -> None:
+        self._listeners.remove(self)
         self._sink.close()
 
 
-def declare_advanced_publisher(
-    session: Session,
-    key_expr: Any,
-    *,
-    encoding: Any = None,
-    congestion_control: zenoh.CongestionControl | None = None,
-    priority: zenoh.Priority | None = None,
-    express: bool | None = None,
-    reliability: zenoh.Reliability | None = None,
-    allowed_destination: zenoh.Locality | None = None,
-    cache: CacheConfig | None = None,
-    sample_miss_detection: MissDetectionConfig | None = None,
-    publisher_detection: bool | None = None,
-) -> AdvancedPublisher:
+def declare_advanced_publisher(session: Session, key_expr: Any, **options: Any) -> AdvancedPublisher:
     """Declare an advanced publisher."""
-    return AdvancedPublisher(session, key_expr, locals())
+    return AdvancedPublisher(session, key_expr, **options)
 
 
 def declare_advanced_subscriber(
-    session: Session,
-    key_expr: Any,
-    handler: Any = None,
-    *,
-    allowed_origin: zenoh.Locality | None = None,
-    history: HistoryConfig | None = None,
-    recovery: RecoveryConfig | None = None,
-    subscriber_detection: bool | None = None,
+    session: Session, key_expr: Any, handler: Any = None, **options: Any
 ) -> AdvancedSubscriber:
     """Declare an advanced subscriber."""
-    return AdvancedSubscriber(session, key_expr, handler, locals())
+    return AdvancedSubscriber(session, key_expr, handler, **options)

@@ -12,7 +12,7 @@ import zenoh.ext
 import zenoh.handlers
 
 from vnet.errors import ProgramError
-from vnet.gateway.emulated import advanced, sessions, values
+from vnet.gateway.emulated import advanced, queries, sessions, values
 from vnet.gateway.emulated.modules import ProgramModules
 from vnet.gateway.emulated.strands import run_strand
 from vnet.gateway.emulated.values import Outlet, refused
@@ -57,18 +57,28 @@ ZENOHS_OWN = (
     "ZError",
 )
 """Values that Python can construct, and which are the same everywhere."""
-EMULATED = (
-    *(
-        sessions.CancellationToken,
-        values.Config,
-        values.EntityGlobalId,
-        values.Handler,
-        values.Hello,
-        sessions.Liveliness,
-    ),
-    *(sessions.LivelinessToken, sessions.MatchingListener, values.MatchingStatus, sessions.Publisher),
-    *(sessions.Querier, sessions.Query, sessions.Queryable, values.Reply, values.ReplyError, values.Sample),
-    *(sessions.Scout, sessions.Session, sessions.SessionInfo, values.SourceInfo, sessions.Subscriber),
+EMULATED: tuple[type, ...] = (
+    sessions.CancellationToken,
+    sessions.Liveliness,
+    sessions.LivelinessToken,
+    sessions.MatchingListener,
+    sessions.Publisher,
+    sessions.Querier,
+    queries.Query,
+    sessions.Queryable,
+    sessions.Scout,
+    sessions.Session,
+    sessions.SessionInfo,
+    sessions.Subscriber,
+    values.Config,
+    values.EntityGlobalId,
+    values.Handler,
+    values.Hello,
+    values.MatchingStatus,
+    values.Reply,
+    values.ReplyError,
+    values.Sample,
+    values.SourceInfo,
     values.ZenohId,
 )
 EXTENDED = (
@@ -89,7 +99,7 @@ EXTENDED = (
 
 def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, ModuleType]:
     """Return the package `zenoh` of a program, by the names of its modules."""
-    outlet = Outlet(new_number)
+    outlet = Outlet(vehicle.due, new_number)
 
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
         if timestamp_callback is not None:

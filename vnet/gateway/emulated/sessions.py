@@ -10,68 +10,58 @@ from typing import Any
 import msgspec
 import zenoh
 
+from vnet.gateway.emulated.queries import ANY_KEY, Asking, Entity
 from vnet.gateway.emulated.values import (
+    DELETE,
+    NO_ENCODING,
+    NOTHING,
+    PUT,
     EntityGlobalId,
     Hello,
     MatchingStatus,
     Outlet,
     Reply,
-    ReplyError,
     Sample,
     SourceInfo,
     ZenohId,
+    bytes_or_none,
+    encoding_of,
     key_of,
     sink_of,
+    token_sample,
+    zbytes_of,
 )
-from vnet.gateway.emulated.vehicle import ANY_KEY, LOCAL, REMOTE, Asking, Entity, Vehicle, token_sample
+from vnet.gateway.emulated.vehicle import Vehicle
 
 QUERY_TIMEOUT_S = 10.0
 """Zenoh's own `queries_default_timeout`."""
-_NO_ENCODING = zenoh.Encoding.ZENOH_BYTES
-_NOTHING = zenoh.ZBytes(b"")
-PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
+LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
 
 
-def _key(key: Any) -> zenoh.KeyExpr:
-    return key if isinstance(key, zenoh.KeyExpr) else key_of(key)
-
-
-def _bytes(content: Any) -> zenoh.ZBytes:
-    return content if isinstance(content, zenoh.ZBytes) else zenoh.ZBytes(content)
-
-
-def _bytes_or_none(content: Any) -> zenoh.ZBytes | None:
-    return None if content is None else _bytes(content)
-
-
-def _encoding(encoding: Any, default: zenoh.Encoding = _NO_ENCODING) -> zenoh.Encoding:
-    if encoding is None:
-        return default
-    return encoding if isinstance(encoding, zenoh.Encoding) else zenoh.Encoding(encoding)
-
-
-def _refuse_instrumentation(instrumentation: object) -> None:
-    if instrumentation is not None:
-        raise zenoh.ZError(
-            "timestamp_instrumentation is not available on virtual time: Zenoh has no transport here"
-        )
+def _refuse(**given: object) -> None:
+    """Raise ZError for an argument that virtual time does not have."""
+    for name, value in given.items():
+        if value is not None:
+            raise zenoh.ZError(f"{name} is not available on virtual time: sessions have no transport")
 
 
 class Declared:
     """What a session has declared, until it is undeclared; a `with` block undeclares it."""
 
-    _is_declared = True
+    _is_declared = False
+    _end: Callable[[], object] = staticmethod(lambda: None)
+    """Does what undeclaring is."""
 
     def __enter__(self) -> Any:
         return self
 
     def __exit__(self, *_args: object, **_kwargs: object) -> None:
-        self.undeclare()
+        self.undeclare_if_declared()
 
     def undeclare(self) -> None:
         """Undeclare it. Raises ZError if it has been."""
         if not self._is_declared:
-            raise zenoh.ZError("Undeclared")
+            raise zenoh.ZError(f"Undeclared {type(self).__name__}")
         self._is_declared = False
         self._end()
 
@@ -80,93 +70,71 @@ class Declared:
         if self._is_declared:
             self.undeclare()
 
-    def _end(self) -> None:
-        """Do what undeclaring is."""
-
 
 class Listening(Declared):
     """What a session has declared that takes items, with the end of the channel that the program reads."""
 
-    _end_of: Callable[[], object] = staticmethod(lambda: None)
-    _handler: Any = None
+    handler: Any = None
     _is_background = False
+    """Whether it goes on when the program discards it."""
 
     def __class_getitem__(cls, item: object) -> type[Listening]:
         return cls
 
-    @property
-    def handler(self) -> Any:
-        """The handler."""
-        return self._handler
-
     def try_recv(self) -> Any:
         """Return the next item, None if there is none now."""
-        return self._handler.try_recv()
+        return self.handler.try_recv()
 
     def recv(self) -> Any:
         """Return the next item; block until there is one."""
-        return self._handler.recv()
+        return self.handler.recv()
 
     def __iter__(self) -> Any:
-        return iter(self._handler)
-
-    def _end(self) -> None:
-        self._end_of()
+        return iter(self.handler)
 
     def __del__(self) -> None:
-        if self._is_declared and not self._is_background:
-            self._is_declared = False
-            self._end_of()
+        if not self._is_background:
+            self.undeclare_if_declared()
 
 
-class _Entity(Listening):
-    """A subscriber or a queryable."""
-
-    _kind = ""
-
-    def __init__(
-        self, session: Session, key: Any, handler: Any, origin: zenoh.Locality | None, complete: bool = False
-    ) -> None:
-        self._is_declared = False
-        session.check_open()
-        sink, self._handler, self._is_background = sink_of(handler, session.outlet)
-        entity = Entity(
-            session, _key(key), sink, origin != REMOTE, origin != LOCAL, complete, next(session.entity_numbers)
-        )
-        self._entity, self._is_declared = entity, True
-        self._end_of = partial(session.vehicle.undeclare, self._kind, entity)
-        session.declare(self._kind, entity)
-
-    @property
-    def id(self) -> EntityGlobalId:
-        """The id of the entity."""
-        return EntityGlobalId(self._entity.session.zid(), self._entity.eid)
-
-    @property
-    def key_expr(self) -> zenoh.KeyExpr:
-        """The key expression."""
-        return self._entity.key
-
-
-class Subscriber(_Entity):
+class Subscriber(Listening):
     """A subscriber."""
 
-    _kind = "subscriber"
+    kind = "subscriber"
+
+    def __init__(
+        self,
+        session: Session,
+        key: Any,
+        handler: Any,
+        allowed_origin: zenoh.Locality | None = None,
+        complete: bool | None = None,
+    ) -> None:
+        session.check_open()
+        sink, self.handler, self._is_background = sink_of(handler, session.outlet)
+        number = next(session.entity_numbers)
+        self._entity = Entity(session, key_of(key), sink, allowed_origin, bool(complete), number)
+        self._end = partial(session.vehicle.undeclare, self.kind, self._entity)
+        self._is_declared = True
+        session.declare(self.kind, self._entity)
+
+    id = property(lambda self: self._entity.id)
+    key_expr = property(lambda self: self._entity.key)
 
 
-class Queryable(_Entity):
+class Queryable(Subscriber):
     """A queryable."""
 
-    _kind = "queryable"
+    kind = "queryable"
 
 
 class Watcher(Subscriber):
     """A subscriber of tokens."""
 
-    _kind = "watcher"
+    kind = "watcher"
 
-    def __init__(self, session: Session, key: Any, handler: Any, history: bool) -> None:
-        super().__init__(session, key, handler, None)
+    def __init__(self, session: Session, key: Any, handler: Any, history: bool | None) -> None:
+        super().__init__(session, key, handler)
         if history:
             session.vehicle.tell_present(self._entity)
 
@@ -175,53 +143,14 @@ class LivelinessToken(Declared):
     """A token."""
 
     def __init__(self, session: Session, key: Any) -> None:
-        self._is_declared = False
         session.check_open()
-        self._session = session
-        self._entity = Entity(session, _key(key), eid=next(session.entity_numbers))
+        entity = Entity(session, key_of(key), eid=next(session.entity_numbers))
+        self._end = partial(session.vehicle.undeclare, "token", entity)
         self._is_declared = True
-        session.declare("token", self._entity)
-
-    def _end(self) -> None:
-        self._session.vehicle.undeclare("token", self._entity)
+        session.declare("token", entity)
 
     def __del__(self) -> None:
-        if self._is_declared:
-            self._is_declared = False
-            self._end()
-
-
-class Liveliness:
-    """Tokens of a session, and of others."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-
-    def declare_token(self, key_expr: Any) -> LivelinessToken:
-        """Declare a token, which is there until it is undeclared or discarded."""
-        return LivelinessToken(self._session, key_expr)
-
-    def declare_subscriber(self, key_expr: Any, handler: Any = None, *, history: bool | None = None) -> Subscriber:
-        """Declare a subscriber that is told of tokens, with `history` also of those that are there."""
-        return Watcher(self._session, key_expr, handler, bool(history))
-
-    def get(
-        self,
-        key_expr: Any,
-        handler: Any = None,
-        *,
-        timeout: float | int | None = None,
-        cancellation_token: CancellationToken | None = None,
-    ) -> Any:
-        """Get the tokens that are there: those of other vehicles as far as they have been heard."""
-        self._session.check_open()
-        sink, seen, _ = sink_of(handler, self._session.outlet)
-        tokens = self._session.vehicle.tokens(_key(key_expr))
-        if cancellation_token is None or not cancellation_token.is_cancelled:
-            for token in tokens:
-                sink.push(Reply(token_sample(token, alive=True)))
-        sink.close()
-        return seen
+        self.undeclare_if_declared()
 
 
 class CancellationToken:
@@ -234,14 +163,11 @@ class CancellationToken:
     def cancel(self) -> None:
         """End the queries that have it, now and later."""
         self._is_cancelled = True
-        for asking in self._askings:
+        askings, self._askings = self._askings, []
+        for asking in askings:
             asking.cancel()
-        self._askings.clear()
 
-    @property
-    def is_cancelled(self) -> bool:
-        """Whether `cancel` was called."""
-        return self._is_cancelled
+    is_cancelled = property(lambda self: self._is_cancelled)
 
     def add(self, asking: Asking) -> None:
         """Have it end a query."""
@@ -250,265 +176,112 @@ class CancellationToken:
             self.cancel()
 
 
-class Query:
-    """A query at a queryable; it is concluded once it is dropped, or discarded."""
+class Liveliness:
+    """Tokens of a session, and of others."""
 
-    def __init__(self, asking: Asking, entity: Entity) -> None:
-        self._asking = asking
-        self._entity = entity
-        self._is_open = True
+    def __init__(self, session: Session) -> None:
+        self._session = session
 
-    def __enter__(self) -> Query:
-        return self
+    def declare_token(self, key_expr: Any) -> LivelinessToken:
+        """Declare a token, which is there until it is undeclared or discarded."""
+        return LivelinessToken(self._session, key_expr)
 
-    def __exit__(self, *_args: object, **_kwargs: object) -> None:
-        self.drop()
+    def declare_subscriber(self, key_expr: Any, handler: Any = None, *, history: bool | None = None) -> Watcher:
+        """Declare a subscriber that is told of tokens, with `history` also of those that are there."""
+        return Watcher(self._session, key_expr, handler, history)
 
-    def __del__(self) -> None:
-        self.drop()
-
-    @property
-    def selector(self) -> zenoh.Selector:
-        """The selector."""
-        return zenoh.Selector(self._asking.key, str(self._asking.parameters))
-
-    @property
-    def key_expr(self) -> zenoh.KeyExpr:
-        """The key expression."""
-        return self._asking.key
-
-    @property
-    def parameters(self) -> zenoh.Parameters:
-        """The parameters."""
-        return zenoh.Parameters(str(self._asking.parameters))
-
-    @property
-    def payload(self) -> zenoh.ZBytes | None:
-        """The payload."""
-        return self._asking.payload
-
-    @property
-    def encoding(self) -> zenoh.Encoding | None:
-        """The encoding of the payload."""
-        return self._asking.encoding
-
-    @property
-    def attachment(self) -> zenoh.ZBytes | None:
-        """The attachment."""
-        return self._asking.attachment
-
-    @property
-    def source_info(self) -> SourceInfo | None:
-        """Who asks, if it says so."""
-        return self._asking.source_info
-
-    @property
-    def timestamp_stack(self) -> None:
-        """None: instrumentation of timestamps is refused."""
-        return
-
-    def accepts_replies(self) -> zenoh.ReplyKeyExpr:
-        """Return which keys replies may have."""
-        any_key = self._asking.takes_any_key
-        return zenoh.ReplyKeyExpr.ANY if any_key else zenoh.ReplyKeyExpr.MATCHING_QUERY
-
-    def reply(
+    def get(
         self,
         key_expr: Any,
-        payload: Any,
+        handler: Any = None,
         *,
-        encoding: Any = None,
-        congestion_control: Any = None,
-        priority: Any = None,
-        express: bool | None = None,
-        attachment: Any = None,
-        timestamp: zenoh.Timestamp | None = None,
-    ) -> None:
-        """Reply with a sample. Raises ZError for a key that the query does not match."""
-        self._reply(PUT, key_expr, _bytes(payload), _encoding(encoding), express, attachment, timestamp)
-
-    def reply_del(
-        self,
-        key_expr: Any,
-        *,
-        congestion_control: Any = None,
-        priority: Any = None,
-        express: bool | None = None,
-        attachment: Any = None,
-        timestamp: zenoh.Timestamp | None = None,
-    ) -> None:
-        """Reply that a key is deleted. Raises ZError for a key that the query does not match."""
-        self._reply(DELETE, key_expr, _NOTHING, _NO_ENCODING, express, attachment, timestamp)
-
-    def reply_err(self, payload: Any, *, encoding: Any = None) -> None:
-        """Reply with an error."""
-        self._check_open()
-        self._asking.reply(Reply(ReplyError(_bytes(payload), _encoding(encoding)), self._replier()))
-
-    def reply_sample(self, sample: Sample) -> None:
-        """Reply with a sample that has been published, as caches do."""
-        self._check_open()
-        self._asking.reply(Reply(sample, self._replier()))
-
-    def _reply(
-        self, kind: Any, key: Any, payload: zenoh.ZBytes, encoding: Any, express: Any, attachment: Any, time: Any
-    ) -> None:
-        self._check_open()
-        key_expr = _key(key)
-        asking = self._asking
-        if not asking.takes_any_key and not asking.key.intersects(key_expr):
-            raise zenoh.ZError(
-                f"Attempted to reply on `{key_expr}`, which does not intersect with query `{asking.key}`"
-            )
-        sample = Sample(
-            key_expr,
-            payload,
-            kind,
-            encoding,
-            time,
-            asking.congestion_control,
-            asking.priority,
-            asking.express if express is None else express,
-            _bytes_or_none(attachment),
-        )
-        asking.reply(Reply(sample, self._replier()))
-
-    def _replier(self) -> EntityGlobalId:
-        return EntityGlobalId(self._entity.session.zid(), self._entity.eid)
-
-    def _check_open(self) -> None:
-        if not self._is_open:
-            raise zenoh.ZError("the query has been dropped")
-
-    def drop(self) -> None:
-        """Conclude it: no more replies come from here."""
-        if self._is_open:
-            self._is_open = False
-            self._asking.done()
-
-    def __str__(self) -> str:
-        return str(self.selector)
+        timeout: float | int | None = None,
+        cancellation_token: CancellationToken | None = None,
+    ) -> Any:
+        """Get the tokens that are there: those of other vehicles as far as they have been heard."""
+        self._session.check_open()
+        sink, seen, _ = sink_of(handler, self._session.outlet)
+        if cancellation_token is None or not cancellation_token.is_cancelled:
+            for token in self._session.vehicle.tokens(key_of(key_expr)):
+                sink.push(Reply(token_sample(token, alive=True)))
+        sink.close()
+        return seen
 
 
 class MatchingListener(Listening):
     """A listener that is told whether there is anybody at the other end."""
 
     def __init__(self, owner: Publisher | Querier, handler: Any) -> None:
-        session = owner._session
-        sink, self._handler, self._is_background = sink_of(handler, session.outlet)
-        self._owner, self._sink = owner, sink
-        self._matching = False
+        session = owner.session
+        self._sink, self.handler, self._is_background = sink_of(handler, session.outlet)
+        self._owner, self._matching = owner, False
+        self._end = partial(session.vehicle.on_matching.remove, self._look)
+        self._is_declared = True
         session.vehicle.on_matching.append(self._look)
         self._look()
 
     def _look(self) -> None:
-        matching = self._owner.matching_status.matching
-        if matching != self._matching:
-            self._matching = matching
-            self._sink.push(MatchingStatus(matching))
-
-    def _end_of(self) -> None:
-        self._owner._session.vehicle.on_matching.remove(self._look)
-        self._sink.close()
+        status: MatchingStatus = self._owner.matching_status
+        if status.matching != self._matching:
+            self._matching = status.matching
+            self._sink.push(status)
 
 
 class Publisher(Declared):
     """A publisher."""
 
-    def __init__(self, session: Session, key: Any, options: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        key: Any,
+        *,
+        encoding: Any = None,
+        congestion_control: zenoh.CongestionControl | None = None,
+        priority: zenoh.Priority | None = None,
+        express: bool | None = None,
+        reliability: zenoh.Reliability | None = None,
+        allowed_destination: zenoh.Locality | None = None,
+    ) -> None:
         session.check_open()
-        self._session = session
-        self._key = _key(key)
-        self._eid = next(session.entity_numbers)
-        self._encoding = _encoding(options["encoding"])
-        self._congestion_control = options["congestion_control"] or zenoh.CongestionControl.DEFAULT
-        self._priority = options["priority"] or zenoh.Priority.DEFAULT
-        self._express = bool(options["express"])
-        self._reliability = options["reliability"] or zenoh.Reliability.RELIABLE
-        self._destination = options["allowed_destination"]
-        session.publishers.append(self)
+        self.session = session
+        self.key_expr = key_of(key)
+        self.id = EntityGlobalId(session.zid(), next(session.entity_numbers))
+        self.encoding = encoding_of(encoding)
+        self.congestion_control = congestion_control or zenoh.CongestionControl.DEFAULT
+        self.priority = priority or zenoh.Priority.DEFAULT
+        self.reliability = reliability or zenoh.Reliability.RELIABLE
+        self._qos: dict[str, Any] = {
+            "congestion_control": self.congestion_control,
+            "priority": self.priority,
+            "express": express,
+            "allowed_destination": allowed_destination,
+        }
+        self._is_declared = True
 
-    @property
-    def id(self) -> EntityGlobalId:
-        """The id of the publisher."""
-        return EntityGlobalId(self._session.zid(), self._eid)
-
-    @property
-    def key_expr(self) -> zenoh.KeyExpr:
-        """The key expression."""
-        return self._key
-
-    @property
-    def encoding(self) -> zenoh.Encoding:
-        """The encoding of samples that say none."""
-        return self._encoding
-
-    @property
-    def congestion_control(self) -> zenoh.CongestionControl:
-        """The congestion control of its samples."""
-        return self._congestion_control
-
-    @property
-    def priority(self) -> zenoh.Priority:
-        """The priority of its samples."""
-        return self._priority
-
-    @property
-    def reliability(self) -> zenoh.Reliability:
-        """The reliability that was asked for; the radio has its own."""
-        return self._reliability
+    key_expr: zenoh.KeyExpr
+    id: EntityGlobalId
+    encoding: zenoh.Encoding
+    congestion_control: zenoh.CongestionControl
+    priority: zenoh.Priority
+    reliability: zenoh.Reliability
 
     @property
     def matching_status(self) -> MatchingStatus:
         """Whether anybody may take its samples."""
-        return MatchingStatus(self._session.vehicle.matches_subscriber(self._key))
+        return MatchingStatus(self.session.vehicle.matches_subscriber(self.key_expr))
 
-    def put(
-        self,
-        payload: Any,
-        *,
-        encoding: Any = None,
-        attachment: Any = None,
-        timestamp: zenoh.Timestamp | None = None,
-        timestamp_instrumentation: object = None,
-        source_info: SourceInfo | None = None,
-    ) -> None:
+    def put(self, payload: Any, *, encoding: Any = None, **options: Any) -> None:
         """Put a sample."""
-        _refuse_instrumentation(timestamp_instrumentation)
-        self._put(PUT, _bytes(payload), _encoding(encoding, self._encoding), attachment, timestamp, source_info)
+        self._publish(PUT, payload, encoding=encoding_of(encoding, self.encoding), **options)
 
-    def delete(
-        self,
-        *,
-        attachment: Any = None,
-        timestamp: zenoh.Timestamp | None = None,
-        timestamp_instrumentation: object = None,
-        source_info: SourceInfo | None = None,
-    ) -> None:
+    def delete(self, **options: Any) -> None:
         """Delete the key."""
-        _refuse_instrumentation(timestamp_instrumentation)
-        self._put(DELETE, _NOTHING, _NO_ENCODING, attachment, timestamp, source_info)
+        self._publish(DELETE, NOTHING, **options)
 
-    def _put(
-        self, kind: Any, payload: zenoh.ZBytes, encoding: zenoh.Encoding, attachment: Any, time: Any, source: Any
-    ) -> Sample:
+    def _publish(self, kind: zenoh.SampleKind, payload: Any, **options: Any) -> Sample:
         if not self._is_declared:
             raise zenoh.ZError("Undeclared Publisher")
-        self._session.check_open()
-        sample = Sample(
-            self._key,
-            payload,
-            kind,
-            encoding,
-            time or self._session.stamp(),
-            self._congestion_control,
-            self._priority,
-            self._express,
-            _bytes_or_none(attachment),
-            source,
-        )
-        self._session.send(sample, self._destination)
-        return sample
+        return self.session.publish(kind, self.key_expr, payload, **self._qos, **options)
 
     def declare_matching_listener(self, handler: Any = None) -> MatchingListener:
         """Declare a listener that is told whether anybody may take its samples."""
@@ -518,61 +291,38 @@ class Publisher(Declared):
 class Querier(Declared):
     """A querier."""
 
-    def __init__(self, session: Session, key: Any, options: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        key: Any,
+        *,
+        target: zenoh.QueryTarget | None = None,
+        accept_replies: zenoh.ReplyKeyExpr | None = None,
+        **options: Any,
+    ) -> None:
         session.check_open()
-        self._session = session
-        self._key = _key(key)
-        self._eid = next(session.entity_numbers)
-        self._options = options
+        self.session = session
+        self.key_expr = key_of(key)
+        self.id = EntityGlobalId(session.zid(), next(session.entity_numbers))
+        self.accept_replies = accept_replies or zenoh.ReplyKeyExpr.DEFAULT
+        self._complete = target == zenoh.QueryTarget.ALL_COMPLETE
+        self._options = {**options, "target": target, "accept_replies": accept_replies}
+        self._is_declared = True
 
-    @property
-    def id(self) -> EntityGlobalId:
-        """The id of the querier."""
-        return EntityGlobalId(self._session.zid(), self._eid)
-
-    @property
-    def key_expr(self) -> zenoh.KeyExpr:
-        """The key expression."""
-        return self._key
-
-    @property
-    def accept_replies(self) -> zenoh.ReplyKeyExpr:
-        """Which keys replies may have."""
-        return self._options["accept_replies"] or zenoh.ReplyKeyExpr.DEFAULT
+    key_expr: zenoh.KeyExpr
+    id: EntityGlobalId
+    accept_replies: zenoh.ReplyKeyExpr
 
     @property
     def matching_status(self) -> MatchingStatus:
         """Whether anybody may answer."""
-        complete = self._options["target"] == zenoh.QueryTarget.ALL_COMPLETE
-        return MatchingStatus(self._session.vehicle.matches_queryable(self._key, complete))
+        return MatchingStatus(self.session.vehicle.matches_queryable(self.key_expr, self._complete))
 
-    def get(
-        self,
-        handler: Any = None,
-        *,
-        parameters: Any = None,
-        payload: Any = None,
-        encoding: Any = None,
-        attachment: Any = None,
-        source_info: SourceInfo | None = None,
-        cancellation_token: CancellationToken | None = None,
-        timestamp_instrumentation: object = None,
-    ) -> Any:
+    def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
         """Ask for replies."""
         if not self._is_declared:
             raise zenoh.ZError("Undeclared Querier")
-        selector = zenoh.Selector(self._key, parameters)
-        return self._session.get(
-            selector,
-            handler,
-            payload=payload,
-            encoding=encoding,
-            attachment=attachment,
-            source_info=source_info,
-            cancellation_token=cancellation_token,
-            timestamp_instrumentation=timestamp_instrumentation,
-            **self._options,
-        )
+        return self.session.get(zenoh.Selector(self.key_expr, parameters), handler, **self._options, **options)
 
     def declare_matching_listener(self, handler: Any = None) -> MatchingListener:
         """Declare a listener that is told whether anybody may answer."""
@@ -597,17 +347,11 @@ class SessionInfo:
         """Return none: a vehicle has no peers."""
         return []
 
-    def transports(self) -> list[Any]:
-        """Return none: a session of the emulator has no transport."""
-        return []
-
-    def links(self) -> list[Any]:
-        """Return none, as `transports`."""
-        return []
+    transports = links = peers_zid
 
     def declare_transport_events_listener(self, handler: Any = None, *, history: bool | None = None) -> Any:
         """Refuse. Raises ZError."""
-        raise zenoh.ZError("transport events are not available on virtual time: sessions have no transport")
+        raise zenoh.ZError("events of transports are not available on virtual time: sessions have no transport")
 
     declare_link_events_listener = declare_transport_events_listener
 
@@ -616,16 +360,15 @@ class Session:
     """A session."""
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, config: zenoh.Config) -> None:
-        self.vehicle = vehicle
-        self.outlet = outlet
+        self.vehicle, self.outlet = vehicle, outlet
         self.entity_numbers = count(1)
-        self.publishers: list[Publisher] = []
         self._zid = vehicle.new_zid()
         self._is_closed = False
-        self._entities: list[tuple[str, Entity]] = []
         self._at_close: list[Callable[[], object]] = []
-        self._stamps = stamps_own(config)
-        vehicle.sessions.append(self)
+        enabled = msgspec.json.decode(config.get_json("timestamping/enabled"))
+        mode = msgspec.json.decode(config.get_json("mode")) or "peer"
+        self.stamps = bool(enabled.get(mode) if isinstance(enabled, dict) else enabled)
+        """Whether its samples have timestamps of its own."""
 
     def __enter__(self) -> Session:
         return self
@@ -633,15 +376,8 @@ class Session:
     def __exit__(self, *_args: object, **_kwargs: object) -> None:
         self.close()
 
-    @property
-    def info(self) -> SessionInfo:
-        """What the session knows of its surroundings."""
-        return SessionInfo(self)
-
-    @property
-    def id(self) -> EntityGlobalId:
-        """The session's id as that of an entity."""
-        return EntityGlobalId(self._zid, 0)
+    info = property(SessionInfo)
+    id = property(lambda self: EntityGlobalId(self._zid, 0))
 
     def zid(self) -> ZenohId:
         """Return the session's id."""
@@ -649,14 +385,10 @@ class Session:
 
     def close(self) -> None:
         """Undeclare all that the session has declared."""
-        if self._is_closed:
-            return
-        for end in self._at_close:
-            end()
-        for kind, entity in self._entities:
-            self.vehicle.undeclare(kind, entity)
-        self._is_closed = True
-        self.vehicle.sessions.remove(self)
+        if not self._is_closed:
+            for end in self._at_close:
+                end()
+            self._is_closed = True
 
     def is_closed(self) -> bool:
         """Return whether it has been closed."""
@@ -669,7 +401,7 @@ class Session:
 
     def declare(self, kind: str, entity: Entity) -> None:
         """Declare an entity, until the session is closed."""
-        self._entities.append((kind, entity))
+        self.at_close(partial(self.vehicle.undeclare, kind, entity))
         self.vehicle.declare(kind, entity)
 
     def at_close(self, end: Callable[[], object]) -> None:
@@ -683,21 +415,22 @@ class Session:
         """Return the present time by the vehicle's clock."""
         return self.vehicle.new_timestamp(self._zid)
 
-    def stamp(self) -> zenoh.Timestamp | None:
-        """Return the timestamp of a sample that has none, if the session's configuration asks for one."""
-        return self.new_timestamp() if self._stamps else None
-
     def declare_keyexpr(self, key_expr: Any) -> zenoh.KeyExpr:
         """Return the key expression."""
-        return _key(key_expr)
+        return key_of(key_expr)
 
-    def send(self, sample: Sample, destination: zenoh.Locality | None) -> None:
+    def put(self, key_expr: Any, payload: Any, **options: Any) -> None:
         """Put a sample."""
-        self.vehicle.put(self, sample, destination != REMOTE, destination != LOCAL)
+        self.publish(PUT, key_expr, payload, **options)
 
-    def put(
+    def delete(self, key_expr: Any, **options: Any) -> None:
+        """Delete a key."""
+        self.publish(DELETE, key_expr, NOTHING, **options)
+
+    def publish(
         self,
-        key_expr: Any,
+        kind: zenoh.SampleKind,
+        key: Any,
         payload: Any,
         *,
         encoding: Any = None,
@@ -709,53 +442,24 @@ class Session:
         timestamp_instrumentation: object = None,
         allowed_destination: zenoh.Locality | None = None,
         source_info: SourceInfo | None = None,
-    ) -> None:
-        """Put a sample."""
-        _refuse_instrumentation(timestamp_instrumentation)
+    ) -> Sample:
+        """Put or delete a sample, and return it."""
+        _refuse(timestamp_instrumentation=timestamp_instrumentation)
         self.check_open()
         sample = Sample(
-            _key(key_expr),
-            _bytes(payload),
-            PUT,
-            _encoding(encoding),
-            timestamp or self.stamp(),
+            key_of(key),
+            zbytes_of(payload),
+            kind,
+            encoding_of(encoding) if kind == PUT else NO_ENCODING,
+            self.new_timestamp() if timestamp is None and self.stamps else timestamp,
             congestion_control or zenoh.CongestionControl.DEFAULT,
             priority or zenoh.Priority.DEFAULT,
             bool(express),
-            _bytes_or_none(attachment),
+            bytes_or_none(attachment),
             source_info,
         )
-        self.send(sample, allowed_destination)
-
-    def delete(
-        self,
-        key_expr: Any,
-        *,
-        congestion_control: zenoh.CongestionControl | None = None,
-        priority: zenoh.Priority | None = None,
-        express: bool | None = None,
-        attachment: Any = None,
-        timestamp: zenoh.Timestamp | None = None,
-        timestamp_instrumentation: object = None,
-        allowed_destination: zenoh.Locality | None = None,
-        source_info: SourceInfo | None = None,
-    ) -> None:
-        """Delete a key."""
-        _refuse_instrumentation(timestamp_instrumentation)
-        self.check_open()
-        sample = Sample(
-            _key(key_expr),
-            _NOTHING,
-            DELETE,
-            _NO_ENCODING,
-            timestamp or self.stamp(),
-            congestion_control or zenoh.CongestionControl.DEFAULT,
-            priority or zenoh.Priority.DEFAULT,
-            bool(express),
-            _bytes_or_none(attachment),
-            source_info,
-        )
-        self.send(sample, allowed_destination)
+        self.vehicle.put(self, sample, allowed_destination != REMOTE, allowed_destination != LOCAL)
+        return sample
 
     def get(
         self,
@@ -778,10 +482,10 @@ class Session:
         cancellation_token: CancellationToken | None = None,
     ) -> Any:
         """Ask for replies."""
-        _refuse_instrumentation(timestamp_instrumentation)
+        _refuse(timestamp_instrumentation=timestamp_instrumentation)
         self.check_open()
         sink, seen, _ = sink_of(handler, self.outlet)
-        selector = zenoh.Selector(selector) if not isinstance(selector, zenoh.Selector) else selector
+        selector = selector if isinstance(selector, zenoh.Selector) else zenoh.Selector(selector)
         if accept_replies == zenoh.ReplyKeyExpr.ANY and ANY_KEY not in selector.parameters:
             rest = str(selector.parameters)
             selector = zenoh.Selector(selector.key_expr, f"{rest};{ANY_KEY}" if rest else ANY_KEY)
@@ -793,9 +497,9 @@ class Session:
             sink.close,
             target=target or zenoh.QueryTarget.DEFAULT,
             consolidation=consolidation or zenoh.ConsolidationMode.AUTO,
-            payload=_bytes_or_none(payload),
-            encoding=_encoding(encoding) if payload is not None or encoding is not None else None,
-            attachment=_bytes_or_none(attachment),
+            payload=bytes_or_none(payload),
+            encoding=None if payload is None and encoding is None else encoding_of(encoding),
+            attachment=bytes_or_none(attachment),
             source_info=source_info,
             congestion_control=congestion_control or zenoh.CongestionControl.BLOCK,
             priority=priority or zenoh.Priority.DATA,
@@ -804,82 +508,41 @@ class Session:
         asking.expire_after(QUERY_TIMEOUT_S if timeout is None else timeout)
         if cancellation_token is not None:
             cancellation_token.add(asking)
-            if asking.is_over:
-                return seen
-        self.vehicle.ask(asking, self, allowed_destination != REMOTE, allowed_destination != LOCAL)
+        if not asking.is_over:
+            self.vehicle.ask(asking, self, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return seen
 
-    def declare_subscriber(
-        self, key_expr: Any, handler: Any = None, *, allowed_origin: zenoh.Locality | None = None
-    ) -> Subscriber:
+    def declare_subscriber(self, key_expr: Any, handler: Any = None, **options: Any) -> Subscriber:
         """Declare a subscriber."""
-        return Subscriber(self, key_expr, handler, allowed_origin)
+        return Subscriber(self, key_expr, handler, **options)
 
-    def declare_queryable(
-        self,
-        key_expr: Any,
-        handler: Any = None,
-        *,
-        complete: bool | None = None,
-        allowed_origin: zenoh.Locality | None = None,
-    ) -> Queryable:
+    def declare_queryable(self, key_expr: Any, handler: Any = None, **options: Any) -> Queryable:
         """Declare a queryable."""
-        return Queryable(self, key_expr, handler, allowed_origin, bool(complete))
+        return Queryable(self, key_expr, handler, **options)
 
-    def declare_publisher(
-        self,
-        key_expr: Any,
-        *,
-        encoding: Any = None,
-        congestion_control: zenoh.CongestionControl | None = None,
-        priority: zenoh.Priority | None = None,
-        express: bool | None = None,
-        reliability: zenoh.Reliability | None = None,
-        allowed_destination: zenoh.Locality | None = None,
-    ) -> Publisher:
+    def declare_publisher(self, key_expr: Any, **options: Any) -> Publisher:
         """Declare a publisher."""
-        options = locals()
-        return Publisher(self, key_expr, options)
+        return Publisher(self, key_expr, **options)
 
-    def declare_querier(
-        self,
-        key_expr: Any,
-        *,
-        target: zenoh.QueryTarget | None = None,
-        consolidation: Any = None,
-        accept_replies: zenoh.ReplyKeyExpr | None = None,
-        timeout: float | int | None = None,
-        congestion_control: zenoh.CongestionControl | None = None,
-        priority: zenoh.Priority | None = None,
-        express: bool | None = None,
-        allowed_destination: zenoh.Locality | None = None,
-    ) -> Querier:
+    def declare_querier(self, key_expr: Any, **options: Any) -> Querier:
         """Declare a querier."""
-        options = {name: value for name, value in locals().items() if name not in ("self", "key_expr")}
-        return Querier(self, key_expr, options)
+        return Querier(self, key_expr, **options)
 
     def liveliness(self) -> Liveliness:
         """Return what has tokens."""
         return Liveliness(self)
 
 
-def stamps_own(config: zenoh.Config) -> bool:
-    """Return whether a configuration has its session give timestamps."""
-    enabled = msgspec.json.decode(config.get_json("timestamping/enabled"))
-    mode = msgspec.json.decode(config.get_json("mode")) or "peer"
-    return bool(enabled.get(mode) if isinstance(enabled, dict) else enabled)
-
-
 class Scout(Listening):
     """Scouting, which finds the vehicle's router."""
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, handler: Any, what: Any) -> None:
-        sink, self._handler, self._is_background = sink_of(handler, outlet)
-        self._end_of = sink.close
+        sink, self.handler, self._is_background = sink_of(handler, outlet)
+        self._end, self._is_declared = sink.close, True
         matcher = what if isinstance(what, zenoh.WhatAmIMatcher) else zenoh.WhatAmIMatcher(what or "router|peer")
         if matcher.matches(zenoh.WhatAmI.ROUTER):
             sink.push(Hello(zenoh.WhatAmI.ROUTER, vehicle.zid, []))
 
     def stop(self) -> None:
         """Stop scouting."""
-        self.undeclare()
+        self.undeclare_if_declared()

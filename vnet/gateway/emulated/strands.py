@@ -58,7 +58,7 @@ class Strand(greenlet):
 def drive(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
     """Run a strand that waits for `item` to its end, and return its result."""
     note_greenlet(strand)
-    while not strand.dead:
+    while not strand.dead and item is not IDLE:
         try:
             value = yield item
         except GeneratorExit:
@@ -71,6 +71,17 @@ def drive(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
     if isinstance(item, GreenletExit):
         raise asyncio.CancelledError
     return item
+
+
+IDLE = object()
+"""What a strand waits for that has nothing to do until `begin` is called again."""
+
+
+def idle() -> None:
+    """Have the present strand do nothing until `begin` is called again."""
+    parent = getcurrent().parent
+    assert parent is not None
+    parent.switch(IDLE)
 
 
 async def run_strand(strand: Strand) -> Any:

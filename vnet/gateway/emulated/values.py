@@ -8,14 +8,13 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextvars import copy_context
 from functools import lru_cache
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import msgspec
 import zenoh
-from greenlet import GreenletExit
 from zenoh.handlers import Callback
 
-from vnet.gateway.emulated.strands import Strand, block_on, drive, fail
+from vnet.gateway.emulated.strands import IDLE, Strand, block_on, drive, fail, idle
 from vnet.gateway.frames import CrossingReply, CrossingSample
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
@@ -79,10 +78,7 @@ class Sample(_Value, frozen=True, eq=False, gc=False):
     attachment: zenoh.ZBytes | None = None
     source_info: SourceInfo | None = None
 
-    @property
-    def timestamp_stack(self) -> None:
-        """None: instrumentation of timestamps is refused."""
-        return
+    timestamp_stack: ClassVar[None] = None
 
 
 class ReplyError(_Value, frozen=True, eq=False, gc=False):
@@ -91,10 +87,7 @@ class ReplyError(_Value, frozen=True, eq=False, gc=False):
     payload: zenoh.ZBytes
     encoding: zenoh.Encoding
 
-    @property
-    def timestamp_stack(self) -> None:
-        """None: instrumentation of timestamps is refused."""
-        return
+    timestamp_stack: ClassVar[None] = None
 
 
 class Reply(_Value, frozen=True, eq=False, gc=False):
@@ -195,13 +188,38 @@ def name_of(member: zenoh.Priority | zenoh.CongestionControl) -> Any:
     return str(member).rpartition(".")[2]
 
 
-@lru_cache(maxsize=1024)
-def key_of(text: str) -> zenoh.KeyExpr:
-    """Return a key expression. Raises ZError."""
-    return zenoh.KeyExpr(text)
+PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
+NOTHING = zenoh.ZBytes(b"")
+NO_ENCODING = zenoh.Encoding.ZENOH_BYTES
+_key = lru_cache(maxsize=1024)(zenoh.KeyExpr)
+_encoding = lru_cache(maxsize=256)(zenoh.Encoding)
 
 
-encoding_of = lru_cache(maxsize=256)(zenoh.Encoding)
+def key_of(key: Any) -> zenoh.KeyExpr:
+    """Return what a program has given as a key expression as one. Raises ZError."""
+    return key if isinstance(key, zenoh.KeyExpr) else _key(key)
+
+
+def encoding_of(encoding: Any, default: zenoh.Encoding = NO_ENCODING) -> zenoh.Encoding:
+    """Return what a program has given as an encoding as one."""
+    if encoding is None:
+        return default
+    return encoding if isinstance(encoding, zenoh.Encoding) else _encoding(encoding)
+
+
+def zbytes_of(content: Any) -> zenoh.ZBytes:
+    """Return what a program has given as a payload as one."""
+    return content if isinstance(content, zenoh.ZBytes) else zenoh.ZBytes(content)
+
+
+def bytes_or_none(content: Any) -> zenoh.ZBytes | None:
+    """Return the same, None for None."""
+    return None if content is None else zbytes_of(content)
+
+
+def token_sample(key: zenoh.KeyExpr, alive: bool) -> Sample:
+    """Return the sample that says that a token has come or gone."""
+    return Sample(key, NOTHING, PUT if alive else DELETE, NO_ENCODING)
 
 
 def sample_of(crossing: CrossingSample) -> Sample:
@@ -323,6 +341,7 @@ class CallbackSink:
         self._outlet = outlet
         self._number = outlet.new_number()
         self._context = copy_context()
+        self._strand: Strand | None = None
         self._items: deque[Any] = deque()
         self._runs = self._closed = False
 
@@ -331,7 +350,7 @@ class CallbackSink:
         self._items.append(item)
         if not self._runs:
             self._runs = True
-            self._outlet.soon(self)
+            self._outlet.due.soon(self)
 
     def close(self) -> None:
         """Call the callback no more, once it has had all."""
@@ -339,30 +358,32 @@ class CallbackSink:
             self._closed = True
             if self._drop is not None and not self._runs:
                 self._runs = True
-                self._outlet.soon(self)
+                self._outlet.due.soon(self)
 
     def run(self) -> None:
         """Call the callback until it blocks; then a task goes on with it."""
-        strand = Strand(self._work, self._number, context=self._context)
+        strand = self._strand
+        if strand is None:
+            strand = self._strand = Strand(self._work, self._number, context=self._context)
         item = strand.begin()
-        if not strand.dead:
+        if item is not IDLE:
             Task(_go_on(strand, item), loop=asyncio.get_running_loop(), name=f"thread {self._number}")
 
     def _work(self) -> None:
-        try:
+        while True:  # a strand costs ten times what a switch does
             while self._items:
                 self._call(self._callback, self._items.popleft())
             if self._closed and self._drop is not None:
                 drop, self._drop = self._drop, None
                 self._call(drop)
-        finally:
             self._runs = False
+            idle()
 
     def _call(self, function: Callable[..., Any], *args: Any) -> None:
         try:
             function(*args)
-        except GreenletExit:
-            raise
+        except SystemExit:
+            pass  # it ends a thread, and a callback at most
         except Exception as error:
             fail(error, "in a callback of Zenoh")
 
@@ -371,16 +392,17 @@ async def _go_on(strand: Strand, item: Any) -> None:
     await drive(strand, item)
 
 
-class Outlet:
-    """What has callbacks of a vehicle run, in the order in which they became due."""
+class DueCallbacks:
+    """Callbacks of a vehicle that are due, which run in the order in which they became so."""
 
-    def __init__(self, new_number: Callable[[], int]) -> None:
-        self.new_number = new_number
+    def __init__(self) -> None:
         self._due: list[CallbackSink] = []
+        self.is_held = False
+        """Whether `run` will be called, as what is due comes by the radio."""
 
     def soon(self, sink: CallbackSink) -> None:
         """Have a callback run once the present code has blocked or returned."""
-        if not self._due:
+        if not self._due and not self.is_held:
             asyncio.get_running_loop().call_soon(self.run)
         self._due.append(sink)
 
@@ -391,10 +413,15 @@ class Outlet:
             sink.run()
 
 
-Sink = Handler | CallbackSink
+class Outlet(NamedTuple):
+    """Where items for a program go."""
+
+    due: DueCallbacks
+    new_number: Callable[[], int]
+    """Numbers the program's threads."""
 
 
-def sink_of(handler: Any, outlet: Outlet) -> tuple[Sink, Any, bool]:
+def sink_of(handler: Any, outlet: Outlet) -> tuple[Handler | CallbackSink, Any, bool]:
     """Return where items go, the handler that the program sees, and whether they go to a callback alone.
 
     Raises ValueError for what is no handler.

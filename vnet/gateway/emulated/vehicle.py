@@ -9,28 +9,29 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import zenoh
 
 from vnet.errors import VnetError
 from vnet.gateway.emulated.modules import EPOCH_NS
+from vnet.gateway.emulated.queries import Asking, Entity, Owner
 from vnet.gateway.emulated.values import (
+    NO_ENCODING,
+    PUT,
+    DueCallbacks,
     Reply,
-    ReplyError,
     Sample,
-    Sink,
-    SourceInfo,
     ZenohId,
     crossing_of,
     key_of,
     result_of,
     sample_of,
     timestamp_at,
+    token_sample,
 )
 from vnet.gateway.frames import (
     CrossingQuery,
@@ -44,39 +45,15 @@ from vnet.gateway.frames import (
     decode_fragment,
     decode_message,
 )
-from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY
 from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
-from vnet.node import Node
+from vnet.node import Fix, Node
+from vnet.radio import Packet
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
-if TYPE_CHECKING:
-    from vnet.gateway.emulated.sessions import Query, Session
-
 MOST_KEYS = 4096
 """Keys of samples for which it is remembered where they go."""
-LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
-ANY_KEY = "_anyke"
-"""Parameter of queries to which replies with any key are accepted."""
-_NOTHING = zenoh.ZBytes(b"")
-_NO_ENCODING = zenoh.Encoding.ZENOH_BYTES
-
-
-@dataclass(eq=False)
-class Entity:
-    """A subscriber, a queryable, a token or a subscriber of tokens of a session."""
-
-    session: Session
-    key: zenoh.KeyExpr
-    sink: Sink | None = None
-    is_local: bool = True
-    """Whether it takes what its own session puts."""
-    is_remote: bool = True
-    """Whether it takes what comes from elsewhere."""
-    is_complete: bool = False
-    eid: int = 0
-    told: set[str] = field(default_factory=set)
-    """Keys of living tokens of which a subscriber of tokens has been told."""
 
 
 class Vehicle:
@@ -85,17 +62,23 @@ class Vehicle:
     def __init__(self, node: Node, keys: Sequence[str], query_s: float, liveliness_s: float) -> None:
         self.node = node
         self.zid = ZenohId.of(node.id, node.incarnation, "router")
-        self.sessions: list[Session] = []
         self._keys = [zenoh.KeyExpr(key) for key in keys]
         self._query_s, self._liveliness_s = query_s, liveliness_s
         self._loop = asyncio.get_running_loop()
         self._fragments = Fragments(node.radio.max_payload)
         self._reassembly = Reassembly()
+        self.due = DueCallbacks()
         self._subscribers: list[Entity] = []
         self._queryables: list[Entity] = []
         self._tokens: list[Entity] = []
         self._watchers: list[Entity] = []
         """Subscribers of tokens."""
+        self._entities = {
+            "subscriber": self._subscribers,
+            "queryable": self._queryables,
+            "token": self._tokens,
+            "watcher": self._watchers,
+        }
         self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * liveliness_s * NS_PER_S))
         self._has_tokens = asyncio.Event()
         self._takers: dict[str, list[Entity]] = {}
@@ -119,7 +102,7 @@ class Vehicle:
 
     def declare(self, kind: str, entity: Entity) -> None:
         """Add a subscriber, a queryable, a token or a subscriber of tokens ("watcher")."""
-        self._entities(kind).append(entity)
+        self._entities[kind].append(entity)
         if kind != "token":
             self._listen()
         if kind == "subscriber" and entity.key.intersects(FIX_KEY):
@@ -130,23 +113,14 @@ class Vehicle:
 
     def undeclare(self, kind: str, entity: Entity) -> None:
         """Remove one; it takes nothing more."""
-        entities = self._entities(kind)
+        entities = self._entities[kind]
         if entity not in entities:
             return
         entities.remove(entity)
-        if entity.sink is not None:
-            entity.sink.close()
+        entity.sink.close()
         self._changed(kind)
         if kind == "token" and not any(str(each.key) == str(entity.key) for each in entities):
             self._token_changed(entity.key, alive=False)
-
-    def _entities(self, kind: str) -> list[Entity]:
-        return {
-            "subscriber": self._subscribers,
-            "queryable": self._queryables,
-            "token": self._tokens,
-            "watcher": self._watchers,
-        }[kind]
 
     def _changed(self, kind: str) -> None:
         if kind in ("subscriber", "queryable"):
@@ -185,13 +159,13 @@ class Vehicle:
                 self._takers[key] = takers
         return takers
 
-    def put(self, session: Session, sample: Sample, to_own: bool, to_others: bool) -> None:
+    def put(self, session: Owner, sample: Sample, to_own: bool, to_others: bool) -> None:
         """Take a sample of a session to its own subscribers, and to all others here and over the radio."""
         key = str(sample.key_expr)
         takers = self._takers_of(key)
         if to_others:
             stamped = sample
-            if sample.timestamp is None and sample.kind == zenoh.SampleKind.PUT:  # as routers do
+            if sample.timestamp is None and sample.kind == PUT:  # as routers do
                 stamped = msgspec.structs.replace(sample, timestamp=self.new_timestamp(self.zid))
             if self.crosses(key):
                 self._send(crossing_of(stamped))
@@ -205,8 +179,7 @@ class Vehicle:
 
     def _deliver(self, entities: list[Entity], sample: Sample) -> None:
         for entity in entities:
-            if entity.sink is not None:
-                entity.sink.push(sample)
+            entity.sink.push(sample)
 
     def _report(self, sample: Sample) -> None:
         try:
@@ -217,7 +190,7 @@ class Vehicle:
 
     # Queries.
 
-    def ask(self, asking: Asking, session: Session | None, to_own: bool, to_others: bool) -> None:
+    def ask(self, asking: Asking, session: Owner | None, to_own: bool, to_others: bool) -> None:
         """Ask the queryables of a session, those of others, and other vehicles; None asks for another vehicle."""
         intersecting = [each for each in self._queryables if each.key.intersects(asking.key)]
         all_complete = asking.target == zenoh.QueryTarget.ALL_COMPLETE
@@ -233,11 +206,11 @@ class Vehicle:
             if crosses:
                 self._ask_by_radio(asking)
             for entity in others:
-                self._loop.call_soon(asking.put_to, entity, asking.begun())
+                self._loop.call_soon(asking.begun().put_to, entity)
         if to_own:
             for entity in intersecting:
                 if entity.session is session and entity.is_local and (entity.is_complete or not all_complete):
-                    asking.put_to(entity, asking.begun())
+                    asking.begun().put_to(entity)
         asking.done()  # of the asking itself
 
     def _ask_by_radio(self, asking: Asking) -> None:
@@ -275,8 +248,6 @@ class Vehicle:
             zenoh.Selector(query.selector),
             reply,
             lambda: None,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
             payload=None if query.payload is None else zenoh.ZBytes(query.payload),
             encoding=None if query.encoding is None else zenoh.Encoding(query.encoding),
             attachment=None if query.attachment is None else zenoh.ZBytes(query.attachment),
@@ -288,6 +259,7 @@ class Vehicle:
 
     def tokens(self, key: zenoh.KeyExpr) -> list[zenoh.KeyExpr]:
         """Return the keys of tokens that are there, each once: this vehicle's first."""
+        self._listen()
         keys = dict.fromkeys(str(each.key) for each in self._tokens) | self._heard_tokens.keys
         return [key_of(each) for each in keys if key_of(each).intersects(key)]
 
@@ -295,8 +267,7 @@ class Vehicle:
         """Tell a new subscriber of tokens which are there."""
         for token in self.tokens(watcher.key):
             watcher.told.add(str(token))
-            if watcher.sink is not None:
-                watcher.sink.push(token_sample(token, alive=True))
+            watcher.sink.push(token_sample(token, alive=True))
 
     def _token_changed(self, key: zenoh.KeyExpr, alive: bool) -> None:
         if self.crosses(str(key)):
@@ -311,8 +282,7 @@ class Vehicle:
         for watcher in self._watchers:
             if watcher.key.intersects(key) and not (alive and text in watcher.told):
                 (watcher.told.add if alive else watcher.told.discard)(text)
-                if watcher.sink is not None:
-                    watcher.sink.push(token_sample(key, alive))
+                watcher.sink.push(token_sample(key, alive))
 
     async def tell_tokens(self) -> None:
         """Tell the tokens again while there are any, and forget those of vehicles that are not heard."""
@@ -330,10 +300,10 @@ class Vehicle:
         keys = {str(each.key) for each in self._tokens}
         self._send(CrossingTokens(tuple(sorted(key for key in keys if self.crosses(key)))))
 
-    def _hear_tokens(self, sender: str, tokens: CrossingTokens) -> None:
+    def _hear_tokens(self, sender: str, tokens: CrossingTokens, heard_ns: int) -> None:
         for text in tokens.keys:
             key_of(text)  # which raises for what is no key
-        for text, alive in self._heard_tokens.hear(sender, tokens.keys, self.node.now_ns):
+        for text, alive in self._heard_tokens.hear(sender, tokens.keys, heard_ns):
             self._tell_watchers(key_of(text), alive)
         self._has_tokens.set()
 
@@ -356,9 +326,9 @@ class Vehicle:
     def _listen(self) -> None:
         """Have the radio's packets wake this vehicle from now on; of what it has heard before tokens count."""
         if not self._hears.is_set():
-            for packet in self.node.radio.drain():
-                self._hear(packet.sender, packet.payload, only_tokens=True)
             self._hears.set()
+            for packet in self.node.radio.drain():
+                self._hear(packet, only_tokens=True)
 
     def tasks(self) -> list[Coroutine[Any, Any, None]]:
         """Return what is to run beside the programs."""
@@ -369,25 +339,27 @@ class Vehicle:
         await self._hears.wait()
         radio = self.node.radio
         while True:
-            packet = await radio.receive()
-            self._hear(packet.sender, packet.payload)
-            for packet in radio.drain():
-                self._hear(packet.sender, packet.payload)
+            packet, self.due.is_held = await radio.receive(), True
+            self._hear(packet)
+            self.due.is_held = False
+            self.due.run()
 
-    def _hear(self, sender: str, payload: bytes, only_tokens: bool = False) -> None:
+    def _hear(self, packet: Packet, only_tokens: bool = False) -> None:
+        sender = packet.sender
         try:
-            heard = _whole(payload)
+            heard = _whole(packet.payload)
             if heard is None:
-                message = self._reassembly.take(sender, payload)
+                message = self._reassembly.take(sender, packet.payload)
                 sample = sample_of(message) if isinstance(message, CrossingSample) else None
             else:
                 message, sample = heard
             if sample is not None and not only_tokens:
-                for entity in self._takers_of(str(sample.key_expr)):
-                    if entity.is_remote and entity.sink is not None:
+                assert isinstance(message, CrossingSample)
+                for entity in self._takers_of(message.key):
+                    if entity.is_remote:
                         entity.sink.push(sample)
             elif isinstance(message, CrossingTokens):
-                self._hear_tokens(sender, message)
+                self._hear_tokens(sender, message, packet.received_ns)
             elif isinstance(message, CrossingQuery) and not only_tokens:
                 self._answer(sender, message)
             elif isinstance(message, CrossingReply):
@@ -405,18 +377,23 @@ class Vehicle:
         async for fix in self.node.gnss:
             sample = Sample(
                 key_of(FIX_KEY),
-                zenoh.ZBytes(fix_content(fix)),
-                zenoh.SampleKind.PUT,
-                _NO_ENCODING,
+                zenoh.ZBytes(msgspec.msgpack.encode(told_of(fix))),
+                PUT,
+                NO_ENCODING,
                 self.new_timestamp(self.zid),
             )
             self._deliver([each for each in self._takers_of(FIX_KEY) if each.is_remote], sample)
 
 
-def token_sample(key: zenoh.KeyExpr, alive: bool) -> Sample:
-    """Return the sample that says that a token has come or gone."""
-    kind = zenoh.SampleKind.PUT if alive else zenoh.SampleKind.DELETE
-    return Sample(key, _NOTHING, kind, _NO_ENCODING)
+def told_of(fix: Fix) -> dict[str, Any]:
+    """Return what programs are told of a fix."""
+    return {
+        "time_ns": fix.time_ns,
+        "position_m": fix.position_m.tolist(),
+        "covariance_m2": fix.covariance_m2.tolist(),
+        "heading_rad": fix.heading_rad,
+        "speed_m_s": fix.speed_m_s,
+    }
 
 
 @lru_cache(maxsize=1024)
@@ -427,119 +404,3 @@ def _whole(payload: bytes) -> tuple[Message, Sample | None] | None:
         return None
     message = decode_message(fragment.content)
     return message, sample_of(message) if isinstance(message, CrossingSample) else None
-
-
-class Asking:
-    """A query on its way: who has been asked and has not concluded yet, and which replies are passed on."""
-
-    def __init__(
-        self,
-        selector: zenoh.Selector,
-        on_reply: Callable[[Reply], object],
-        on_end: Callable[[], object],
-        *,
-        target: zenoh.QueryTarget,
-        consolidation: zenoh.ConsolidationMode,
-        payload: zenoh.ZBytes | None = None,
-        encoding: zenoh.Encoding | None = None,
-        attachment: zenoh.ZBytes | None = None,
-        source_info: SourceInfo | None = None,
-        congestion_control: zenoh.CongestionControl = zenoh.CongestionControl.BLOCK,
-        priority: zenoh.Priority = zenoh.Priority.DATA,
-        express: bool = False,
-    ) -> None:
-        self.selector = selector
-        self.key, self.parameters = selector.key_expr, selector.parameters
-        self.target = target
-        self.payload, self.encoding, self.attachment = payload, encoding, attachment
-        self.source_info = source_info
-        self.congestion_control, self.priority, self.express = congestion_control, priority, express
-        if consolidation == zenoh.ConsolidationMode.AUTO:
-            ranged = "_time" in self.parameters
-            consolidation = zenoh.ConsolidationMode.NONE if ranged else zenoh.ConsolidationMode.LATEST
-        self._consolidates = consolidation != zenoh.ConsolidationMode.NONE
-        self._holds_back = consolidation == zenoh.ConsolidationMode.LATEST
-        self._on_reply, self._on_end = on_reply, on_end
-        self._replies: dict[str, Reply] = {}
-        self._pending = 1
-        self._timer: asyncio.TimerHandle | None = None
-        self.is_over = False
-
-    @property
-    def takes_any_key(self) -> bool:
-        """Whether replies may have a key that the query does not match."""
-        return ANY_KEY in self.parameters
-
-    def expire_after(self, seconds: float) -> None:
-        """End it then if it goes on."""
-        self._timer = asyncio.get_running_loop().call_later(seconds, self._expire)
-
-    def begun(self) -> Asking:
-        """Take note of one more that is asked."""
-        self._pending += 1
-        return self
-
-    def put_to(self, entity: Entity, asking: Asking) -> None:
-        """Have a queryable take the query."""
-        from vnet.gateway.emulated.sessions import Query
-
-        query: Query = Query(self, entity)
-        if entity.sink is None or self.is_over:
-            query.drop()
-        else:
-            entity.sink.push(query)
-
-    def reply(self, reply: Reply) -> None:
-        """Take a reply."""
-        sample = reply.result
-        if self.is_over:
-            return
-        if not isinstance(sample, Sample) or not self._consolidates:
-            self._on_reply(reply)
-            return
-        key = str(sample.key_expr)
-        before = self._replies.get(key)
-        if before is not None and not _is_not_older(sample, before.result):
-            return
-        self._replies[key] = reply
-        if not self._holds_back:
-            self._on_reply(reply)
-
-    def done(self) -> None:
-        """Take note that one of those asked has concluded."""
-        self._pending -= 1
-        if self._pending == 0:
-            self.end()
-
-    def end(self) -> None:
-        """End the query: nothing more is passed on."""
-        if self.is_over:
-            return
-        self.is_over = True
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._holds_back:
-            for reply in self._replies.values():
-                self._on_reply(reply)
-        self._on_end()
-
-    def cancel(self) -> None:
-        """End the query, with what it has held back lost."""
-        self._replies.clear()
-        self.end()
-
-    def _expire(self) -> None:
-        if not self.is_over:
-            on_end, self._on_end = self._on_end, lambda: None
-            self.end()
-            error = ReplyError(zenoh.ZBytes("Timeout"), zenoh.Encoding.ZENOH_STRING)
-            self._on_reply(Reply(error))
-            on_end()
-
-
-def _is_not_older(sample: Sample, before: Sample | ReplyError) -> bool:
-    """Return whether a reply takes the place of another of its key."""
-    assert isinstance(before, Sample)
-    if before.timestamp is None:
-        return True
-    return sample.timestamp is not None and sample.timestamp >= before.timestamp

@@ -1,0 +1,241 @@
+"""Programs that import zenoh, at the radio of a simulated run."""
+
+from collections import Counter
+
+import pytest
+
+from tests.vnet.gateway.conftest import Drive, events, log
+
+TALK = """
+    import sys, time, zenoh
+    session = zenoh.open(zenoh.Config.from_env())
+    session.declare_subscriber("car/*/pose", lambda s: print("heard", s.key_expr, s.payload.to_string(), s.kind))
+    publisher = session.declare_publisher(f"car/{sys.argv[1]}/pose")
+    for number in range(10):
+        publisher.put(str(number))
+        time.sleep(0.1)
+    publisher.delete()
+    time.sleep(0.5)
+    """
+
+
+@pytest.mark.parametrize("order", ["fifo", "shuffle"])
+def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive, order: str) -> None:
+    first, again = (drive(TALK, vehicles=3, loss=0.3, run={"order": order}) for _ in range(2))
+    assert first.verdict == "valid"
+    for node in ("v01", "v02", "v03"):
+        assert log(first, node) == log(again, node)
+        heard = Counter(line.split("/")[1] for line in log(first, node) if line.startswith("heard"))
+        assert heard[node] == 11, "a session hears itself past the radio"
+        rows = [row for row in first.trace.to_pylist() if row["receiver"] == node and row["outcome"] == "delivered"]
+        assert {other: heard[other] for other in heard if other != node} == Counter(row["sender"] for row in rows)
+    assert any("SampleKind.DELETE" in line for line in log(first))
+
+
+def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        session.declare_subscriber("**", lambda s: print("heard", s.key_expr))
+        time.sleep(0.1)
+        if sys.argv[1] == "v01":
+            for key in ("pose/a", "lidar/a", "vnet/own"):
+                session.put(key, b"x")
+        time.sleep(0.5)
+        """,
+        """
+        import time, zenoh
+        with zenoh.open(zenoh.Config()) as session, session.declare_subscriber("*/*") as subscriber:
+            time.sleep(0.5)
+            while (sample := subscriber.try_recv()) is not None:
+                print("inside", sample.key_expr)
+        """,
+        vehicles=2,
+        radio={"keys": ["pose/**"]},
+    )
+    inside = {line for line in log(run) if line.startswith("inside")}
+    assert inside - {"inside vnet/fix"} == {"inside pose/a", "inside lidar/a", "inside vnet/own"}
+    assert {line for line in log(run, "v02") if line.endswith("/a")} == {"heard pose/a", "inside pose/a"}
+    assert len(run.trace) == 1
+
+
+def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        me, session = sys.argv[1], zenoh.open(zenoh.Config())
+
+        def answer(query):
+            with query:
+                if me == "v02":
+                    query.reply("state/v02", query.payload, attachment=b"note", encoding="text/plain")
+                    query.reply_del("state/gone")
+                else:
+                    query.reply_err(f"{me}: {query.parameters}")
+
+        time.sleep(0.1)
+        if me == "v01":
+            started = time.monotonic()
+            for reply in session.get("state/*?x=1", payload="asked", consolidation=zenoh.ConsolidationMode.NONE):
+                if reply.ok is not None:
+                    print(reply.ok.key_expr, reply.ok.kind, reply.ok.payload.to_string(), reply.ok.encoding)
+                else:
+                    print("error", reply.err.payload.to_string())
+            print("over", round(time.monotonic() - started, 3))
+            try:
+                print(session.get("state/nobody", timeout=0.2).recv().err.payload.to_string())
+            except zenoh.ZError:
+                print("nobody")
+        else:
+            queryable = session.declare_queryable("state/*", answer)
+            time.sleep(1.5)
+        """,
+        vehicles=3,
+        program={"zenoh": {"query_s": 0.5}},
+        duration_s=3.0,
+    )
+    lines = log(run)
+    assert sorted(lines[:3]) == [
+        "error v03: x=1",
+        "state/gone SampleKind.DELETE  zenoh/bytes",
+        "state/v02 SampleKind.PUT asked text/plain",
+    ]
+    assert lines[3].startswith("over 0.5")
+    assert lines[4].startswith("v0") or lines[4] == "Timeout"
+
+
+def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        me, session = sys.argv[1], zenoh.open(zenoh.Config())
+        if me == "v01":
+            time.sleep(0.42)
+            print([str(reply.ok.key_expr) for reply in session.liveliness().get("alive/*")])
+            tell = lambda s: print(round(time.monotonic(), 1), s.key_expr, s.kind)
+            session.liveliness().declare_subscriber("alive/*", tell, history=True)
+            time.sleep(5)
+        else:
+            token = session.liveliness().declare_token(f"alive/{me}")
+            time.sleep(2.0)
+            token.undeclare()
+            time.sleep(5)
+        """,
+        vehicles=3,
+        duration_s=5.0,
+        program={"zenoh": {"liveliness_s": 0.2}},
+        fault=[{"kind": "kill", "at_s": 1.0, "duration_s": 3.9, "nodes": ["v03"]}],
+    )
+    assert log(run)[:5] == [
+        "['alive/v02', 'alive/v03']",
+        "0.4 alive/v02 SampleKind.PUT",
+        "0.4 alive/v03 SampleKind.PUT",
+        "1.4 alive/v03 SampleKind.DELETE",
+        "2.0 alive/v02 SampleKind.DELETE",
+    ]
+
+
+def test_large_sample_crosses_in_fragments(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        with session.declare_subscriber("big", zenoh.handlers.RingChannel(1)) as subscriber:
+            time.sleep(0.1)
+            if sys.argv[1] == "v01":
+                session.put("big", bytes(range(256)) * 40)
+            sample = subscriber.recv()
+            print(len(sample.payload), sample.payload.to_bytes() == bytes(range(256)) * 40)
+        """,
+        vehicles=2,
+    )
+    assert log(run, "v02")[0] == "10240 True"
+    assert len(run.trace) > 6
+
+
+RECOVER = """
+    import sys, time, zenoh
+    from zenoh.ext import *
+    session = zenoh.open(zenoh.Config())
+    if sys.argv[1] == "v01":
+        publisher = declare_advanced_publisher(
+            session, "count", cache=CacheConfig(max_samples=100), publisher_detection=True,
+            sample_miss_detection=MissDetectionConfig(heartbeat=0.1),
+        )
+        for number in range(40):
+            publisher.put(z_serialize(number))
+            time.sleep(0.05)
+        time.sleep(10)
+    else:
+        time.sleep(0.3)
+        subscriber = declare_advanced_subscriber(
+            session, "count", lambda s: print("heard", z_deserialize(int, s.payload), s.source_info.source_sn),
+            history=HistoryConfig(detect_late_publishers=True) if {history} else None,
+            recovery=RecoveryConfig({recovery}) if "{recovery}" else None,
+        )
+        subscriber.sample_miss_listener(lambda miss: print("missed", miss.nb))
+        time.sleep(10)
+    """
+
+
+@pytest.mark.parametrize("recovery", ["heartbeat=True", "periodic_queries=0.2"])
+def test_advanced_subscriber_recovers_all_that_the_radio_loses(drive: Drive, recovery: str) -> None:
+    # Zenoh gives up what lies before a query's end: queries over the radio must end before the next begins.
+    zenoh = {"zenoh": {"query_s": 0.1}}
+    text = RECOVER.format(history=True, recovery=recovery)
+    run = drive(text, vehicles=2, loss=0.3, duration_s=9.0, program=zenoh)
+    lost = sum(row["outcome"] == "lost" and row["receiver"] == "v02" for row in run.trace.to_pylist())
+    heard = [int(line.split()[1]) for line in log(run, "v02") if line.startswith("heard")]
+    missed = sum(int(line.split()[1]) for line in log(run, "v02") if line.startswith("missed"))
+    assert heard == sorted(set(heard)), "in order, each once"
+    assert heard[-1] == 39
+    assert len(heard) + missed == 40 - heard[0]
+    assert missed < lost / 2
+    assert heard[0] < 5, "the history is there, up to what its frames have lost"
+
+
+def test_sample_miss_listener_reports_exactly_what_the_radio_has_lost(drive: Drive) -> None:
+    run = drive(RECOVER.format(history=False, recovery=""), vehicles=2, loss=0.3, duration_s=4.0)
+    heard = [int(line.split()[2]) for line in log(run, "v02") if line.startswith("heard")]
+    missed = sum(int(line.split()[1]) for line in log(run, "v02") if line.startswith("missed"))
+    assert missed == heard[-1] - heard[0] + 1 - len(heard) > 0
+
+
+def test_fixes_and_reports_go_by_own_keys(drive: Drive) -> None:
+    run = drive(
+        """
+        import msgpack, zenoh
+        session = zenoh.open(zenoh.Config())
+        subscriber = session.declare_subscriber("vnet/fix")
+        for sample in subscriber:
+            fix = msgpack.unpackb(sample.payload.to_bytes())
+            session.put("vnet/report", msgpack.packb({"estimate_m": fix["position_m"], "seen": 1}))
+        """
+    )
+    assert run.verdict == "valid"
+    assert (run.reported("seen")[1:] == 1).all()
+    assert len(run.trace) == 0
+
+
+def test_callback_that_fails_is_told_and_zenoh_goes_on(drive: Drive) -> None:
+    run = drive(
+        """
+        import time, zenoh
+        session = zenoh.open(zenoh.Config())
+        session.declare_subscriber("a", lambda sample: print(1 / int(sample.payload.to_string())))
+        for number in ("1", "0", "2"):
+            session.put("a", number)
+        time.sleep(0.1)
+        """
+    )
+    (told,) = events(run, "exception")
+    assert ("ZeroDivisionError" in told["error"], "in a callback of Zenoh" in told["place"]) == (True, True)
+    assert {"1.0", "0.5"} <= set(log(run))
+
+
+def test_command_that_is_no_python_and_keys_that_overlap_are_refused_by_name(drive: Drive) -> None:
+    run = drive("", program={"command": ["talker", "x"]})
+    assert "program.command = 'talker x'" in events(run, "crashed")[0]["error"]
+    run = drive("", radio={"keys": ["a/**", "a/b"]})
+    assert "radio.keys: 'a/**' and 'a/b' overlap" in events(run, "crashed")[0]["error"]

@@ -1,0 +1,258 @@
+"""Queries of `import zenoh` on virtual time: on their way, and as a queryable has them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import zenoh
+
+from vnet.gateway.emulated.values import (
+    DELETE,
+    NO_ENCODING,
+    NOTHING,
+    PUT,
+    EntityGlobalId,
+    Reply,
+    ReplyError,
+    Sample,
+    SourceInfo,
+    ZenohId,
+    bytes_or_none,
+    encoding_of,
+    key_of,
+    zbytes_of,
+)
+
+ANY_KEY = "_anyke"
+"""Parameter of queries to which replies with any key are accepted."""
+
+
+class Owner(Protocol):
+    """A session, as the vehicle has it."""
+
+    def zid(self) -> ZenohId:
+        """Return its id."""
+        ...
+
+
+class Sink(Protocol):
+    """What takes samples, queries or replies."""
+
+    def push(self, item: Any, /) -> object:
+        """Take one."""
+        ...
+
+    def close(self) -> object:
+        """Take no more."""
+        ...
+
+
+@dataclass(eq=False)
+class Direct:
+    """A sink that calls a function at once."""
+
+    push: Callable[[Any], object]
+    close: Callable[[], object] = lambda: None
+
+
+@dataclass(eq=False)
+class Entity:
+    """A subscriber, a queryable, a token or a subscriber of tokens of a session."""
+
+    session: Owner
+    key: zenoh.KeyExpr
+    sink: Sink = field(default_factory=lambda: Direct(lambda item: None))
+    origin: zenoh.Locality | None = None
+    is_complete: bool = False
+    eid: int = 0
+    told: set[str] = field(default_factory=set)
+    """Keys of living tokens of which a subscriber of tokens has been told."""
+
+    def __post_init__(self) -> None:
+        self.is_local = self.origin != zenoh.Locality.REMOTE
+        self.is_remote = self.origin != zenoh.Locality.SESSION_LOCAL
+
+    @property
+    def id(self) -> EntityGlobalId:
+        """Its id."""
+        return EntityGlobalId(self.session.zid(), self.eid)
+
+
+@dataclass(eq=False)
+class Asking:
+    """A query on its way: who has been asked and has not concluded yet, and which replies are passed on."""
+
+    selector: zenoh.Selector
+    on_reply: Callable[[Reply], object]
+    on_end: Callable[[], object]
+    target: zenoh.QueryTarget = field(default_factory=lambda: zenoh.QueryTarget.ALL)
+    consolidation: zenoh.ConsolidationMode = field(default_factory=lambda: zenoh.ConsolidationMode.NONE)
+    payload: zenoh.ZBytes | None = None
+    encoding: zenoh.Encoding | None = None
+    attachment: zenoh.ZBytes | None = None
+    source_info: SourceInfo | None = None
+    congestion_control: zenoh.CongestionControl = field(default_factory=lambda: zenoh.CongestionControl.BLOCK)
+    priority: zenoh.Priority = field(default_factory=lambda: zenoh.Priority.DATA)
+    express: bool = False
+
+    def __post_init__(self) -> None:
+        self.key, self.parameters = self.selector.key_expr, self.selector.parameters
+        self.takes_any_key = ANY_KEY in self.parameters
+        mode = self.consolidation
+        if mode == zenoh.ConsolidationMode.AUTO:
+            ranged = "_time" in self.parameters
+            mode = zenoh.ConsolidationMode.NONE if ranged else zenoh.ConsolidationMode.LATEST
+        self._consolidates = mode != zenoh.ConsolidationMode.NONE
+        self._holds_back = mode == zenoh.ConsolidationMode.LATEST
+        self._replies: dict[str, Reply] = {}
+        self._pending = 1
+        self._timer: asyncio.TimerHandle | None = None
+        self.is_over = False
+
+    def expire_after(self, seconds: float) -> None:
+        """End it then if it goes on."""
+        self._timer = asyncio.get_running_loop().call_later(seconds, self._expire)
+
+    def begun(self) -> Asking:
+        """Take note of one more that is asked."""
+        self._pending += 1
+        return self
+
+    def put_to(self, entity: Entity) -> None:
+        """Have a queryable take the query."""
+        query = Query(self, entity)
+        if not self.is_over:
+            entity.sink.push(query)
+
+    def reply(self, reply: Reply) -> None:
+        """Take a reply."""
+        sample = reply.result
+        if self.is_over:
+            return
+        if not isinstance(sample, Sample) or not self._consolidates:
+            self.on_reply(reply)
+            return
+        key = str(sample.key_expr)
+        before = self._replies.get(key)
+        if before is None or _is_not_older(sample, before.result):
+            self._replies[key] = reply
+            if not self._holds_back:
+                self.on_reply(reply)
+
+    def done(self) -> None:
+        """Take note that one of those asked has concluded."""
+        self._pending -= 1
+        if self._pending == 0:
+            self._end()
+
+    def cancel(self) -> None:
+        """End the query, with what it has held back lost."""
+        self._replies.clear()
+        self._end()
+
+    def _end(self, error: Reply | None = None) -> None:
+        if self.is_over:
+            return
+        self.is_over = True
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._holds_back:
+            for reply in self._replies.values():
+                self.on_reply(reply)
+        if error is not None:
+            self.on_reply(error)
+        self.on_end()
+
+    def _expire(self) -> None:
+        self._end(Reply(ReplyError(zenoh.ZBytes("Timeout"), zenoh.Encoding.ZENOH_STRING)))
+
+
+def _is_not_older(sample: Sample, before: Sample | ReplyError) -> bool:
+    """Return whether a reply takes the place of another of its key."""
+    assert isinstance(before, Sample)
+    if before.timestamp is None:
+        return True
+    return sample.timestamp is not None and sample.timestamp >= before.timestamp
+
+
+class Query:
+    """A query at a queryable; it is concluded once it is dropped, or discarded."""
+
+    timestamp_stack = None
+
+    def __init__(self, asking: Asking, entity: Entity) -> None:
+        self._asking, self._entity, self._is_open = asking, entity, True
+
+    def __enter__(self) -> Query:
+        return self
+
+    def __exit__(self, *_args: object, **_kwargs: object) -> None:
+        self.drop()
+
+    def __del__(self) -> None:
+        self.drop()
+
+    def __str__(self) -> str:
+        return str(self._asking.selector)
+
+    selector = property(lambda self: zenoh.Selector(self._asking.key, str(self._asking.parameters)))
+    key_expr = property(lambda self: self._asking.key)
+    parameters = property(lambda self: zenoh.Parameters(str(self._asking.parameters)))
+    payload = property(lambda self: self._asking.payload)
+    encoding = property(lambda self: self._asking.encoding)
+    attachment = property(lambda self: self._asking.attachment)
+    source_info = property(lambda self: self._asking.source_info)
+
+    def accepts_replies(self) -> zenoh.ReplyKeyExpr:
+        """Return which keys replies may have."""
+        any_key = self._asking.takes_any_key
+        return zenoh.ReplyKeyExpr.ANY if any_key else zenoh.ReplyKeyExpr.MATCHING_QUERY
+
+    def reply(self, key_expr: Any, payload: Any, *, encoding: Any = None, **options: Any) -> None:
+        """Reply with a sample. Raises ZError for a key that the query does not match."""
+        self._reply(PUT, key_expr, zbytes_of(payload), encoding_of(encoding), **options)
+
+    def reply_del(self, key_expr: Any, **options: Any) -> None:
+        """Reply that a key is deleted. Raises ZError for a key that the query does not match."""
+        self._reply(DELETE, key_expr, NOTHING, NO_ENCODING, **options)
+
+    def reply_err(self, payload: Any, *, encoding: Any = None) -> None:
+        """Reply with an error."""
+        self._answer(ReplyError(zbytes_of(payload), encoding_of(encoding)))
+
+    def reply_sample(self, sample: Sample) -> None:
+        """Reply with a sample that has been published, as caches do."""
+        self._answer(sample)
+
+    def _reply(
+        self,
+        kind: zenoh.SampleKind,
+        key: Any,
+        payload: zenoh.ZBytes,
+        encoding: zenoh.Encoding,
+        *,
+        congestion_control: object = None,  # as priority, the query's own
+        priority: object = None,
+        express: bool | None = None,
+        attachment: Any = None,
+        timestamp: zenoh.Timestamp | None = None,
+    ) -> None:
+        asking, key_expr = self._asking, key_of(key)
+        if not asking.takes_any_key and not asking.key.intersects(key_expr):
+            raise zenoh.ZError(f"Attempted to reply on `{key_expr}`, which does not intersect query `{asking.key}`")
+        qos = asking.congestion_control, asking.priority, asking.express if express is None else express
+        self._answer(Sample(key_expr, payload, kind, encoding, timestamp, *qos, bytes_or_none(attachment)))
+
+    def _answer(self, result: Sample | ReplyError) -> None:
+        if not self._is_open:
+            raise zenoh.ZError("the query has been dropped")
+        self._asking.reply(Reply(result, self._entity.id))
+
+    def drop(self) -> None:
+        """Conclude it: no more replies come from here."""
+        if self._is_open:
+            self._is_open = False
+            self._asking.done()
