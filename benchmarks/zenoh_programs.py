@@ -27,7 +27,7 @@ RATE_HZ = 10
 PAYLOAD_BYTES = 100
 CLIENTS_A_PROCESS = 8
 LATENCY_MS = 1.0
-"""What the radio itself takes."""
+"""Latency of the radio itself."""
 MEASURED_S = 12.0
 TALKER = """
 import sys, time

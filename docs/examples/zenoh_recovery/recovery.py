@@ -22,7 +22,7 @@ PUBLISHED = 100
 CACHE = 100
 """Numbers that an advanced publisher keeps: all."""
 LATE_S = 0.09
-"""What comes later has been recovered: the radio itself takes a few milliseconds."""
+"""Longest delay of a number that the radio has not lost: it takes a few milliseconds."""
 ATTEMPTS = 3
 END_S = 19.0
 

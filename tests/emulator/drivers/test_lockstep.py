@@ -151,7 +151,7 @@ def test_a_frame_that_arrives_as_a_window_ends_is_heard_in_the_next() -> None:
         lockstep.receive(process_id, yielded(grant, timer_ns, ["v03"] if process_id == "v03" else []))
     (grant,) = lockstep.step().values()
     airtime_ns = 1_000  # of a byte
-    steps = [wire.Step(130 * MS - airtime_ns, wire.Traffic([wire.Frame("v01", b"x")]))]
+    steps = [wire.Step(130 * MS - airtime_ns, wire.Traffic([SentFrame("v01", b"x")]))]
     lockstep.receive("v01", wire.Yield(b"n", grant.seq, None, [], [], steps, 1))
     grants = lockstep.step()
     assert list(grants) == ["v02"] and window(grants) == (130, 160)

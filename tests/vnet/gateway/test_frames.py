@@ -1,4 +1,4 @@
-"""What crosses the radio: messages cut into frames and put together again, whatever is lost or changed."""
+"""Messages on the radio: cut into frames and put together again, whatever is lost or changed."""
 
 import contextlib
 
