@@ -45,9 +45,9 @@ from vnet.gateway.frames import (
     decode_fragment,
     decode_message,
 )
-from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
 from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
-from vnet.node import Fix, Node
+from vnet.node import Node
 from vnet.radio import Packet
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
@@ -377,23 +377,12 @@ class Vehicle:
         async for fix in self.node.gnss:
             sample = Sample(
                 key_of(FIX_KEY),
-                zenoh.ZBytes(msgspec.msgpack.encode(told_of(fix))),
+                zenoh.ZBytes(fix_content(fix)),
                 PUT,
                 NO_ENCODING,
                 self.new_timestamp(self.zid),
             )
             self._deliver([each for each in self._takers_of(FIX_KEY) if each.is_remote], sample)
-
-
-def told_of(fix: Fix) -> dict[str, Any]:
-    """Return what programs are told of a fix."""
-    return {
-        "time_ns": fix.time_ns,
-        "position_m": fix.position_m.tolist(),
-        "covariance_m2": fix.covariance_m2.tolist(),
-        "heading_rad": fix.heading_rad,
-        "speed_m_s": fix.speed_m_s,
-    }
 
 
 @lru_cache(maxsize=1024)
