@@ -81,7 +81,7 @@ class Vehicle:
         }
         self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * liveliness_s * NS_PER_S))
         self._has_tokens = asyncio.Event()
-        self._takers: dict[str, list[Entity]] = {}
+        self._matching: dict[str, list[Entity]] = {}
         self._crossing: dict[str, bool] = {}
         self._queries: dict[int, Asking] = {}
         self._query_numbers = count()
@@ -124,7 +124,7 @@ class Vehicle:
 
     def _changed(self, kind: str) -> None:
         if kind in ("subscriber", "queryable"):
-            self._takers.clear()
+            self._matching.clear()
             for tell in list(self.on_matching):
                 tell()
 
@@ -150,19 +150,19 @@ class Vehicle:
                 self._crossing[key] = crosses
         return crosses
 
-    def _takers_of(self, key: str) -> list[Entity]:
-        takers = self._takers.get(key)
-        if takers is None:
+    def _subscribers_of(self, key: str) -> list[Entity]:
+        matching = self._matching.get(key)
+        if matching is None:
             expression = key_of(key)
-            takers = [each for each in self._subscribers if each.key.intersects(expression)]
-            if len(self._takers) < MOST_KEYS:
-                self._takers[key] = takers
-        return takers
+            matching = [each for each in self._subscribers if each.key.intersects(expression)]
+            if len(self._matching) < MOST_KEYS:
+                self._matching[key] = matching
+        return matching
 
     def put(self, session: Owner, sample: Sample, to_own: bool, to_others: bool) -> None:
         """Take a sample of a session to its own subscribers, and to all others here and over the radio."""
         key = str(sample.key_expr)
-        takers = self._takers_of(key)
+        matching = self._subscribers_of(key)
         if to_others:
             stamped = sample
             if sample.timestamp is None and sample.kind == PUT:  # as routers do
@@ -171,11 +171,11 @@ class Vehicle:
                 self._send(crossing_of(stamped))
             elif key == REPORT_KEY:
                 self._report(sample)
-            others = [each for each in takers if each.session is not session and each.is_remote]
+            others = [each for each in matching if each.session is not session and each.is_remote]
             if others:
                 self._loop.call_soon(self._deliver, others, stamped)
         if to_own:
-            self._deliver([each for each in takers if each.session is session and each.is_local], sample)
+            self._deliver([each for each in matching if each.session is session and each.is_local], sample)
 
     def _deliver(self, entities: list[Entity], sample: Sample) -> None:
         for entity in entities:
@@ -355,7 +355,7 @@ class Vehicle:
                 message, sample = heard
             if sample is not None and not only_tokens:
                 assert isinstance(message, CrossingSample)
-                for entity in self._takers_of(message.key):
+                for entity in self._subscribers_of(message.key):
                     if entity.is_remote:
                         entity.sink.push(sample)
             elif isinstance(message, CrossingTokens):
@@ -382,7 +382,7 @@ class Vehicle:
                 NO_ENCODING,
                 self.new_timestamp(self.zid),
             )
-            self._deliver([each for each in self._takers_of(FIX_KEY) if each.is_remote], sample)
+            self._deliver([each for each in self._subscribers_of(FIX_KEY) if each.is_remote], sample)
 
 
 @lru_cache(maxsize=1024)
