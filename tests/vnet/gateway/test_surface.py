@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 import zenoh
 
+from tests.support.paths import ROOT
 from vnet.gateway.emulated.programs import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
@@ -65,3 +66,8 @@ def test_values_are_zenohs_own_wherever_python_can_construct_them() -> None:
     assert package.KeyExpr("a/**").includes("a/b")
     assert isinstance(package.Config(), package.Config)
     assert isinstance(package.ZBytes(b"x"), zenoh.ZBytes)
+
+
+def test_page_names_all_that_is_refused() -> None:
+    page = (ROOT / "docs/how-to/zenoh.md").read_text().partition("Refused by name are")[2]
+    assert {name for name in REFUSED if f"`{name}`" not in page} == set()

@@ -10,8 +10,9 @@ import asyncio
 import shlex
 from collections.abc import Sequence
 
-from vnet import extras
 from vnet.errors import ProgramError, shown
+from vnet.gateway.emulated.programs import run_program
+from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.gateway.keys import RADIO_KEYS, check_keys
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Task
@@ -26,10 +27,6 @@ async def main(node: Node) -> None:
 
     `node.options` has their commands (`command`), `keys` that cross the radio, and `query_s` and `liveliness_s`.
     """
-    extras.require('program.kind = "zenoh" in lockstep', "greenlet", error=ProgramError)
-    from vnet.gateway.emulated.programs import run_program
-    from vnet.gateway.emulated.vehicle import Vehicle
-
     loop = asyncio.get_running_loop()
     if not isinstance(loop, VirtualTimeLoop):
         raise ProgramError('vnet.gateway.emulated needs run.pacing = "lockstep": in real time Zenoh itself runs')

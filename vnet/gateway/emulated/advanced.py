@@ -50,7 +50,7 @@ class CacheConfig:
 
 @dataclass(frozen=True)
 class HistoryConfig:
-    """What a subscriber asks caches for at its beginning."""
+    """History for which a subscriber asks caches at its beginning."""
 
     detect_late_publishers: bool | None = field(default=None, kw_only=True)
     max_samples: int | None = field(default=None, kw_only=True)
@@ -72,7 +72,7 @@ class MissDetectionConfig:
 
 @dataclass(frozen=True)
 class RecoveryConfig:
-    """How a subscriber finds that its last sample was not the publisher's."""
+    """Ways to find that a subscriber's last sample was not the publisher's."""
 
     periodic_queries: Any = field(default=None, kw_only=True)
     heartbeat: Literal[True] | None = field(default=None, kw_only=True)
@@ -214,7 +214,7 @@ def _is_since(sample: Sample, since_ns: int | None) -> bool:
 
 
 class _Source:
-    """What a subscriber has of one publisher: samples by number, or by timestamp."""
+    """State of one publisher at a subscriber: samples by number, or by timestamp."""
 
     def __init__(self) -> None:
         self.last: Any = None

@@ -39,7 +39,7 @@ class Owner(Protocol):
 
 
 class Sink(Protocol):
-    """What takes samples, queries or replies."""
+    """A receiver of samples, queries or replies."""
 
     def push(self, item: Any, /) -> object:
         """Take one."""

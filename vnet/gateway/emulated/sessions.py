@@ -46,7 +46,7 @@ def _refuse(**given: object) -> None:
 
 
 class Declared:
-    """What a session has declared, until it is undeclared; a `with` block undeclares it."""
+    """An entity that a session has declared; a `with` block undeclares it."""
 
     _is_declared = False
     _end: Callable[[], object] = staticmethod(lambda: None)
@@ -72,11 +72,11 @@ class Declared:
 
 
 class Listening(Declared):
-    """What a session has declared that takes items, with the end of the channel that the program reads."""
+    """An entity that takes items, with the end of the channel that the program reads."""
 
     handler: Any = None
     _is_background = False
-    """Whether it goes on when the program discards it."""
+    """True if it goes on when the program discards it."""
 
     def __class_getitem__(cls, item: object) -> type[Listening]:
         return cls
@@ -267,7 +267,7 @@ class Publisher(Declared):
 
     @property
     def matching_status(self) -> MatchingStatus:
-        """Whether anybody may take its samples."""
+        """True for `matching` if anybody may take its samples."""
         return MatchingStatus(self.session.vehicle.matches_subscriber(self.key_expr))
 
     def put(self, payload: Any, *, encoding: Any = None, **options: Any) -> None:
@@ -315,7 +315,7 @@ class Querier(Declared):
 
     @property
     def matching_status(self) -> MatchingStatus:
-        """Whether anybody may answer."""
+        """True for `matching` if anybody may answer."""
         return MatchingStatus(self.session.vehicle.matches_queryable(self.key_expr, self._complete))
 
     def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
@@ -330,7 +330,7 @@ class Querier(Declared):
 
 
 class SessionInfo:
-    """What a session knows of its surroundings: the router of its vehicle."""
+    """Surroundings of a session: the router of its vehicle."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -368,7 +368,7 @@ class Session:
         enabled = msgspec.json.decode(config.get_json("timestamping/enabled"))
         mode = msgspec.json.decode(config.get_json("mode")) or "peer"
         self.stamps = bool(enabled.get(mode) if isinstance(enabled, dict) else enabled)
-        """Whether its samples have timestamps of its own."""
+        """True if its samples have timestamps of its own."""
 
     def __enter__(self) -> Session:
         return self

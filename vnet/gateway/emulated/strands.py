@@ -74,7 +74,7 @@ def drive(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
 
 
 IDLE = object()
-"""What a strand waits for that has nothing to do until `begin` is called again."""
+"""Stands for what a strand waits for that has nothing to do until `begin` is called again."""
 
 
 def idle() -> None:

@@ -108,7 +108,7 @@ class Reply(_Value, frozen=True, eq=False, gc=False):
 
 
 class Hello(_Value, frozen=True, eq=False, gc=False):
-    """What scouting finds."""
+    """A router that scouting finds."""
 
     whatami: zenoh.WhatAmI
     zid: ZenohId
@@ -116,7 +116,7 @@ class Hello(_Value, frozen=True, eq=False, gc=False):
 
 
 class MatchingStatus(_Value, frozen=True, eq=False, gc=False):
-    """Whether there is anybody at the other end."""
+    """True for `matching` if there is anybody at the other end."""
 
     matching: bool
 
@@ -398,7 +398,7 @@ class DueCallbacks:
     def __init__(self) -> None:
         self._due: list[CallbackSink] = []
         self.is_held = False
-        """Whether `run` will be called, as what is due comes by the radio."""
+        """True while `run` will be called, as what is due comes by the radio."""
 
     def soon(self, sink: CallbackSink) -> None:
         """Have a callback run once the present code has blocked or returned."""
@@ -414,7 +414,7 @@ class DueCallbacks:
 
 
 class Outlet(NamedTuple):
-    """Where items for a program go."""
+    """Destination of items for a program."""
 
     due: DueCallbacks
     new_number: Callable[[], int]

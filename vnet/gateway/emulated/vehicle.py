@@ -45,9 +45,9 @@ from vnet.gateway.frames import (
     decode_fragment,
     decode_message,
 )
-from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
 from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
-from vnet.node import Fix, Node
+from vnet.node import Node
 from vnet.radio import Packet
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
@@ -81,7 +81,7 @@ class Vehicle:
         }
         self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * liveliness_s * NS_PER_S))
         self._has_tokens = asyncio.Event()
-        self._takers: dict[str, list[Entity]] = {}
+        self._matching: dict[str, list[Entity]] = {}
         self._crossing: dict[str, bool] = {}
         self._queries: dict[int, Asking] = {}
         self._query_numbers = count()
@@ -124,7 +124,7 @@ class Vehicle:
 
     def _changed(self, kind: str) -> None:
         if kind in ("subscriber", "queryable"):
-            self._takers.clear()
+            self._matching.clear()
             for tell in list(self.on_matching):
                 tell()
 
@@ -150,19 +150,19 @@ class Vehicle:
                 self._crossing[key] = crosses
         return crosses
 
-    def _takers_of(self, key: str) -> list[Entity]:
-        takers = self._takers.get(key)
-        if takers is None:
+    def _subscribers_of(self, key: str) -> list[Entity]:
+        matching = self._matching.get(key)
+        if matching is None:
             expression = key_of(key)
-            takers = [each for each in self._subscribers if each.key.intersects(expression)]
-            if len(self._takers) < MOST_KEYS:
-                self._takers[key] = takers
-        return takers
+            matching = [each for each in self._subscribers if each.key.intersects(expression)]
+            if len(self._matching) < MOST_KEYS:
+                self._matching[key] = matching
+        return matching
 
     def put(self, session: Owner, sample: Sample, to_own: bool, to_others: bool) -> None:
         """Take a sample of a session to its own subscribers, and to all others here and over the radio."""
         key = str(sample.key_expr)
-        takers = self._takers_of(key)
+        matching = self._subscribers_of(key)
         if to_others:
             stamped = sample
             if sample.timestamp is None and sample.kind == PUT:  # as routers do
@@ -171,11 +171,11 @@ class Vehicle:
                 self._send(crossing_of(stamped))
             elif key == REPORT_KEY:
                 self._report(sample)
-            others = [each for each in takers if each.session is not session and each.is_remote]
+            others = [each for each in matching if each.session is not session and each.is_remote]
             if others:
                 self._loop.call_soon(self._deliver, others, stamped)
         if to_own:
-            self._deliver([each for each in takers if each.session is session and each.is_local], sample)
+            self._deliver([each for each in matching if each.session is session and each.is_local], sample)
 
     def _deliver(self, entities: list[Entity], sample: Sample) -> None:
         for entity in entities:
@@ -355,7 +355,7 @@ class Vehicle:
                 message, sample = heard
             if sample is not None and not only_tokens:
                 assert isinstance(message, CrossingSample)
-                for entity in self._takers_of(message.key):
+                for entity in self._subscribers_of(message.key):
                     if entity.is_remote:
                         entity.sink.push(sample)
             elif isinstance(message, CrossingTokens):
@@ -377,23 +377,12 @@ class Vehicle:
         async for fix in self.node.gnss:
             sample = Sample(
                 key_of(FIX_KEY),
-                zenoh.ZBytes(msgspec.msgpack.encode(told_of(fix))),
+                zenoh.ZBytes(fix_content(fix)),
                 PUT,
                 NO_ENCODING,
                 self.new_timestamp(self.zid),
             )
-            self._deliver([each for each in self._takers_of(FIX_KEY) if each.is_remote], sample)
-
-
-def told_of(fix: Fix) -> dict[str, Any]:
-    """Return what programs are told of a fix."""
-    return {
-        "time_ns": fix.time_ns,
-        "position_m": fix.position_m.tolist(),
-        "covariance_m2": fix.covariance_m2.tolist(),
-        "heading_rad": fix.heading_rad,
-        "speed_m_s": fix.speed_m_s,
-    }
+            self._deliver([each for each in self._subscribers_of(FIX_KEY) if each.is_remote], sample)
 
 
 @lru_cache(maxsize=1024)
