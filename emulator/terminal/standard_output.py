@@ -21,9 +21,6 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-from emulator.records.atomic import disk_errors
-from emulator.records.run_folder import PROGRAMS_LOG
-
 NOBODY_READS = (errno.EPIPE, errno.EIO, errno.ENXIO)
 """Errors of a pipe without a reader, and of a terminal that is gone: nothing is wrong with the command."""
 
@@ -121,6 +118,9 @@ class ResultOnly(StandardOutput):
     def keep_in(self, logs: Path) -> None:
         """Move what was printed so far into the folder, and keep there what follows."""
         _flush()
+        from emulator.records.atomic import disk_errors  # slow to import, and `--help` does without
+        from emulator.records.run_folder import PROGRAMS_LOG
+
         path = logs / PROGRAMS_LOG
         with disk_errors(path):
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)

@@ -17,7 +17,6 @@ CASES = [
 ]
 EXEMPT = {
     "docs/examples/sumo_loop/street.toml": "needs libsumo",
-    "docs/how-to/zenoh.md:talkers.toml": "its programs live in real time: system/test_zenoh.py",
 }
 """Scenarios without a row, and why."""
 

@@ -9,7 +9,7 @@ _SEGMENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z")
 
 
 SEGMENTS = "names are letters, digits, '_', '.', '-', at most 64"
-"""What `is_segment` allows, as errors say it."""
+"""Names that `is_segment` allows, in the words of errors."""
 
 
 def is_segment(name: str) -> bool:

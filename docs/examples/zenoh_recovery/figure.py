@@ -73,9 +73,9 @@ def draw(axes: Axes, table: pa.Table, curves: tuple[Curve, ...], label: str) -> 
         axes.errorbar(percent, means, widths, color=curve.colour, marker=curve.marker, capsize=3, label=curve.words)
     axes.set_ylabel(label)
     axes.set_xlabel("loss of frames (%)")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.3 * axes.get_ylim()[1])  # room for the legend
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    axes.legend(fontsize="small", loc="upper left")
 
 
 def main(table_path: str, picture_path: str) -> None:
