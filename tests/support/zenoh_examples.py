@@ -134,7 +134,8 @@ def z_liveliness(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
 
 def z_advanced(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
     """z_advanced_pub and z_advanced_sub: a late subscriber has the history, a plain one what comes."""
-    ext, heard = zenoh.ext, queue.Queue()
+    ext = zenoh.ext
+    heard: queue.Queue[Any] = queue.Queue()
     session = open_session()
     publisher = ext.declare_advanced_publisher(
         session,
@@ -155,7 +156,7 @@ def z_advanced(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
         subscriber_detection=True,
     )
     told = [heard.get(), heard.get()]
-    found = queue.Queue()
+    found: queue.Queue[int] = queue.Queue()
     subscriber.detect_publishers(lambda sample: found.put(str(sample.key_expr).count("@adv/pub")), history=True)
     told.append(found.get())
     for index in range(5, 8):
@@ -167,7 +168,8 @@ def z_advanced(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
 
 def z_matching(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
     """z_pub with --add-matching-listener: a publisher is told when its first subscriber comes and its last goes."""
-    publisher, told = open_session().declare_publisher("demo/matching"), queue.Queue()
+    told: queue.Queue[bool] = queue.Queue()
+    publisher = open_session().declare_publisher("demo/matching")
     publisher.declare_matching_listener(lambda status: told.put(status.matching))
     settle()
     session = open_session()

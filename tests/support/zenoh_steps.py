@@ -125,7 +125,7 @@ class _Interpreter:
             allowed_destination=self._locality(destination),
             payload=payload,
         )
-        told = []
+        told: list[tuple[Any, ...]] = []
         for reply in replies:
             if reply.ok is None:
                 told.append(("error", str(reply.err.encoding), bytes(reply.err.payload)))
