@@ -255,3 +255,37 @@ def test_live_and_simulated_runs_are_the_same(vnet: Vnet, tmp_path: Path, order:
         logs = [(each.folder / f"logs/{node}.log").read_text() for each in (live, simulated, apart)]
         heard = [[line for line in text.splitlines() if line.startswith(("heard", "state"))] for text in logs]
         assert heard[0] == heard[1] == heard[2] != []
+
+
+def test_gateway_and_virtual_time_have_the_same_receptions(vnet: Vnet, tmp_path: Path) -> None:
+    (tmp_path / "put.py").write_text("""
+import sys, time, zenoh
+with zenoh.open(zenoh.Config.from_env()) as session:
+    session.declare_subscriber("**", lambda sample: None)
+    for number in range(15):
+        session.put(f"car/{sys.argv[1]}", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+        time.sleep(0.05)
+    time.sleep(60)
+""")
+    (tmp_path / "put.toml").write_text(f"""
+        [run]
+        duration_s = 4.0
+        settle_s = 0.0
+        [network]
+        vehicles = 3
+        [radio]
+        range_m = 100000.0
+        loss = 0.3
+        [program]
+        kind = "zenoh"
+        command = ["python", "{tmp_path}/put.py", "{{id}}"]
+        """)
+    received = []
+    for command, pacing in (("run", "realtime"), ("simulate", "lockstep")):
+        done = vnet(command, str(tmp_path / "put.toml"), "--set", f"run.pacing={pacing}")
+        rows = [row for row in done.trace() if row["outcome"] in ("delivered", "lost")]
+        received.append({(row["sender"], row["seq"], row["receiver"]): row["outcome"] for row in rows})
+    real, emulated = received
+    assert len(emulated) == 3 * 15 * 2
+    assert real.items() <= emulated.items(), "what is put before a run in real time begins is no frame"
+    assert set(real.values()) == {"delivered", "lost"}
