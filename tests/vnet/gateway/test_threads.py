@@ -1,6 +1,7 @@
 """Threads, clocks and chance of programs on virtual time."""
 
 import re
+import signal
 from pathlib import Path
 
 from tests.vnet.gateway.conftest import Drive, events, log
@@ -81,9 +82,10 @@ def test_conditions_barriers_semaphores_timers_locals_and_pools_work(drive: Driv
 
 
 def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -> None:
+    before = signal.getsignal(signal.SIGINT)
     run = drive(
         """
-        import asyncio, time
+        import asyncio, signal, time
 
         async def tick(name, period):
             for number in range(2):
@@ -92,6 +94,7 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
 
         async def main():
             loop = asyncio.get_running_loop()
+            loop.add_signal_handler(signal.SIGINT, loop.stop)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(tick("a", 0.1))
                 tasks.create_task(tick("b", 0.15))
@@ -119,6 +122,7 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
             print(error)
         """
     )
+    assert signal.getsignal(signal.SIGINT) is before, "signals of the process are not the program's"
     assert log(run)[:-1] == [
         "slept 0.05",
         "a 0 0.1",
