@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -93,9 +94,8 @@ class Network:
 
 @pytest.fixture(scope="module")
 def network() -> Iterator[Network]:
-    network = Network()
-    yield network
-    network.close()
+    with closing(Network()) as network:
+        yield network
 
 
 def emulated(steps: Sequence[Step]) -> list[str]:
@@ -194,10 +194,9 @@ def test_examples_are_told_the_same(tmp_path: Path) -> None:
     lines = (run.folder / "logs/v01.log").read_text().splitlines()
     told = dict(line.split(" ", 2)[1:] for line in lines if line.startswith("told "))
     for name, example in EXAMPLES.items():
-        network = Network()
-        sessions = iter(network.sessions)
-        assert told[name] == repr(example(zenoh, sessions.__next__, network.settle)), name
-        network.close()
+        with closing(Network()) as network:
+            sessions = iter(network.sessions)
+            assert told[name] == repr(example(zenoh, sessions.__next__, network.settle)), name
 
 
 TALK = """

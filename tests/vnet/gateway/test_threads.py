@@ -138,6 +138,23 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
     ]
 
 
+def test_joinable_threads_of_later_pythons_work(drive: Drive) -> None:
+    run = drive(
+        """
+        import _thread, time
+        handles = [_thread.start_joinable_thread(lambda: time.sleep(0.2), daemon=False) for _ in range(2)]
+        handles[0].join(0.1)
+        print(handles[0].is_done(), round(time.monotonic(), 2))
+        handles[0].join()
+        print(handles[0].is_done(), handles[0].ident != handles[1].ident, round(time.monotonic(), 2))
+        _thread.start_joinable_thread(lambda: time.sleep(0.3), daemon=False)
+        _thread._shutdown()
+        print(round(time.monotonic(), 2), _thread._make_thread_handle(7).ident, _thread._get_main_thread_ident())
+        """
+    )
+    assert log(run)[:-1] == ["False 0.1", "True True 0.2", "0.5 7 1"]
+
+
 CHANCE = """
     import datetime, logging, os, random, secrets, sys, time, uuid
     print(random.random(), random.Random().random(), random.SystemRandom().random(), random.Random(1).random())
