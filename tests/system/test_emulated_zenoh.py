@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -16,7 +17,9 @@ from hypothesis import strategies as st
 
 import emulator
 from tests.support.paths import ROOT
+from tests.support.zenoh_examples import EXAMPLES
 from tests.support.zenoh_steps import Step, interpret
+from tests.system.conftest import Vnet
 from vnet.transport.session import router_endpoint
 
 SESSIONS = 3
@@ -91,9 +94,8 @@ class Network:
 
 @pytest.fixture(scope="module")
 def network() -> Iterator[Network]:
-    network = Network()
-    yield network
-    network.close()
+    with closing(Network()) as network:
+        yield network
 
 
 def emulated(steps: Sequence[Step]) -> list[str]:
@@ -163,3 +165,126 @@ def test_sessions_are_told_the_same(network: Network, steps: list[Step]) -> None
     told = [repr(line) for line in interpret(zenoh, network.sessions, steps, network.settle)]
     network.settle()
     assert emulated(steps) == told
+
+
+EXAMPLE = f"""
+import sys, time, zenoh, zenoh.ext
+sys.path.insert(0, {str(ROOT)!r})
+from tests.support.zenoh_examples import EXAMPLES
+for name, example in EXAMPLES.items():
+    sessions = []
+    def open_session():
+        sessions.append(zenoh.open(zenoh.Config()))
+        return sessions[-1]
+    print("told", name, example(zenoh, open_session, lambda: time.sleep(0.01)))
+    for session in sessions:
+        session.close()
+"""
+
+
+def test_examples_are_told_the_same(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(EXAMPLE)
+    scenario = {
+        "run": {"duration_s": 60.0, "settle_s": 0.0},
+        "network": {"vehicles": 1},
+        "radio": {"keys": ["none"]},
+        "program": {"kind": "zenoh", "command": ["python", str(tmp_path / "program.py")]},
+    }
+    run = emulator.simulate(scenario, out=tmp_path / "run")
+    lines = (run.folder / "logs/v01.log").read_text().splitlines()
+    told = dict(line.split(" ", 2)[1:] for line in lines if line.startswith("told "))
+    for name, example in EXAMPLES.items():
+        with closing(Network()) as network:
+            sessions = iter(network.sessions)
+            assert told[name] == repr(example(zenoh, sessions.__next__, network.settle)), name
+
+
+TALK = """
+import sys, threading, time, zenoh
+
+def count(sample):
+    print("heard", sample.key_expr, sample.payload.to_string(), time.time())
+
+session = zenoh.open(zenoh.Config.from_env())
+session.declare_subscriber("car/*/pose", count)
+session.declare_queryable("state", lambda query: query.reply("state", sys.argv[1]))
+token = session.liveliness().declare_token(f"alive/{sys.argv[1]}")
+
+def ask():
+    while True:
+        time.sleep(0.3)
+        for reply in session.get("state", timeout=0.25):
+            print("state", reply.ok and reply.ok.payload.to_string())
+
+threading.Thread(target=ask, daemon=True).start()
+for number in range(20):
+    session.put(f"car/{sys.argv[1]}/pose", str(number))
+    time.sleep(0.1)
+"""
+
+
+@pytest.mark.parametrize("order", ["fifo", "shuffle"])
+def test_live_and_simulated_runs_are_the_same(vnet: Vnet, tmp_path: Path, order: str) -> None:
+    (tmp_path / "talk.py").write_text(TALK)
+    text = f"""
+        [run]
+        duration_s = 2.5
+        settle_s = 0.0
+        order = "{order}"
+        [network]
+        vehicles = 3
+        [radio]
+        range_m = 100000.0
+        loss = 0.2
+        [program]
+        kind = "zenoh"
+        command = ["python", "{tmp_path}/talk.py", "{{id}}"]
+        zenoh = {{ query_s = 0.2 }}
+        [[fault]]
+        kind = "restart"
+        at_s = 1.0
+        duration_s = 0.4
+        nodes = ["v02"]
+        """
+    (tmp_path / "talk.toml").write_text(text)
+    live, simulated = (vnet(command, str(tmp_path / "talk.toml")) for command in ("run", "simulate"))
+    apart = vnet("simulate", str(tmp_path / "talk.toml"), "--processes", "2")
+    assert live.fingerprint == simulated.fingerprint == apart.fingerprint
+    for node in ("v01", "v02", "v03"):
+        logs = [(each.folder / f"logs/{node}.log").read_text() for each in (live, simulated, apart)]
+        heard = [[line for line in text.splitlines() if line.startswith(("heard", "state"))] for text in logs]
+        assert heard[0] == heard[1] == heard[2] != []
+
+
+def test_gateway_and_virtual_time_have_the_same_receptions(vnet: Vnet, tmp_path: Path) -> None:
+    (tmp_path / "put.py").write_text("""
+import sys, time, zenoh
+with zenoh.open(zenoh.Config.from_env()) as session:
+    session.declare_subscriber("**", lambda sample: None)
+    for number in range(15):
+        session.put(f"car/{sys.argv[1]}", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+        time.sleep(0.05)
+    time.sleep(60)
+""")
+    (tmp_path / "put.toml").write_text(f"""
+        [run]
+        duration_s = 4.0
+        settle_s = 0.0
+        [network]
+        vehicles = 3
+        [radio]
+        range_m = 100000.0
+        loss = 0.3
+        [program]
+        kind = "zenoh"
+        command = ["python", "{tmp_path}/put.py", "{{id}}"]
+        """)
+    received = []
+    for command, pacing in (("run", "realtime"), ("simulate", "lockstep")):
+        done = vnet(command, str(tmp_path / "put.toml"), "--set", f"run.pacing={pacing}")
+        rows = [row for row in done.trace() if row["outcome"] in ("delivered", "lost")]
+        received.append({(row["sender"], row["seq"], row["receiver"]): row["outcome"] for row in rows})
+    real, emulated = received
+    assert len(emulated) == 3 * 15 * 2
+    assert real.items() <= emulated.items(), "what is put before a run in real time begins is no frame"
+    assert set(real.values()) == {"delivered", "lost"}

@@ -510,6 +510,13 @@ class VirtualTimeLoop(SkewedLoop):
             "run the scenario with run.pacing = realtime"
         )
 
+    def add_signal_handler(self, sig: int, callback: Callable[..., object], *args: Any) -> None:  # type: ignore[override]
+        """Do nothing: no signal comes to a program on virtual time, and those of the process are not its own."""
+
+    def remove_signal_handler(self, sig: int) -> bool:
+        """Return False: there is none."""
+        return False
+
     create_connection = create_server = create_datagram_endpoint = _refuse
     create_unix_connection = create_unix_server = _refuse
     subprocess_exec = subprocess_shell = _refuse

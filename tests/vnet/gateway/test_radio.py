@@ -1,5 +1,7 @@
 """Programs that import zenoh, at the radio of a simulated run."""
 
+import gc
+import re
 from collections import Counter
 
 import pytest
@@ -239,3 +241,50 @@ def test_command_that_is_no_python_and_keys_that_overlap_are_refused_by_name(dri
     assert "program.command = 'talker x'" in events(run, "crashed")[0]["error"]
     run = drive("", radio={"keys": ["a/**", "a/b"]})
     assert "radio.keys: 'a/**' and 'a/b' overlap" in events(run, "crashed")[0]["error"]
+
+
+ALL_KINDS = """
+    import sys, threading, time, zenoh
+    from zenoh.ext import *
+    me, session = sys.argv[1], zenoh.open(zenoh.Config())
+    kept = [
+        session.declare_subscriber("**"),
+        session.liveliness().declare_subscriber("**", history=True),
+        session.liveliness().declare_token(f"alive/{me}"),
+        session.declare_queryable("asked"),
+        declare_advanced_subscriber(
+            session, "**", history=HistoryConfig(detect_late_publishers=True),
+            recovery=RecoveryConfig(heartbeat=True),
+        ),
+        declare_advanced_publisher(
+            session, f"count/{me}", cache=CacheConfig(max_samples=5), publisher_detection=True,
+            sample_miss_detection=MissDetectionConfig(heartbeat=0.1),
+        ),
+        session.declare_publisher(f"car/{me}").declare_matching_listener(),
+    ]
+    threading.Thread(target=lambda: [print("never") for reply in session.get("asked")]).start()
+    with session:
+        while True:
+            kept[5].put(b"x" * 3000)
+            time.sleep(0.05)
+    """
+
+
+def test_nothing_is_raised_where_vehicles_are_killed_or_the_run_ends_in_the_middle(
+    drive: Drive, capfd: pytest.CaptureFixture[str]
+) -> None:
+    faults = [
+        {"kind": "kill", "at_s": 0.52, "duration_s": 0.5, "nodes": ["v01"]},
+        {"kind": "restart", "at_s": 0.83, "duration_s": 0.2, "nodes": ["v02"]},
+    ]
+    run = drive(ALL_KINDS, vehicles=3, duration_s=1.53, fault=faults)
+    gc.collect()
+    assert (events(run, "exception"), events(run, "crashed")) == ([], [])
+    assert not re.search("ignored|Traceback|never", capfd.readouterr().err)
+
+
+def test_frames_that_a_fault_has_changed_are_dropped(drive: Drive) -> None:
+    fault = {"kind": "corrupt", "at_s": 0.0, "duration_s": 2.0, "probability": 0.7}
+    run = drive(ALL_KINDS, vehicles=2, fault=[fault])
+    assert (events(run, "exception"), events(run, "crashed")) == ([], [])
+    assert any("is no sample" in event["text"] for event in events(run, "log"))

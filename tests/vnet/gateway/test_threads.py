@@ -1,6 +1,7 @@
 """Threads, clocks and chance of programs on virtual time."""
 
 import re
+import signal
 from pathlib import Path
 
 from tests.vnet.gateway.conftest import Drive, events, log
@@ -81,9 +82,10 @@ def test_conditions_barriers_semaphores_timers_locals_and_pools_work(drive: Driv
 
 
 def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -> None:
+    before = signal.getsignal(signal.SIGINT)
     run = drive(
         """
-        import asyncio, time
+        import asyncio, signal, time
 
         async def tick(name, period):
             for number in range(2):
@@ -92,6 +94,7 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
 
         async def main():
             loop = asyncio.get_running_loop()
+            loop.add_signal_handler(signal.SIGINT, loop.stop)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(tick("a", 0.1))
                 tasks.create_task(tick("b", 0.15))
@@ -119,6 +122,7 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
             print(error)
         """
     )
+    assert signal.getsignal(signal.SIGINT) is before, "signals of the process are not the program's"
     assert log(run)[:-1] == [
         "slept 0.05",
         "a 0 0.1",
@@ -132,6 +136,23 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
         "slept",
         "no running event loop",
     ]
+
+
+def test_joinable_threads_of_later_pythons_work(drive: Drive) -> None:
+    run = drive(
+        """
+        import _thread, time
+        handles = [_thread.start_joinable_thread(lambda: time.sleep(0.2), daemon=False) for _ in range(2)]
+        handles[0].join(0.1)
+        print(handles[0].is_done(), round(time.monotonic(), 2))
+        handles[0].join()
+        print(handles[0].is_done(), handles[0].ident != handles[1].ident, round(time.monotonic(), 2))
+        _thread.start_joinable_thread(lambda: time.sleep(0.3), daemon=False)
+        _thread._shutdown()
+        print(round(time.monotonic(), 2), _thread._make_thread_handle(7).ident, _thread._get_main_thread_ident())
+        """
+    )
+    assert log(run)[:-1] == ["False 0.1", "True True 0.2", "0.5 7 1"]
 
 
 CHANCE = """
@@ -163,7 +184,8 @@ def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path:
     (package / "__init__.py").write_text("from . import parts\nfrom .parts import *\nname = None\n")
     (package / "parts.py").write_text(
         "from __future__ import annotations\n"
-        "import time, dataclasses\nfrom typing import ClassVar, get_type_hints\n"
+        "import time, dataclasses\nfrom typing import ClassVar, NamedTuple, get_type_hints\n"
+        "class Place(NamedTuple):\n    x: int\n"
         "__all__ = ['Wheel', 'wait']\n"
         "@dataclasses.dataclass\nclass Wheel:\n    size: int\n    kind: ClassVar[str] = 'round'\n"
         "def wait():\n    time.sleep(0.5)\n    return get_type_hints(Wheel)['size']\n"

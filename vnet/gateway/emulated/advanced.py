@@ -165,7 +165,7 @@ class _Cache:
         entity = Entity(session, key, Direct(self._answer))
         session.declare("queryable", entity)
         self._node = session.vehicle.node
-        self.end = partial(session.vehicle.undeclare, "queryable", entity)
+        self.end = partial(session.end, entity)
 
     def _answer(self, query: Query) -> None:
         first, last = _range_of(query.parameters.get("_sn"))
@@ -273,7 +273,7 @@ class AdvancedSubscriber(Listening):
 
     def _declare(self, kind: str, entity: Entity) -> None:
         self.session.declare(kind, entity)
-        self._ends.append(partial(self.session.vehicle.undeclare, kind, entity))
+        self._ends.append(partial(self.session.end, entity))
 
     def _end_all(self) -> None:
         for end in self._ends:

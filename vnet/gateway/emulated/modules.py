@@ -108,7 +108,7 @@ class ProgramModules:
             "signal": self._signal,
             "sys": self._sys,
             "time": self._time,
-            "typing": partial(self._rebound, typing),
+            "typing": partial(self._rebound, typing, "get_type_hints"),
         }
 
     # Running.
@@ -262,11 +262,11 @@ class ProgramModules:
 
     # Modules of which the program has others.
 
-    def _rebound(self, real: ModuleType) -> ModuleType:
+    def _rebound(self, real: ModuleType, *only: str) -> ModuleType:
         """Return a module whose functions find the program's own modules in `sys.modules`; all else is shared."""
         facade = Facade(real, sys=self.load("sys"))
         for name, value in list(vars(facade).items()):
-            if isinstance(value, FunctionType) and value.__globals__ is vars(real):
+            if isinstance(value, FunctionType) and value.__globals__ is vars(real) and name in (only or (name,)):
                 again = FunctionType(
                     value.__code__, vars(facade), value.__name__, value.__defaults__, value.__closure__
                 )

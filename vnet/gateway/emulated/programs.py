@@ -57,44 +57,18 @@ ZENOHS_OWN = (
     "ZError",
 )
 """Values that Python can construct, and which are the same everywhere."""
-EMULATED: tuple[type, ...] = (
-    sessions.CancellationToken,
-    sessions.Liveliness,
-    sessions.LivelinessToken,
-    sessions.MatchingListener,
-    sessions.Publisher,
-    sessions.Querier,
-    queries.Query,
-    sessions.Queryable,
-    sessions.Scout,
-    sessions.Session,
-    sessions.SessionInfo,
-    sessions.Subscriber,
-    values.Config,
-    values.EntityGlobalId,
-    values.Handler,
-    values.Hello,
-    values.MatchingStatus,
-    values.Reply,
-    values.ReplyError,
-    values.Sample,
-    values.SourceInfo,
-    values.ZenohId,
-)
-EXTENDED = (
-    "AdvancedPublisher",
-    "AdvancedSubscriber",
-    "CacheConfig",
-    "HistoryConfig",
-    "Miss",
-    "MissDetectionConfig",
-    "RecoveryConfig",
-    "RepliesConfig",
-    "SampleMissListener",
-    "declare_advanced_publisher",
-    "declare_advanced_subscriber",
-)
-"""Names of `zenoh.ext` that are emulated; the others of it are Zenoh's own."""
+_EMULATED = (values, queries, sessions, advanced)
+
+
+def _own_names(real: ModuleType) -> dict[str, Any]:
+    """Return what stands here for names of one of Zenoh's modules."""
+    found = {}
+    for name in vars(real):
+        for module in _EMULATED:
+            own = vars(module).get(name)
+            if getattr(own, "__module__", "") == module.__name__:
+                found[name] = own
+    return found
 
 
 def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, ModuleType]:
@@ -109,20 +83,12 @@ def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, 
     def scout(handler: Any = None, what: Any = None, config: zenoh.Config | None = None) -> sessions.Scout:
         return sessions.Scout(vehicle, outlet, handler, what)
 
-    handlers = ModuleType("zenoh.handlers")
-    vars(handlers).update(
-        Callback=zenoh.handlers.Callback,
-        DefaultHandler=values.DefaultHandler,
-        FifoChannel=values.FifoChannel,
-        Handler=values.Handler,
-        RingChannel=values.RingChannel,
-    )
-    ext = ModuleType("zenoh.ext")
+    handlers, ext, package = (ModuleType(name) for name in ("zenoh.handlers", "zenoh.ext", "zenoh"))
+    vars(handlers).update(_own_names(zenoh.handlers), Callback=zenoh.handlers.Callback)
     vars(ext).update({name: value for name, value in vars(zenoh.ext).items() if not name.startswith("_")})
-    vars(ext).update({name: getattr(advanced, name) for name in EXTENDED})
-    package = ModuleType("zenoh")
+    vars(ext).update(_own_names(zenoh.ext))
     vars(package).update({name: getattr(zenoh, name) for name in ZENOHS_OWN})
-    vars(package).update({each.__name__: each for each in EMULATED})
+    vars(package).update(_own_names(zenoh))
     vars(package).update({name: refused(name, reason) for name, reason in REFUSED.items()})
     vars(package).update(
         __path__=[],

@@ -114,7 +114,7 @@ class Subscriber(Listening):
         sink, self.handler, self._is_background = sink_of(handler, session.outlet)
         number = next(session.entity_numbers)
         self._entity = Entity(session, key_of(key), sink, allowed_origin, bool(complete), number)
-        self._end = partial(session.vehicle.undeclare, self.kind, self._entity)
+        self._end = partial(session.end, self._entity)
         self._is_declared = True
         session.declare(self.kind, self._entity)
 
@@ -145,7 +145,7 @@ class LivelinessToken(Declared):
     def __init__(self, session: Session, key: Any) -> None:
         session.check_open()
         entity = Entity(session, key_of(key), eid=next(session.entity_numbers))
-        self._end = partial(session.vehicle.undeclare, "token", entity)
+        self._end = partial(session.end, entity)
         self._is_declared = True
         session.declare("token", entity)
 
@@ -364,6 +364,7 @@ class Session:
         self.entity_numbers = count(1)
         self._zid = vehicle.new_zid()
         self._is_closed = False
+        self._declared: dict[Entity, str] = {}
         self._at_close: list[Callable[[], object]] = []
         enabled = msgspec.json.decode(config.get_json("timestamping/enabled"))
         mode = msgspec.json.decode(config.get_json("mode")) or "peer"
@@ -388,6 +389,8 @@ class Session:
         if not self._is_closed:
             for end in self._at_close:
                 end()
+            for entity in list(self._declared):
+                self.end(entity)
             self._is_closed = True
 
     def is_closed(self) -> bool:
@@ -401,8 +404,13 @@ class Session:
 
     def declare(self, kind: str, entity: Entity) -> None:
         """Declare an entity, until the session is closed."""
-        self.at_close(partial(self.vehicle.undeclare, kind, entity))
+        self._declared[entity] = kind
         self.vehicle.declare(kind, entity)
+
+    def end(self, entity: Entity) -> None:
+        """Undeclare an entity, unless it has been."""
+        if (kind := self._declared.pop(entity, None)) is not None:
+            self.vehicle.undeclare(kind, entity)
 
     def at_close(self, end: Callable[[], object]) -> None:
         """Have `end` called when the session is closed."""

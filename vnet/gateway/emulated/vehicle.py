@@ -114,8 +114,6 @@ class Vehicle:
     def undeclare(self, kind: str, entity: Entity) -> None:
         """Remove one; it takes nothing more."""
         entities = self._entities[kind]
-        if entity not in entities:
-            return
         entities.remove(entity)
         entity.sink.close()
         self._changed(kind)
