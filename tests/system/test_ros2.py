@@ -9,7 +9,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from tests.system.conftest import Finished, Vnet
-from tests.system.ros2_nodes import FIRST_OF_PAMOJA, PAMOJA_GID
+from tests.system.ros2_nodes import FIRST_OF_PAMOJA, PAMOJA_GID, TWIST
 from tests.system.test_zenoh import SLOW
 from vnet.gateway.ros2 import CLOCK_TYPE, FIX_TYPE, parse_attachment, parse_topic
 
@@ -56,7 +56,7 @@ def test_two_clients_hear_ask_and_see_each_other_as_far_as_the_radio_carries(
     vnet: Vnet, tmp_path: Path, graph: str
 ) -> None:
     (tmp_path / "ros2.toml").write_text(SCENARIO.replace("GRAPH", graph))
-    done = vnet("run", str(tmp_path / "ros2.toml"))
+    done = vnet("run", str(tmp_path / "ros2.toml"), "--report")
     assert done.status in SLOW
     assert done.check("conservation")["verdict"] == done.check("isolation")["verdict"] == "valid"
     sent = pq.read_table(done.folder / "samples.parquet").to_pylist()
@@ -107,6 +107,11 @@ def test_two_clients_hear_ask_and_see_each_other_as_far_as_the_radio_carries(
     assert nodes == [["there", "gone", "there"] if graph == "range" else ["there"]]
     assert any("/SS/%/%/v01/%v01%add/" in key for key in seen)
     assert ("tokens" in {row["kind"] for row in sent}) == (graph == "range")
+
+    if graph == "range":
+        page = (done.folder / "report.html").read_text()
+        assert f"/cmd_vel {TWIST} in domain 7" in page
+        assert "v01 /v01" in page
 
     # What stays inside, and what vnet tells.
     assert not [row for row in sent for name in ("/tf", "clock", "/vnet/") if name in row["key"]]

@@ -13,6 +13,8 @@ from zenoh_ros2_sdk import attachment as sdk_attachment
 from zenoh_ros2_sdk import entity as sdk_entity
 from zenoh_ros2_sdk import keyexpr as sdk_keys
 
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.samples import key_figures
 from tests.vnet.gateway.conftest import Drive, log
 from vnet.gateway.ros2 import (
     CLOCK_TYPE,
@@ -208,6 +210,11 @@ NODE = """
     subscribers += [session.declare_subscriber(key, hear) for key in ("0/clock/**", "0/vnet/**")]
     serve = lambda query: query.reply(query.key_expr, b"yes")
     service = None if own == "v01" else session.declare_queryable(KEY.format("serve"), serve, complete=True)
+    tokens = []
+    for number, (kind, topic) in enumerate([("MP", "chatter"), ("SC" if own == "v01" else "SS", "serve")]):
+        endpoint = f"%{topic}/std_msgs::msg::dds_::String_/TypeHashNotSupported/::,10:,:,:,,"
+        key = f"@ros2_lv/0/{own}/0/{number}/{kind}/%/%/node/{endpoint}"
+        tokens.append(session.liveliness().declare_token(key))
     time.sleep(0.5)
     if own == "v01":
         for topic in ("chatter", "tf"):
@@ -225,3 +232,16 @@ def test_rules_services_clock_and_fixes_hold_on_virtual_time(drive: Drive) -> No
     topics = {topic.topic: (size, attached) for key, size, attached in heard if (topic := parse_topic(key))}
     assert topics == {"/chatter": ("5", "True"), "/clock": ("12", "True"), "/vnet/fix": ("364", "True")}
     assert 5 <= sum(key.startswith("0/clock/") for key, *_ in heard) <= 7
+
+
+def test_figures_are_by_topic_and_type_with_the_nodes_that_send(drive: Drive) -> None:
+    run = drive(NODE, vehicles=2, radio={"profile": "ros2"})
+    found = {(each.kind, each.key): each for each in key_figures(RecordedRun.open(run.folder))}
+    for kind, topic, nodes in (
+        ("put", "/chatter", {"v01 /node"}),
+        ("query", "/serve", {"v01 /node"}),
+        ("reply", "/serve", {"v02 /node"}),
+    ):
+        figures = found.pop((kind, f"{topic} std_msgs/msg/String"))
+        assert (figures.messages, figures.arrived, figures.nodes) == (1, 1, nodes)
+    assert found.keys() == {("tokens", "/node")}
