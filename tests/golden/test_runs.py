@@ -17,6 +17,7 @@ CASES = [
 ]
 EXEMPT = {
     "docs/examples/sumo_loop/street.toml": "needs libsumo",
+    "docs/how-to/ros2.md:chatter.toml": "its programs live in real time: system/test_ros2.py",
     "docs/how-to/zenoh.md:talkers.toml": "its programs live in real time: system/test_zenoh.py",
 }
 """Scenarios without a row, and why."""
