@@ -1,5 +1,6 @@
 """ROS 2's format on Zenoh, against independent readers and writers of it."""
 
+import io
 import math
 from typing import Any
 
@@ -7,12 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from pamoja import ros2 as pamoja
 from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk import attachment as sdk_attachment
 from zenoh_ros2_sdk import entity as sdk_entity
 from zenoh_ros2_sdk import keyexpr as sdk_keys
 
+from emulator.export.mcap_file import write_mcap
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.samples import key_figures
 from tests.vnet.gateway.conftest import Drive, log
@@ -232,6 +235,31 @@ def test_rules_services_clock_and_fixes_hold_on_virtual_time(drive: Drive) -> No
     topics = {topic.topic: (size, attached) for key, size, attached in heard if (topic := parse_topic(key))}
     assert topics == {"/chatter": ("5", "True"), "/clock": ("12", "True"), "/vnet/fix": ("364", "True")}
     assert 5 <= sum(key.startswith("0/clock/") for key, *_ in heard) <= 7
+
+
+def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(drive: Drive) -> None:
+    program = f"""
+        import sys, zenoh
+        session, own = zenoh.open(zenoh.Config()), sys.argv[1]
+        hashes = {{"chatter": "{STRING_HASH}", "old": "TypeHashNotSupported", "odd": "RIHS01_00"}}
+        for name, type_hash in hashes.items():
+            key = f"0/{{name}}/std_msgs::msg::dds_::String_/{{type_hash}}"
+            session.put(key, bytes.fromhex("000100000c000000") + b"hello from \\0")
+    """
+    run = drive(program, radio={"profile": "ros2", "max_payload_bytes": 120}, run={"keep_payloads": True})
+    file = io.BytesIO()
+    write_mcap(RecordedRun.open(run.folder), file)
+    file.seek(0)
+    schemas = {}
+    for schema, channel, message in make_reader(file).iter_messages():
+        if channel.message_encoding == "cdr":
+            told: Any = STORE.deserialize_cdr(message.data, "std_msgs/msg/String")
+            assert told.data == "hello from "
+            schemas[channel.topic] = (
+                None if schema is None else (schema.name, schema.encoding, schema.data.decode())
+            )
+    known = ("std_msgs/msg/String", "ros2msg", "string data\n")
+    assert schemas == {"/v01/chatter": known, "/v01/old": known, "/v01/odd": None}
 
 
 def test_figures_are_by_topic_and_type_with_the_nodes_that_send(drive: Drive) -> None:
