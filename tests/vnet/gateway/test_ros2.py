@@ -2,6 +2,8 @@
 
 import io
 import math
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,12 @@ from zenoh_ros2_sdk import attachment as sdk_attachment
 from zenoh_ros2_sdk import entity as sdk_entity
 from zenoh_ros2_sdk import keyexpr as sdk_keys
 
+import emulator
 from emulator.export.mcap_file import write_mcap
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.samples import key_figures
+from tests.support.paths import ROOT
+from tests.system.ros2_nodes import FIRST_OF_PAMOJA
 from tests.vnet.gateway.conftest import Drive, log
 from vnet.gateway.ros2 import (
     CLOCK_TYPE,
@@ -235,6 +240,39 @@ def test_rules_services_clock_and_fixes_hold_on_virtual_time(drive: Drive) -> No
     topics = {topic.topic: (size, attached) for key, size, attached in heard if (topic := parse_topic(key))}
     assert topics == {"/chatter": ("5", "True"), "/clock": ("12", "True"), "/vnet/fix": ("364", "True")}
     assert 5 <= sum(key.startswith("0/clock/") for key, *_ in heard) <= 7
+
+
+@pytest.mark.slow
+def test_two_clients_that_share_no_code_run_unmodified_on_virtual_time(tmp_path: Path) -> None:
+    """All of it replays: who hears whom, who answers, and what is seen of the graph."""
+    nodes = str(ROOT / "tests/system/ros2_nodes.py")
+    scenario = {
+        "run": {"duration_s": 8.0, "settle_s": 0.0},
+        "network": {"vehicles": 2},
+        "radio": {"range_m": 1e5, "profile": "ros2", "ros2": {"domain": 7}},
+        "program": {
+            "kind": "zenoh",
+            "command": ["python", nodes, "sdk", "v01", "v02"],
+            "exceptions": [{"nodes": ["v02"], "command": ["python", nodes, "pamoja", "v02", "v01"]}],
+            "zenoh": {"liveliness_s": 0.3},
+        },
+        "fault": [{"kind": "partition", "at_s": 3.0, "duration_s": 3.0, "groups": [["v01"], ["v02"]]}],
+    }
+    first, again = (emulator.simulate(scenario, out=tmp_path / name) for name in ("first", "again"))
+    assert first.trace.to_pylist() == again.trace.to_pylist()
+    told = {node: [line.split() for line in log(first, node)] for node in ("v01", "v02")}
+    assert told == {node: [line.split() for line in log(again, node)] for node in ("v01", "v02")}
+    heard = [int(line[1]) for line in told["v02"] if line[0] == "heard"]
+    of_sdk = [number for number in heard if number < FIRST_OF_PAMOJA]
+    (cut,) = [number for number, after in pairwise(of_sdk) if after != number + 1]
+    assert of_sdk[: of_sdk.index(cut) + 1] == list(range(cut + 1)), "all are heard before the partition"
+    assert max(int(line[1]) for line in told["v01"] if line[0] == "heard") > FIRST_OF_PAMOJA + 20
+    for lines in told.values():
+        answers = [line for line in lines if line[0] == "answered"]
+        assert len(answers) >= 3
+        assert all(int(total) == int(number) + 1 for _, number, total, *_ in answers)
+    seen = [change for word, change, *key in told["v02"] if word == "token" and key[0].endswith("/0/NN/%/%/v01")]
+    assert seen == ["there", "gone", "there"]
 
 
 def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(drive: Drive) -> None:
