@@ -23,6 +23,7 @@ EXTRA_OF = {
     "pycrate_asn1dir": "its",
     "pyproj": "maps",
     "rerun": "rerun",
+    "rosbags": "ros2",
     "scipy": "scipy",
 }
 """Extra of `vnet-emulator` that installs a library, by the name under which it is imported."""

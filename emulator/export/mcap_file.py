@@ -2,8 +2,9 @@
 
 Topics, each with its JSON schema: `/tf` the true pose of each vehicle (foxglove.FrameTransforms, which viewers show
 with names), `/vehicles/fix` and `/vehicles/estimate` (foxglove.PosesInFrame), `/states` the truth, fixes and
-reports of a period, `/metrics` its figures, `/frames` each frame with its receivers by outcome, `/events`. Times
-are nanoseconds from the start of the run. The scenario is an attachment.
+reports of a period, `/metrics` its figures, `/frames` each frame with its receivers by outcome, `/events`. Messages
+of ROS 2 that were sent by radio are there as they are, in CDR, if their payloads were kept. Times are nanoseconds
+from the start of the run. The scenario is an attachment.
 """
 
 from __future__ import annotations
@@ -13,18 +14,25 @@ import json
 import math
 from base64 import b64encode
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any, BinaryIO
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import SCENARIO_FILE
-from vnet.extras import require
+from emulator.records.tables import PAYLOADS
+from vnet.extras import is_installed, require
+from vnet.gateway.frames import CrossingSample, Reassembly
+from vnet.gateway.ros2 import TopicKey, parse_topic
 from vnet.units import NS_PER_S
 
-Message = tuple[int, str, dict[str, Any]]
-"""Time in ns, topic and content."""
+Channel = str | tuple[str, TopicKey]
+"""A topic of vnet's, or a vehicle and what it has published in ROS 2."""
+Message = tuple[int, Channel, dict[str, Any] | bytes]
+"""Time in ns, channel and content."""
 
 NUMBER: dict[str, Any] = {"type": "number"}
 TEXT: dict[str, Any] = {"type": "string"}
@@ -86,15 +94,21 @@ def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
 
     writer = Writer(file)
     writer.start(profile="", library="vnet")
-    channels = {}
+    channels: dict[Channel, int] = {}
     for topic, (name, schema) in SCHEMAS.items():
         described = json.dumps({"title": name, **schema}).encode()
         schema_id = writer.register_schema(name, "jsonschema", described)
         channels[topic] = writer.register_channel(topic, "json", schema_id)
     count = 0
-    for time_ns, topic, message in heapq.merge(*_streams(recorded), key=lambda one: one[0]):
-        data = json.dumps(message, allow_nan=False).encode()
-        writer.add_message(channels[topic], log_time=time_ns, publish_time=time_ns, data=data, sequence=count)
+    for time_ns, channel, message in heapq.merge(*_streams(recorded), key=lambda one: one[0]):
+        if isinstance(channel, tuple) and channel not in channels:
+            vehicle, sent = channel
+            text = _definition(sent.type, sent.type_hash)
+            schema_id = 0 if text is None else writer.register_schema(sent.type, "ros2msg", text)
+            told = {"node": vehicle, "type": sent.type, "type_hash": sent.type_hash}
+            channels[channel] = writer.register_channel(f"/{vehicle}{sent.topic}", "cdr", schema_id, told)
+        data = message if isinstance(message, bytes) else json.dumps(message, allow_nan=False).encode()
+        writer.add_message(channels[channel], log_time=time_ns, publish_time=time_ns, data=data, sequence=count)
         count += 1
     scenario = recorded.scenario_text.encode()
     writer.add_attachment(
@@ -106,7 +120,38 @@ def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
 
 def _streams(recorded: OpenedRun) -> list[Iterator[Message]]:
     """Return the streams of messages, each in the order of time."""
-    return [_periods(recorded), _metrics(recorded), _frames(recorded), _events(recorded)]
+    return [_periods(recorded), _metrics(recorded), _frames(recorded), _events(recorded), _ros2(recorded)]
+
+
+def _ros2(recorded: RecordedRun) -> Iterator[Message]:
+    """Yield the messages that programs of ROS 2 have published by radio, if the run has kept its payloads."""
+    table = recorded.table(PAYLOADS)
+    if table is None or recorded.scenario.radio.profile != "ros2":
+        return
+    reassembly = Reassembly()
+    for row in table.sort_by([(name, "ascending") for name in ("time_ns", "sender", "seq")]).to_pylist():
+        try:
+            message = reassembly.take(row["sender"], row["payload"])
+        except (msgspec.MsgspecError, LookupError):  # of a program that has the radio's bytes in hand
+            continue
+        if isinstance(message, CrossingSample) and not message.is_delete:
+            topic = parse_topic(message.key)
+            if topic is not None and topic.key == message.key:
+                yield row["time_ns"], (row["sender"], topic), message.payload
+
+
+@cache
+def _definition(ros_type: str, type_hash: str) -> bytes | None:
+    """Return the definition of a type, with those it uses; None unless rosbags has one with this hash."""
+    if not is_installed("rosbags"):
+        return None
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    has_hash = type_hash.startswith("RIHS01_")
+    if ros_type not in store.fielddefs or (has_hash and store.hash_rihs01(ros_type) != type_hash):
+        return None
+    return store.generate_msgdef(ros_type, ros_version=2)[0].encode()
 
 
 def _periods(recorded: RecordedRun) -> Iterator[Message]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,9 +26,12 @@ from vnet.gateway.frames import (
     Reassembly,
     decode_fragment,
 )
+from vnet.gateway.ros2 import parse_token, parse_topic
 from vnet.types import IntArray
 
 DELIVERED = Outcome.delivered.name
+SENDS: dict[str, str] = {"MP": "put", "SC": "query", "SS": "reply"}
+"""Kind of message that an endpoint of ROS 2 sends, by the kind in its token."""
 
 
 class SampleRecorder:
@@ -78,7 +82,10 @@ class KeyFigures:
     """The messages under one key, and their fate at the receivers in range."""
 
     key: str
+    """The key; topic and type, or the nodes of tokens, where it is one of ROS 2."""
     kind: str
+    nodes: set[str] = field(default_factory=set)
+    """Vehicle and name of the nodes of ROS 2 whose tokens say that they are its senders."""
     messages: int = 0
     frames: int = 0
     payload_bytes: int = 0
@@ -95,8 +102,11 @@ def key_figures(recorded: OpenedRun) -> list[KeyFigures]:
         return []
     found: dict[tuple[str, str], KeyFigures] = {}
     rows = table.to_pylist()
+    nodes = _senders(rows)
     for row in rows:
+        row["key"], topic = _named(row["kind"], row["key"])
         figures = found.setdefault((row["kind"], row["key"]), KeyFigures(row["key"], row["kind"]))
+        figures.nodes |= nodes.get((row["sender"], row["kind"], topic), set())
         figures.messages += 1
         figures.frames += row["frames"]
         figures.payload_bytes += row["payload_bytes"]
@@ -107,6 +117,31 @@ def key_figures(recorded: OpenedRun) -> list[KeyFigures]:
         else:
             figures.lost[outcome] += 1
     return sorted(found.values(), key=lambda each: (-each.messages, each.key, each.kind))
+
+
+def _named(kind: str, key: str) -> tuple[str, str | None]:
+    """Return a key in words, and the topic or service of ROS 2 that it is of."""
+    if kind == "tokens":
+        tokens = [parse_token(each) for each in key.split()]
+        named = sorted({token.node_name for token in tokens if token is not None})
+        return (", ".join(named) if named and None not in tokens else key), None
+    topic = parse_topic(key.partition("?")[0])
+    if topic is None:
+        return key, None
+    domain = f" in domain {topic.domain}" if topic.domain else ""
+    below = ", @adv" if "/@adv/" in key else ""
+    return f"{topic.topic} {topic.type}{domain}{below}", topic.topic
+
+
+def _senders(rows: Sequence[dict[str, Any]]) -> dict[tuple[str, str, str | None], set[str]]:
+    """Return the nodes of ROS 2 by vehicle, kind of message and topic, as their tokens tell."""
+    found: dict[tuple[str, str, str | None], set[str]] = {}
+    for sender, keys in {(row["sender"], row["key"]) for row in rows if row["kind"] == "tokens"}:
+        for token in map(parse_token, keys.split()):
+            if token is not None and token.endpoint is not None and token.kind in SENDS:
+                place = sender, SENDS[token.kind], token.endpoint.topic
+                found.setdefault(place, set()).add(f"{sender} {token.node_name}")
+    return found
 
 
 def _outcomes(recorded: OpenedRun, rows: Sequence[dict[str, object]]) -> Iterator[tuple[int, str]]:

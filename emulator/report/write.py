@@ -26,7 +26,7 @@ from emulator.report.radio_figures import radio_section
 from emulator.report.source import Source, maybe, why_not
 from emulator.report.timeline import timeline
 from vnet.counted import counted
-from vnet.errors import VnetError
+from vnet.errors import VnetError, first_names
 
 MOST_EVENTS = 200
 MOST_SAID = 2000
@@ -215,10 +215,12 @@ def _keys(source: Source) -> dict[str, Any] | None:
     found = maybe(lambda: sample_figures(source))
     if not found:
         return None
+    has_nodes = any(each.nodes for each in found)
     rows = [
         {
             "key": each.key,
             "kind": each.kind,
+            **({"from": first_names(sorted(each.nodes)) if each.nodes else ""} if has_nodes else {}),
             "messages": f"{each.messages:,}",
             "frames": f"{each.frames:,}",
             "payload": f"{each.payload_bytes:,} bytes",

@@ -16,6 +16,7 @@ from vnet.errors import ScenarioError, shown
 
 _MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
+_TOPIC = re.compile(r"(/([A-Za-z_]\w*|\*\*?))+", re.ASCII)
 MANY_SESSIONS = 10_000
 Coordinate = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
 NodeId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
@@ -42,6 +43,15 @@ def _is_entry(entry: str) -> str:
 
 
 Entry = Annotated[str, AfterValidator(_is_entry)]
+
+
+def _is_topic(name: str) -> str:
+    if not _TOPIC.fullmatch(name):
+        raise ValueError('write it as "/tf", with * for one part of a name and ** for any number')
+    return name
+
+
+Topic = Annotated[str, AfterValidator(_is_topic)]
 
 
 ZENOH_ENTRY = "vnet.gateway.emulated:main"
@@ -107,6 +117,21 @@ class ZenohSessions(Section):
             if secure != (getattr(self, name) is not None):
                 raise ValueError(f"listen = {shown(self.listen)}: {name} goes with tls/ and quic/, which need it")
         return self
+
+
+class Ros2Topics(Section):
+    """`[radio.ros2]`: topics, services and graph of programs of ROS 2, with `radio.profile = "ros2"`."""
+
+    inside: tuple[Topic, ...] = ("/parameter_events", "/rosout", "/tf", "/tf_static")
+    """Topics and services that stay in their vehicle, with their tokens, as do `/clock` and `/vnet/**`: names as in
+    `/tf`, with `*` for one part of a name and `**` for any number."""
+    graph: Literal["range", "always"] = "range"
+    """Whose nodes and topics a vehicle sees: those of vehicles whose tokens its radio hears (`range`), or those of
+    all, past the radio (`always`, in real time)."""
+    domain: int = Field(0, ge=0, le=232)
+    """`ROS_DOMAIN_ID` of commands, and of `/clock` and `/vnet/fix`. All domains cross the radio."""
+    clock_hz: float = Field(10.0, gt=0, le=1000)
+    """Rate at which a vehicle's own programs are told emulated time on `/clock`."""
 
 
 class ProgramException(OneProgram):

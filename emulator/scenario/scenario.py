@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.network import Driven, Map, Network
-from emulator.scenario.program import Backbone, Program, RoadsideUnit, with_names
+from emulator.scenario.program import Backbone, Program, RoadsideUnit, Ros2Topics, with_names
 from emulator.scenario.radio import RATES_MBPS, Buildings, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.sections import DAY_S, FAR_M, Section
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
@@ -144,6 +144,12 @@ class Radio(Section):
     """For programs of `kind = "zenoh"`: key expressions that cross the radio, none of which overlap; `**` and
     `**/@adv/**` if left out. What is put elsewhere stays in its vehicle, and so does `vnet/**`."""
 
+    profile: Literal["ros2"] | None = None
+    """For programs of `kind = "zenoh"`: what their keys mean. With `ros2` topics and services of rmw_zenoh, and the
+    tokens of its graph, cross the radio, except those that stay inside (docs/how-to/ros2.md)."""
+    ros2: Ros2Topics | None = None
+    """Its options; it has its defaults if left out."""
+
     @property
     def is_physical(self) -> bool:
         """True if signals have a power, and frames the airtime of 802.11p."""
@@ -164,6 +170,17 @@ class Radio(Section):
             rates = ", ".join(f"{rate:g}" for rate in RATES_MBPS)
             raise ValueError(f"bitrate_mbps = {self.bitrate_mbps:g}: 802.11p has {rates}")
         return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _ros2_is_of_its_profile(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        if data.get("profile") == "ros2":
+            return {"ros2": {}, **data}
+        if data.get("ros2") is not None:
+            raise ValueError('ros2 goes with profile = "ros2"')
+        return data
 
     @field_validator("links", mode="before")
     @classmethod
@@ -216,8 +233,9 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _zenoh_programs_can_run(self) -> Scenario:
         if self.program.kind != "zenoh":
-            if self.radio.keys is not None:
-                raise ValueError('radio.keys goes with program.kind = "zenoh"')
+            for name in ("keys", "profile"):
+                if getattr(self.radio, name) is not None:
+                    raise ValueError(f'radio.{name} goes with program.kind = "zenoh"')
             return self
         for unit in self.roadside:
             if unit.entry is not None:
@@ -225,6 +243,8 @@ class Scenario(Section):
         if self.run.pacing == "lockstep":
             if not self.program.commands:
                 raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
+            if self.radio.ros2 is not None and self.radio.ros2.graph == "always":
+                raise ValueError('radio.ros2.graph = "always" needs run.pacing = "realtime"')
             return self
         if self.run.nodes_per_process != 1:
             raise ValueError('run.nodes_per_process goes with program.kind = "vnet": Zenoh programs have their own')
@@ -286,11 +306,13 @@ class Scenario(Section):
         if self.program.kind != "zenoh":
             return self.program.of(node).options
         sessions = self.program.sessions
-        own = {
+        own: dict[str, Any] = {
             "command": self.program.commands_of(node),
             "query_s": sessions.query_s,
             "liveliness_s": sessions.liveliness_s,
         }
+        if self.radio.ros2 is not None:
+            own["ros2"] = self.radio.ros2.model_dump(mode="json", exclude={"graph"})
         return own | ({} if self.radio.keys is None else {"keys": list(self.radio.keys)})
 
     @property

@@ -31,6 +31,7 @@ from vnet.gateway.frames import (
     Reassembly,
 )
 from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
+from vnet.gateway.ros2 import Published, Ros2
 from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
 from vnet.transport.session import open_local_router, router_endpoint
 from vnet.transport.wire import WireFix
@@ -51,9 +52,11 @@ class Gateway:
     "session", "report"), and the gateway with what belongs to it: `take` then takes that on the run's loop.
     """
 
-    def __init__(self, node: str, keys: Sequence[str], settings: ZenohSessions, hear: Hear) -> None:
+    def __init__(
+        self, node: str, keys: Sequence[str], settings: ZenohSessions, hear: Hear, ros2: Ros2 | None = None
+    ) -> None:
         self.node = node
-        self._keys, self._settings, self._hear = keys, settings, hear
+        self._keys, self._settings, self._hear, self._ros2 = keys, settings, hear, ros2
         self._session: zenoh.Session | None = None
         self._watches: list[Any] = []
         self._queries: dict[int, zenoh.Query] = {}
@@ -77,10 +80,14 @@ class Gateway:
         endpoint = router_endpoint(session)
         for key in self._keys:
             session.declare_subscriber(key, self._put, allowed_origin=REMOTE)
-            session.declare_queryable(key, self._asked, allowed_origin=REMOTE)
+            # Clients of ROS 2's services ask none but complete queryables.
+            session.declare_queryable(key, self._asked, complete=self._ros2 is not None, allowed_origin=REMOTE)
             watch = session.liveliness().declare_subscriber(key, self._token, history=True)
             self._watches.append(watch)
         session.declare_subscriber(REPORT_KEY, self._reported, allowed_origin=REMOTE)
+        if self._ros2 is not None:
+            own = map(session.liveliness().declare_token, self._ros2.tokens(str(session.zid())))
+            self._watches.extend(own)
         info = session.info
         self._watches.append(info.declare_transport_events_listener(self._connected, history=True))
         return endpoint
@@ -101,15 +108,18 @@ class Gateway:
     def _tell(self, what: str, item: Any) -> None:
         self._hear("gateway", what, (self, item))
 
+    def _crosses(self, key: str) -> bool:
+        return not key.startswith(OWN_KEYS) and (self._ros2 is None or self._ros2.crosses(key))
+
     def _put(self, sample: zenoh.Sample) -> None:
-        if not str(sample.key_expr).startswith(OWN_KEYS):
+        if self._crosses(str(sample.key_expr)):
             self._tell("message", crossing_of(sample))
 
     def _asked(self, query: zenoh.Query) -> None:
-        if str(query.key_expr).startswith(OWN_KEYS):
-            query.drop()  # type: ignore[no-untyped-call]
-        else:
+        if self._crosses(str(query.key_expr)):
             self._tell("query", query)
+        else:
+            query.drop()  # type: ignore[no-untyped-call]
 
     def _token(self, sample: zenoh.Sample) -> None:
         self._tell("token", (str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
@@ -163,7 +173,7 @@ class Gateway:
 
     def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
         """Take a token that has appeared or is gone; those that other vehicles have told of are echoes."""
-        if key in self._declared or key.startswith(OWN_KEYS) or (key in self._tokens) == is_there:
+        if key in self._declared or not self._crosses(key) or (key in self._tokens) == is_there:
             return None
         (self._tokens.add if is_there else self._tokens.discard)(key)
         return CrossingTokens(tuple(sorted(self._tokens)))
@@ -194,12 +204,29 @@ class Gateway:
             case CrossingReply():
                 self._reply(message)
             case CrossingTokens():
-                self._show_tokens(self._heard_tokens.hear(sender, message.keys, time_ns))
+                self.hear_tokens(sender, message, time_ns)
+
+    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int) -> None:
+        """Take word of another vehicle's tokens."""
+        if self._session is not None:
+            self._show_tokens(self._heard_tokens.hear(sender, tokens.keys, time_ns))
 
     def show_fix(self, fix: WireFix) -> None:
         """Put a fix of the vehicle's receiver at its programs."""
         if self._session is not None:
             self._session.put(FIX_KEY, fix_content(fix.fix()), allowed_destination=REMOTE)
+            if self._ros2 is not None:
+                self._publish(self._ros2.fix(fix.fix()))
+
+    def show_clock(self, time_ns: int) -> None:
+        """Tell the programs emulated time, as ROS 2 does."""
+        if self._session is not None and self._ros2 is not None:
+            self._publish(self._ros2.clock(time_ns))
+
+    def _publish(self, sample: Published) -> None:
+        assert self._session is not None
+        key, payload, attachment = sample
+        self._session.put(key, payload, attachment=attachment, allowed_destination=REMOTE)
 
     def _show(self, sample: CrossingSample) -> None:
         assert self._session is not None

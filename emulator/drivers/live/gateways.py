@@ -28,8 +28,9 @@ from emulator.drivers.live.gateway import Gateway, session_environment
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from vnet.errors import ProgramError, VnetError, first_names, shown
-from vnet.gateway.frames import CrossingReply, Fragments, Message, TooLargeError
+from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
 from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY, check_keys
+from vnet.gateway.ros2 import ROS2_KEYS, Ros2
 from vnet.radio import SentFrame
 from vnet.reports import Report, Reporter
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
@@ -91,7 +92,8 @@ class Gateways:
         scenario = emulation.scenario
         self._emulation, self._launcher, self._starts = emulation, launcher, starts
         self._program, self._settings = scenario.program, scenario.program.sessions
-        self._keys = scenario.radio.keys or RADIO_KEYS
+        self._ros2 = scenario.radio.ros2
+        self._keys = scenario.radio.keys or (RADIO_KEYS if self._ros2 is None else ROS2_KEYS)
         check_keys(self._keys)
         self._hear, self._tell, self._time_ns, self._changes = hear, tell, time_ns, changes
         self._loop = asyncio.get_running_loop()
@@ -126,9 +128,9 @@ class Gateways:
     def start_agents(self, endpoint: str, access: Access, groups: Sequence[Sequence[str]], nice: int = 0) -> None:
         """Open the gateways of these vehicles, and start their commands."""
         for (node,) in groups:
-            vehicle = self._vehicles[node] = _Vehicle(
-                Gateway(node, self._keys, self._settings, self._hear), Reporter(node), nice
-            )
+            rules = None if self._ros2 is None else Ros2(node, self._ros2.inside, self._ros2.domain)
+            gateway = Gateway(node, self._keys, self._settings, self._hear, rules)
+            vehicle = self._vehicles[node] = _Vehicle(gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
@@ -305,6 +307,8 @@ class Gateways:
         inherited = {name: value for name, value in os.environ.items() if name != RUNTIME_VARIABLE}
         environment = session_environment(node, endpoint, self._settings, folder, inherited)
         environment |= {STARTED_BY_VNET: "1", "PYTHONUNBUFFERED": "1"}
+        if self._ros2 is not None:
+            environment["ROS_DOMAIN_ID"] = str(self._ros2.domain)
         filled = {"{id}": node, "{endpoint}": endpoint, "{port}": endpoint.rpartition(":")[2]}
         try:
             for number, words in enumerate(commands, start=1):
@@ -348,6 +352,12 @@ class Gateways:
         vehicle.on_air = True
         self._acknowledge(vehicle)
         self._renew_tokens(vehicle)
+        self._tell_clock(vehicle)
+
+    def _tell_clock(self, vehicle: _Vehicle) -> None:
+        if self._ros2 is not None and self._is_there(vehicle):
+            vehicle.gateway.show_clock(max(self._time_ns(), 0))
+            self._loop.call_later(1 / self._ros2.clock_hz, self._tell_clock, vehicle)
 
     def _acknowledge(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
@@ -394,6 +404,11 @@ class Gateways:
         """Send a message by the vehicle's radio: a reply to one vehicle, if the MAC repeats what is lost."""
         assert vehicle.fragments is not None
         node, to = vehicle.gateway.node, None
+        if isinstance(message, CrossingTokens) and self._ros2 is not None and self._ros2.graph == "always":
+            for other in self._vehicles.values():
+                if other is not vehicle:
+                    other.gateway.hear_tokens(node, message, max(self._time_ns(), 0))
+            return
         if isinstance(message, CrossingReply) and vehicle.acknowledges:
             to = message.to
         try:

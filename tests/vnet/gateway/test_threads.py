@@ -204,6 +204,20 @@ def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path:
     assert log(run, "v02")[0] == "<class 'int'> v02 Wheel(size=3) True"
 
 
+def test_classes_made_by_functions_of_typing_work(drive: Drive) -> None:
+    run = drive("""
+        import typing
+        from typing import NamedTuple
+        class Pose(NamedTuple):
+            x: float
+            y: float = 2.0
+        class Options(typing.TypedDict, total=False):
+            x: float
+        print(Pose(1.0)._asdict(), Options(x=3.0))
+    """)
+    assert log(run)[0] == "{'x': 1.0, 'y': 2.0} {'x': 3.0}"
+
+
 def test_sys_exit_finishes_or_crashes_by_its_status(drive: Drive) -> None:
     text = "import atexit, sys\natexit.register(print, 'bye')\nsys.exit(int(sys.argv[1] == 'v02') * 3)"
     run = drive(text, vehicles=2)

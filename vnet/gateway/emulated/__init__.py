@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from vnet.errors import ProgramError, shown
 from vnet.gateway.emulated.programs import run_program
 from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.gateway.keys import RADIO_KEYS, check_keys
+from vnet.gateway.ros2 import ROS2_KEYS, Ros2
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -25,7 +27,8 @@ PYTHON = ("python", "python3")
 async def main(node: Node) -> None:
     """Run the programs of a scenario with `program.kind = "zenoh"` until all have ended.
 
-    `node.options` has their commands (`command`), `keys` that cross the radio, and `query_s` and `liveliness_s`.
+    `node.options` has their commands (`command`), `keys` that cross the radio, `query_s` and `liveliness_s`, and
+    `ros2`: the options of `[radio.ros2]`.
     """
     loop = asyncio.get_running_loop()
     if not isinstance(loop, VirtualTimeLoop):
@@ -37,10 +40,13 @@ async def main(node: Node) -> None:
                 f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT … or "
                 'python -m MODULE …; any other needs run.pacing = "realtime"'
             )
-    keys = node.options.get("keys", RADIO_KEYS)
+    topics: Mapping[str, Any] | None = node.options.get("ros2")
+    ros2 = None if topics is None else Ros2(node.id, topics["inside"], topics["domain"])
+    keys = node.options.get("keys", RADIO_KEYS if ros2 is None else ROS2_KEYS)
     check_keys(keys)
-    vehicle = Vehicle(node, keys, node.options.get("query_s", 1.0), node.options.get("liveliness_s", 1.0))
-    background = [Task(each, loop=loop) for each in vehicle.tasks()]
+    vehicle = Vehicle(node, keys, node.options.get("query_s", 1.0), node.options.get("liveliness_s", 1.0), ros2)
+    clock = [] if ros2 is None or topics is None else [vehicle.tell_clock(ros2, topics["clock_hz"])]
+    background = [Task(each, loop=loop) for each in [*vehicle.tasks(), *clock]]
     try:
         async with asyncio.TaskGroup() as tasks:
             for words in commands:

@@ -46,6 +46,7 @@ from vnet.gateway.frames import (
     decode_message,
 )
 from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
+from vnet.gateway.ros2 import Ros2
 from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
 from vnet.node import Node
 from vnet.radio import Packet
@@ -59,8 +60,10 @@ MOST_KEYS = 4096
 class Vehicle:
     """The sessions of one vehicle, and its radio."""
 
-    def __init__(self, node: Node, keys: Sequence[str], query_s: float, liveliness_s: float) -> None:
-        self.node = node
+    def __init__(
+        self, node: Node, keys: Sequence[str], query_s: float, liveliness_s: float, ros2: Ros2 | None = None
+    ) -> None:
+        self.node, self._ros2 = node, ros2
         self.zid = ZenohId.of(node.id, node.incarnation, "router")
         self._keys = [zenoh.KeyExpr(key) for key in keys]
         self._query_s, self._liveliness_s = query_s, liveliness_s
@@ -105,7 +108,8 @@ class Vehicle:
         self._entities[kind].append(entity)
         if kind != "token":
             self._listen()
-        if kind == "subscriber" and entity.key.intersects(FIX_KEY):
+        fix_keys = [FIX_KEY] if self._ros2 is None else [FIX_KEY, self._ros2.fix_key]
+        if kind == "subscriber" and any(map(entity.key.intersects, fix_keys)):
             self._locates.set()
         self._changed(kind)
         if kind == "token":
@@ -144,6 +148,7 @@ class Vehicle:
         if crosses is None:
             expression = key_of(key)
             crosses = not key.startswith(OWN_KEYS) and any(each.intersects(expression) for each in self._keys)
+            crosses = crosses and (self._ros2 is None or self._ros2.crosses(key))
             if len(self._crossing) < MOST_KEYS:
                 self._crossing[key] = crosses
         return crosses
@@ -197,7 +202,8 @@ class Vehicle:
             complete = [each for each in others if each.is_complete and each.key.includes(asking.key)]
             crosses = session is not None and self.crosses(str(asking.key))
             if all_complete:
-                others, crosses = complete, False
+                # Clients of ROS 2's services ask none but complete queryables.
+                others, crosses = complete, crosses and self._ros2 is not None
             elif complete and asking.target == zenoh.QueryTarget.BEST_MATCHING:
                 nearest = complete[0].session
                 others, crosses = [each for each in others if each.session is nearest], False
@@ -373,14 +379,27 @@ class Vehicle:
         await self._locates.wait()
         self.node.gnss.drain()
         async for fix in self.node.gnss:
-            sample = Sample(
-                key_of(FIX_KEY),
-                zenoh.ZBytes(fix_content(fix)),
-                PUT,
-                NO_ENCODING,
-                self.new_timestamp(self.zid),
-            )
-            self._deliver([each for each in self._subscribers_of(FIX_KEY) if each.is_remote], sample)
+            self._publish(FIX_KEY, fix_content(fix))
+            if self._ros2 is not None:
+                self._publish(*self._ros2.fix(fix))
+
+    async def tell_clock(self, ros2: Ros2, clock_hz: float) -> None:
+        """Tell the sessions emulated time, as ROS 2 does."""
+        while True:
+            self._publish(*ros2.clock(self.node.now_ns))
+            await asyncio.sleep(1 / clock_hz)
+
+    def _publish(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Take a sample of vnet's own to the sessions."""
+        sample = Sample(
+            key_of(key),
+            zenoh.ZBytes(payload),
+            PUT,
+            NO_ENCODING,
+            self.new_timestamp(self.zid),
+            attachment=None if attachment is None else zenoh.ZBytes(attachment),
+        )
+        self._deliver([each for each in self._subscribers_of(key) if each.is_remote], sample)
 
 
 @lru_cache(maxsize=1024)

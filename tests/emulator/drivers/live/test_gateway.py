@@ -14,6 +14,7 @@ from emulator.scenario.program import ZenohSessions
 from vnet.errors import ProgramError
 from vnet.gateway.frames import CrossingTokens, Fragments
 from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY, check_keys
+from vnet.gateway.ros2 import ROS2_KEYS, Ros2
 from vnet.transport.wire import WireFix
 from vnet.units import NS_PER_S
 
@@ -26,8 +27,8 @@ QUIET = ZenohSessions()
 class Vehicle:
     """A gateway and its radio: frames reach all of `others`, unless `is_lost` says so of their number."""
 
-    def __init__(self, name: str, keys: tuple[str, ...], max_payload: int) -> None:
-        self.gateway = Gateway(name, keys, QUIET, self._hear)
+    def __init__(self, name: str, keys: tuple[str, ...], max_payload: int, ros2: Ros2 | None) -> None:
+        self.gateway = Gateway(name, keys, QUIET, self._hear, ros2)
         self.others: list[Vehicle] = []
         self.is_lost: Callable[[int], bool] = lambda number: False
         self.frames: list[bytes] = []
@@ -101,11 +102,13 @@ def two(
     test: Callable[[list[Vehicle], list[zenoh.Session]], Coroutine[Any, Any, None]],
     keys: tuple[str, ...] = ("**",),
     max_payload: int = 2000,
+    inside: tuple[str, ...] | None = None,
 ) -> None:
-    """Run a test with two vehicles in range, and a client of each."""
+    """Run a test with two vehicles in range, and a client of each; in ROS 2 if topics are `inside`."""
 
     async def run() -> None:
-        first, second = vehicles = [Vehicle(name, keys, max_payload) for name in ("v01", "v02")]
+        rules = {name: None if inside is None else Ros2(name, inside, 0) for name in ("v01", "v02")}
+        first, second = vehicles = [Vehicle(name, keys, max_payload, ros2) for name, ros2 in rules.items()]
         first.others, second.others = [second], [first]
         try:
             endpoints = [await asyncio.to_thread(each.gateway.open, QUIET.listen) for each in vehicles]
@@ -310,6 +313,49 @@ def test_a_program_hears_its_fixes_and_reports_by_keys_of_vnet() -> None:
         assert vehicles[0].frames == []
 
     two(test)
+
+
+def test_topics_services_and_tokens_of_ros_2_cross_or_stay_inside_with_each_other() -> None:
+    def key(topic: str) -> str:
+        return f"0/{topic}/std_msgs::msg::dds_::String_/TypeHashNotSupported"
+
+    def token(topic: str) -> str:
+        return (
+            f"@ros2_lv/0/ab/0/1/MP/%/%/node/%{topic}/std_msgs::msg::dds_::String_/TypeHashNotSupported/::,:,:,:,,"
+        )
+
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        heard, own = listen(sessions[1], "0/**"), listen(sessions[0], "0/vnet/**")
+        seen = watch(sessions[1], "@ros2_lv/**")
+        told = {await seen.get() for _ in range(3)}
+        assert all("%vnet/gateway" in each for each, _ in told), "vnet's own node, and no other vehicle's"
+        queryables = [
+            sessions[1].declare_queryable(
+                key(name), lambda query: query.reply(query.key_expr, b"yes"), complete=True
+            )
+            for name in ("add", "inside/add")
+        ]
+        settle(sessions[1])
+        tokens = []
+        for name in ("inside/a", "chatter"):
+            tokens.append(sessions[0].liveliness().declare_token(token(name.replace("/", "%"))))
+            sessions[0].put(key(name), b"x", attachment=bytes(33))
+        sample = await heard.get()
+        assert str(sample.key_expr) == key("chatter")
+        assert sample.attachment is not None and sample.attachment.to_bytes() == bytes(33)
+        assert await seen.get() == (token("chatter"), True)
+        for name, count in (("add", 1), ("inside/add", 0)):
+            target = zenoh.QueryTarget.ALL_COMPLETE
+            answers = await asyncio.to_thread(lambda: list(sessions[0].get(key(name), target=target)))  # noqa: B023
+            assert len(answers) == count
+        vehicles[0].gateway.show_clock(5)
+        vehicles[0].gateway.show_fix(WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None, 3.0))
+        assert str((await own.get()).key_expr).startswith("0/vnet/fix/")
+        assert seen.empty() and heard.empty()
+        assert len(vehicles[0].frames) == 3  # message, token, query
+        assert queryables
+
+    two(test, keys=ROS2_KEYS, inside=("/inside/**",))
 
 
 def test_sessions_are_counted_by_who_they_are() -> None:
