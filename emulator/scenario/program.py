@@ -126,8 +126,8 @@ class Ros2Topics(Section):
     """Topics and services that stay in their vehicle, with their tokens, as do `/clock` and `/vnet/**`: names as in
     `/tf`, with `*` for one part of a name and `**` for any number."""
     graph: Literal["range", "always"] = "range"
-    """Whose nodes and topics a vehicle sees: those of vehicles whose tokens its radio hears (`range`), or those of
-    all, past the radio (`always`, in real time)."""
+    """Nodes and topics that a vehicle sees: of vehicles whose tokens its radio hears (`range`), or of all, past the
+    radio (`always`, in real time)."""
     domain: int = Field(0, ge=0, le=232)
     """`ROS_DOMAIN_ID` of commands, and of `/clock` and `/vnet/fix`. All domains cross the radio."""
     clock_hz: float = Field(10.0, gt=0, le=1000)

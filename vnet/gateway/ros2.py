@@ -108,7 +108,7 @@ class GraphToken(NamedTuple):
     namespace: str
     node: str
     endpoint: Endpoint | None = None
-    """Of all but nodes."""
+    """The topic or service; None of a node."""
 
     @property
     def key(self) -> str:
