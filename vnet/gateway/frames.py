@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from itertools import count
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -87,6 +87,31 @@ class Fragment(msgspec.Struct, array_like=True, frozen=True):
     index: int
     parts: int
     content: bytes
+
+
+def crossing_of(sample: Any, source: tuple[int, int] | None) -> CrossingSample:
+    """Return what of a sample of Zenoh's, or of an emulated session, crosses the radio."""
+    stamp, time = sample.timestamp, None
+    if stamp is not None:
+        ntp = stamp.get_time_as_ntp64()
+        time = ntp.as_secs(), ntp.subsec_nanos(), bytes(stamp.get_id())
+    return CrossingSample(
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        str(sample.encoding),
+        name_of(sample.kind) == "DELETE",
+        None if sample.attachment is None else sample.attachment.to_bytes(),
+        name_of(sample.priority),
+        name_of(sample.congestion_control),
+        sample.express,
+        time,
+        source,
+    )
+
+
+def name_of(member: object) -> Any:
+    """Return the name of a member of one of Zenoh's enumerations."""
+    return str(member).rpartition(".")[2]
 
 
 _encode = msgspec.msgpack.Encoder().encode

@@ -29,6 +29,7 @@ from vnet.gateway.frames import (
     CrossingTokens,
     Message,
     Reassembly,
+    crossing_of,
 )
 from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
 from vnet.gateway.ros2 import Published, Ros2
@@ -113,7 +114,7 @@ class Gateway:
 
     def _put(self, sample: zenoh.Sample) -> None:
         if self._crosses(str(sample.key_expr)):
-            self._tell("message", crossing_of(sample))
+            self._tell("message", crossing_of(sample, _source_of(sample)))
 
     def _asked(self, query: zenoh.Query) -> None:
         if self._crosses(str(query.key_expr)):
@@ -128,7 +129,7 @@ class Gateway:
         self._tell("report", sample.payload.to_bytes())
 
     def _connected(self, event: zenoh.TransportEvent) -> None:
-        who = f"{event.transport.zid} ({_name_of(event.transport.whatami)})"
+        who = f"{event.transport.zid} ({event.transport.whatami})"
         self._tell("session", (who, event.kind == zenoh.SampleKind.PUT))
 
     # The run's loop.
@@ -242,7 +243,7 @@ class Gateway:
 
         def answered(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                answer = CrossingReply(asker, query.number, crossing_of(reply.ok))
+                answer = CrossingReply(asker, query.number, crossing_of(reply.ok, _source_of(reply.ok)))
             else:
                 assert reply.err is not None
                 error = reply.err.payload.to_bytes(), str(reply.err.encoding)
@@ -343,27 +344,6 @@ def _leaves(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
     return leaves
 
 
-def crossing_of(sample: zenoh.Sample) -> CrossingSample:
-    """Return what of a sample crosses the radio."""
-    stamp = sample.timestamp
-    time = None
-    if stamp is not None:
-        ntp = stamp.get_time_as_ntp64()
-        time = ntp.as_secs(), ntp.subsec_nanos(), bytes(stamp.get_id())
-    return CrossingSample(
-        str(sample.key_expr),
-        sample.payload.to_bytes(),
-        str(sample.encoding),
-        sample.kind == zenoh.SampleKind.DELETE,
-        _bytes(sample.attachment),
-        _name_of(sample.priority),
-        _name_of(sample.congestion_control),
-        sample.express,
-        time,
-        None if sample.source_info is None else (_this_process(), _number_of(sample.source_info)),
-    )
-
-
 def _options(sample: CrossingSample) -> dict[str, Any]:
     """Return the arguments with which a sample is put, deleted or replied."""
     options: dict[str, Any] = {
@@ -383,14 +363,15 @@ def _bytes(content: zenoh.ZBytes | None) -> bytes | None:
     return None if content is None else content.to_bytes()
 
 
-def _name_of(member: Any) -> Any:
-    return str(member).rpartition(".")[2]
-
-
 @cache
 def _this_process() -> int:
     """Return a number that no process on any host shares."""
     return secrets.randbits(62)
+
+
+def _source_of(sample: zenoh.Sample) -> tuple[int, int] | None:
+    """Return what stands for a sample's `SourceInfo` on the radio."""
+    return None if sample.source_info is None else (_this_process(), _number_of(sample.source_info))
 
 
 def _number_of(source: zenoh.SourceInfo) -> int:

@@ -14,6 +14,7 @@ import msgspec
 import zenoh
 from zenoh.handlers import Callback
 
+from vnet.gateway import frames
 from vnet.gateway.emulated.strands import IDLE, Strand, block_on, drive, fail, idle
 from vnet.gateway.frames import CrossingReply, CrossingSample
 from vnet.runtime.own_asyncio import Task
@@ -162,30 +163,12 @@ def timestamp_at(unix_ns: int, zid: ZenohId) -> zenoh.Timestamp:
 
 def crossing_of(sample: Sample) -> CrossingSample:
     """Return what of a sample crosses the radio."""
-    stamp, source, time = sample.timestamp, sample.source_info, None
-    if stamp is not None:
-        ntp = stamp.get_time_as_ntp64()
-        time = ntp.as_secs(), ntp.subsec_nanos(), bytes(stamp.get_id())
-    origin = None
-    if source is not None:
-        origin = source.source_id.zid.number << EID_BITS | source.source_id.eid, source.source_sn
-    return CrossingSample(
-        str(sample.key_expr),
-        sample.payload.to_bytes(),
-        str(sample.encoding),
-        sample.kind == zenoh.SampleKind.DELETE,
-        None if sample.attachment is None else sample.attachment.to_bytes(),
-        name_of(sample.priority),
-        name_of(sample.congestion_control),
-        sample.express,
-        time,
-        origin,
+    source = sample.source_info
+    if source is None:
+        return frames.crossing_of(sample, None)
+    return frames.crossing_of(
+        sample, (source.source_id.zid.number << EID_BITS | source.source_id.eid, source.source_sn)
     )
-
-
-def name_of(member: zenoh.Priority | zenoh.CongestionControl) -> Any:
-    """Return the name of a member of an enumeration."""
-    return str(member).rpartition(".")[2]
 
 
 PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
