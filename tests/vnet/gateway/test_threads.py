@@ -184,8 +184,9 @@ def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path:
     (package / "__init__.py").write_text("from . import parts\nfrom .parts import *\nname = None\n")
     (package / "parts.py").write_text(
         "from __future__ import annotations\n"
-        "import time, dataclasses\nfrom typing import ClassVar, NamedTuple, get_type_hints\n"
+        "import time, dataclasses\nfrom typing import ClassVar, NamedTuple, TypedDict, get_type_hints\n"
         "class Place(NamedTuple):\n    x: int\n"
+        "class Table(TypedDict):\n    x: int\n"
         "__all__ = ['Wheel', 'wait']\n"
         "@dataclasses.dataclass\nclass Wheel:\n    size: int\n    kind: ClassVar[str] = 'round'\n"
         "def wait():\n    time.sleep(0.5)\n    return get_type_hints(Wheel)['size']\n"

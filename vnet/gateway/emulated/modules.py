@@ -273,16 +273,6 @@ class ProgramModules:
                 again.__kwdefaults__ = value.__kwdefaults__
                 again.__dict__.update(vars(value))
                 vars(facade)[name] = again
-        # `NamedTuple` and `TypedDict` are functions that have others as attributes, which compare with them.
-        for again in vars(facade).values():
-            if isinstance(again, FunctionType):
-                vars(again).update(
-                    {
-                        name: vars(facade).get(each.__name__, each)
-                        for name, each in vars(again).items()
-                        if isinstance(each, FunctionType) and each.__globals__ is vars(real)
-                    }
-                )
         return facade
 
     def _sys(self) -> ModuleType:
