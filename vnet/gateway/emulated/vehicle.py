@@ -343,8 +343,9 @@ class Vehicle:
         await self._hears.wait()
         radio = self.node.radio
         while True:
-            packet, self.due.is_held = await radio.receive(), True
-            self._hear(packet)
+            first, self.due.is_held = await radio.receive(), True
+            for packet in (first, *radio.drain()):
+                self._hear(packet)
             self.due.is_held = False
             self.due.run()
 
