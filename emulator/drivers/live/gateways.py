@@ -147,7 +147,12 @@ class Gateways:
         if node in self._closing:
             await self._closing[node]
         try:
-            self.endpoints[node] = await asyncio.to_thread(vehicle.gateway.open, self._listen(node))
+            opening = asyncio.ensure_future(asyncio.to_thread(vehicle.gateway.open, self._listen(node)))
+            self.endpoints[node] = await asyncio.shield(opening)
+        except asyncio.CancelledError:  # the run is over; a router that stays open would not let the process end
+            await asyncio.gather(opening, return_exceptions=True)
+            await vehicle.gateway.close()
+            raise
         except VnetError as error:
             self._say_hello(node, failure=str(error))
             return
