@@ -23,7 +23,8 @@ CDR = b"\x00\x01\x00\x00"
 
 
 def say(*words: object) -> None:
-    print(*words, flush=True)
+    sys.stdout.write(f"{' '.join(map(str, words))}\n")  # at once: print would let other threads into the line
+    sys.stdout.flush()
 
 
 def sdk(own: str, other: str) -> None:

@@ -40,6 +40,8 @@ from vnet.units import NS_PER_S
 
 MOST_SOURCES = 100_000
 """Instances of `SourceInfo` that are kept for samples on their way."""
+ECHO_S = 2.0
+"""Seconds after a token was taken back in which Zenoh's echoes of it are not taken for a program's own."""
 REMOTE = zenoh.Locality.REMOTE
 
 _sources: OrderedDict[int, zenoh.SourceInfo] = OrderedDict()
@@ -65,6 +67,8 @@ class Gateway:
         self._reassembly = Reassembly()
         self._declared: dict[str, zenoh.LivelinessToken] = {}
         """Tokens of other vehicles, which are declared at this one's programs."""
+        self._taken_back: dict[str, float] = {}
+        """Tokens of other vehicles that were taken back lately, and until when (s of the loop) echoes may come."""
         self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * settings.liveliness_s * NS_PER_S))
         self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
@@ -175,6 +179,8 @@ class Gateway:
     def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
         """Take a token that has appeared or is gone; those that other vehicles have told of are echoes."""
         if key in self._declared or not self._crosses(key) or (key in self._tokens) == is_there:
+            return None
+        if self._taken_back.get(key, 0.0) > asyncio.get_running_loop().time():
             return None
         (self._tokens.add if is_there else self._tokens.discard)(key)
         return CrossingTokens(tuple(sorted(self._tokens)))
@@ -289,9 +295,12 @@ class Gateway:
     def _show_tokens(self, changes: Sequence[tuple[str, bool]]) -> None:
         """Declare tokens of other vehicles at the programs, or take them back."""
         assert self._session is not None
+        now_s = asyncio.get_running_loop().time()
+        self._taken_back = {key: until_s for key, until_s in self._taken_back.items() if until_s > now_s}
         for key, is_there in changes:
             if not is_there:
                 self._declared.pop(key, _PENDING).undeclare()
+                self._taken_back[key] = now_s + ECHO_S
             elif key not in self._tokens:
                 # Before the declaration, whose echo must not count as a token of this vehicle's own.
                 self._declared[key] = _PENDING
