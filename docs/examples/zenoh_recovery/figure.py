@@ -67,6 +67,8 @@ def draw(axes: Axes, table: pa.Table, curves: tuple[Curve, ...], label: str) -> 
                 values = 100 * (1 - values / (OTHERS * rows["last.published"].to_numpy()))
             elif "answered" in curve.column:
                 values = 100 * (1 - values)
+            elif not values.any():  # nothing was lost, so nothing was recovered
+                values = np.full(len(values), np.nan)
             samples.append(values)
         means, widths = [each.mean() for each in samples], [half_width(each) for each in samples]
         percent = [100 * loss for loss in losses]
