@@ -57,6 +57,8 @@ Topic = Annotated[str, AfterValidator(_is_topic)]
 ZENOH_ENTRY = "vnet.gateway.emulated:main"
 """Entry of vehicles of kind "zenoh" in lockstep, which runs their commands on virtual time."""
 _ENTRY = "agents.beacon:main"
+PYTHON = ("python", "python3")
+"""First words of a command that stand for the interpreter of vnet."""
 
 
 class OneProgram(Section):
@@ -175,7 +177,9 @@ class Program(OneProgram):
         exceptions = data.get("exceptions")
         exceptions = exceptions if isinstance(exceptions, list | tuple) else ()
         given = [each for each in (data, *exceptions) if isinstance(each, dict)]
-        if data.get("kind", "vnet") != "zenoh":
+        if data.get("kind", "vnet") not in ("vnet", "zenoh"):
+            return data  # told of by its own field
+        if data.get("kind", "vnet") == "vnet":
             if data.get("zenoh") is not None or any(each.get("command") is not None for each in given):
                 raise ValueError('command and zenoh go with kind = "zenoh"')
             return data

@@ -5,6 +5,7 @@ One frozen model a section. What is wrong becomes a `ScenarioError` of one line:
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,11 +13,11 @@ from pydantic import Field, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.network import Driven, Map, Network
-from emulator.scenario.program import Backbone, Program, RoadsideUnit, Ros2Topics, with_names
+from emulator.scenario.program import PYTHON, Backbone, Program, RoadsideUnit, Ros2Topics, with_names
 from emulator.scenario.radio import RATES_MBPS, Buildings, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.sections import DAY_S, FAR_M, Section
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
-from vnet.errors import shown
+from vnet.errors import ProgramError, shown
 from vnet.units import NS_PER_MS, NS_PER_S, Grid
 
 MANY = 1_000_000_000
@@ -182,6 +183,17 @@ class Radio(Section):
             raise ValueError('ros2 goes with profile = "ros2"')
         return data
 
+    @field_validator("keys")
+    @classmethod
+    def _keys_are_expressions(cls, keys: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        from vnet.gateway.keys import check_keys  # with Zenoh, which is slow to import
+
+        try:
+            check_keys(keys or ())
+        except ProgramError as error:
+            raise ValueError(str(error)) from None
+        return keys
+
     @field_validator("links", mode="before")
     @classmethod
     def _links_are_a_file_or_a_matrix(cls, links: Any) -> Any:
@@ -243,6 +255,12 @@ class Scenario(Section):
         if self.run.pacing == "lockstep":
             if not self.program.commands:
                 raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
+            for words in (words for each in (self.program, *self.program.exceptions) for words in each.commands):
+                if len(words) < 2 or words[0] not in PYTHON:
+                    raise ValueError(
+                        f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT … "
+                        'or python -m MODULE …; any other needs run.pacing = "realtime"'
+                    )
             if self.radio.ros2 is not None and self.radio.ros2.graph == "always":
                 raise ValueError('radio.ros2.graph = "always" needs run.pacing = "realtime"')
             return self

@@ -73,9 +73,15 @@ def test_faults_end_pause_and_start_the_commands_with_their_vehicle(vnet: Vnet, 
             ("router_restart", 4.0, "down_s = 0.5"),
         ]
     )
+    token = ("    while True:", "    token = session.liveliness().declare_token(f'alive/{name}')\n    while True:")
+    often = ('kind = "zenoh"', 'kind = "zenoh"\nzenoh = { liveliness_s = 0.2 }')
     old = PAGE[PAGE.index('[[fault]]\nkind = "partition"') : PAGE.index('"v04"]]\n') + len('"v04"]]\n')]
-    done = vnet("run", scenario(tmp_path, (old, faults)))
+    path = scenario(tmp_path, (old, faults), often)
+    talker = tmp_path / "talker.py"
+    talker.write_text(talker.read_text().replace(*token))
+    done = vnet("run", path)
     assert done.status in SLOW
+    assert done.check("pause_respected")["verdict"] == "valid", "a gateway tells no tokens of a paused vehicle"
     assert [event["node"] for event in done.events_of("restarted")] == ["v01"]
     assert done.events_of("router_restarted")
     assert not done.events_of("died")
@@ -129,6 +135,12 @@ def test_a_program_that_never_connects_and_a_port_that_is_taken_are_named(vnet: 
         done = vnet("run", scenario(tmp_path), "--set", f"program.zenoh.listen={endpoint}")
     assert done.status == 2
     assert f"v01: cannot listen at {endpoint}" in done.stderr
+
+
+def test_commands_that_cannot_be_or_end_too_early_are_named_at_once(vnet: Vnet, tmp_path: Path) -> None:
+    for words, text in (('["nosuch"]', "'nosuch' is no command"), ('["true"]', "ended before they had connected")):
+        done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words)))
+        assert (done.status, text in done.stderr) == (2, True), done.stderr
 
 
 @pytest.mark.parametrize("program", ["sh", "talker.py"])

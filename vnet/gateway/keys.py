@@ -23,10 +23,10 @@ def check_keys(keys: Sequence[str]) -> None:
         try:
             expression = zenoh.KeyExpr(key)
         except zenoh.ZError:
-            raise ProgramError(f"radio.keys: {shown(key)} is no key expression of Zenoh") from None
+            raise ProgramError(f"{shown(key)} is no key expression of Zenoh") from None
         for other in keys[:number]:
             if expression.intersects(other):
-                raise ProgramError(f"radio.keys: {shown(other)} and {shown(key)} overlap")
+                raise ProgramError(f"{shown(other)} and {shown(key)} overlap")
 
 
 def fix_content(fix: Fix) -> bytes:

@@ -47,7 +47,7 @@ def main(command: list[str]) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):  # whatever it was that started this may ignore them
         signal.signal(number, signal.SIG_DFL)
     if sys.platform == "linux":  # elsewhere the thread would not survive
-        signal_at_parent_death(signal.SIGTERM)
+        signal_at_parent_death(signal.SIGKILL)  # nobody is left who could insist
     os.execv(command[0], command)
 
 

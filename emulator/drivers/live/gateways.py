@@ -27,9 +27,10 @@ from emulator.drivers.launch import Exit, Launcher
 from emulator.drivers.live.gateway import Gateway, session_environment
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
+from emulator.scenario.program import PYTHON
 from vnet.errors import ProgramError, VnetError, first_names, shown
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
-from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY, check_keys
+from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY
 from vnet.gateway.ros2 import ROS2_KEYS, Ros2
 from vnet.radio import SentFrame
 from vnet.reports import Report, Reporter
@@ -41,8 +42,6 @@ from vnet.units import NS_PER_S
 
 ENDPOINTS = "endpoints.json"
 """File of a run's folder with the endpoint of each vehicle."""
-PYTHON = ("python", "python3")
-"""First words of a command that stand for the interpreter of vnet."""
 HIGHEST_PORT = 65_535
 
 
@@ -58,6 +57,7 @@ class _Vehicle:
     fragments: Fragments | None = None
     acknowledges: bool = False
     is_ready: bool = False
+    is_paused: bool = False
     on_air: bool = False
     """True from time 0, or from its return, on: what programs put before stays in the vehicle."""
     outbox: list[SentFrame] = field(default_factory=list)
@@ -70,6 +70,8 @@ class _Vehicle:
     lateness: list[int] = field(default_factory=lambda: [0] * wire.LATENESS_BINS)
     late: list[tuple[int, int]] = field(default_factory=list)
     is_due: bool = False
+    has_warned: bool = False
+    """True once it was told that a message has more frames than the radio's queue."""
 
 
 class Gateways:
@@ -94,9 +96,9 @@ class Gateways:
         self._program, self._settings = scenario.program, scenario.program.sessions
         self._ros2 = scenario.radio.ros2
         self._keys = scenario.radio.keys or (RADIO_KEYS if self._ros2 is None else ROS2_KEYS)
-        check_keys(self._keys)
         self._hear, self._tell, self._time_ns, self._changes = hear, tell, time_ns, changes
         self._loop = asyncio.get_running_loop()
+        self._check(emulation.world.node_ids)
         self._folder = tempfile.TemporaryDirectory(prefix="vnet-")
         self._vehicles: dict[str, _Vehicle] = {}
         self._closing: dict[str, asyncio.Task[None]] = {}
@@ -108,6 +110,18 @@ class Gateways:
         """Told which endpoints wait for programs."""
         self.endpoints: dict[str, str] = {}
         """The endpoint of each vehicle, which it keeps."""
+
+    def _check(self, node_ids: Sequence[str]) -> None:
+        """Raise ProgramError for what is no command, and for vehicles without a port, before anything starts."""
+        for node in node_ids if self._starts else ():
+            for words in self._program.commands_of(node):
+                self._filled(words, {})
+        port = int(self._settings.listen.rpartition(":")[2])
+        if port and port + len(node_ids) - 1 > HIGHEST_PORT:
+            raise ProgramError(
+                f"program.zenoh.listen = {shown(self._settings.listen)}: {len(node_ids)} vehicles need ports up to "
+                f"{port + len(node_ids) - 1}, and {HIGHEST_PORT} is the highest"
+            )
 
     # In the place of a launcher.
 
@@ -167,10 +181,7 @@ class Gateways:
         if node in self.endpoints:
             return self.endpoints[node]
         address, _, port = self._settings.listen.rpartition(":")
-        number = int(port) and int(port) + self._emulation.number[node]
-        if number > HIGHEST_PORT:
-            raise ProgramError(f"program.zenoh.listen = {shown(self._settings.listen)}: no port is left for {node}")
-        return f"{address}:{number}"
+        return f"{address}:{int(port) and int(port) + self._emulation.number[node]}"
 
     def _tell_endpoints(self) -> None:
         """Write the endpoints of all vehicles, once they listen, and tell them to whoever starts the programs."""
@@ -190,6 +201,9 @@ class Gateways:
         """Send a signal to the commands of a vehicle."""
         for process in self._names_of(name):
             self._launcher.signal_group(process, number)
+        if (vehicle := self._vehicles.get(name)) is not None:
+            vehicle.is_paused = number == signal.SIGSTOP
+            self._flush_soon(vehicle)
 
     def kill(self, name: str) -> None:
         """End a vehicle's commands and its gateway at once."""
@@ -228,6 +242,8 @@ class Gateways:
         if how.status != 0:
             self._spawn(self._end(node))
             self._tell("ended", node, how)
+        elif not vehicle.names and not vehicle.is_ready:
+            self._say_hello(node, failure="its commands have ended before they had connected")
         elif not vehicle.names:
             vehicle.endings.append(wire.Ending(node, "finished"))
             self._flush_soon(vehicle)
@@ -372,7 +388,7 @@ class Gateways:
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
             vehicle.gateway.forget_tokens(max(self._time_ns(), 0))
-            if (tokens := vehicle.gateway.tokens()) is not None:
+            if (tokens := vehicle.gateway.tokens()) is not None and not vehicle.is_paused:
                 self._transmit(vehicle, tokens)
             self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)
 
@@ -416,12 +432,17 @@ class Gateways:
             return
         if isinstance(message, CrossingReply) and vehicle.acknowledges:
             to = message.to
+        before, most = len(vehicle.outbox), self._emulation.scenario.radio.queue_frames
         try:
             for payload in vehicle.fragments.of(message):
                 vehicle.outbox.append(SentFrame(node, payload, to=to, number=vehicle.unicasts))
                 vehicle.unicasts += to is not None
         except TooLargeError as error:
             self._note(vehicle, "error", str(error))
+        if (frames := len(vehicle.outbox) - before) > most and not vehicle.has_warned:
+            vehicle.has_warned = True
+            text = f"a message of {frames} frames, which cannot arrive: radio.queue_frames = {most}"
+            self._note(vehicle, "warning", text)
         self._flush_soon(vehicle)
 
     def _take_report(self, vehicle: _Vehicle, content: bytes) -> None:
@@ -448,7 +469,7 @@ class Gateways:
     def _flush(self, vehicle: _Vehicle, final: bool = False) -> None:
         """Say what the vehicle sends, and acknowledge what it has been told."""
         vehicle.is_due = False
-        if not self._is_there(vehicle):
+        if not self._is_there(vehicle) or (vehicle.is_paused and not final):
             return
         traffic = wire.Traffic(vehicle.outbox, vehicle.reports, vehicle.endings, notes=vehicle.notes)
         vehicle.outbox, vehicle.reports, vehicle.endings, vehicle.notes = [], [], [], []

@@ -7,6 +7,7 @@ from collections import Counter
 import pytest
 
 from tests.vnet.gateway.conftest import Drive, events, log
+from vnet.errors import ScenarioError
 
 TALK = """
     import sys, time, zenoh
@@ -237,10 +238,10 @@ def test_callback_that_fails_is_told_and_zenoh_goes_on(drive: Drive) -> None:
 
 
 def test_command_that_is_no_python_and_keys_that_overlap_are_refused_by_name(drive: Drive) -> None:
-    run = drive("", program={"command": ["talker", "x"]})
-    assert "program.command = 'talker x'" in events(run, "crashed")[0]["error"]
-    run = drive("", radio={"keys": ["a/**", "a/b"]})
-    assert "radio.keys: 'a/**' and 'a/b' overlap" in events(run, "crashed")[0]["error"]
+    with pytest.raises(ScenarioError, match="program.command = 'talker x'"):
+        drive("", program={"command": ["talker", "x"]})
+    with pytest.raises(ScenarioError, match=r"radio\.keys.*'a/\*\*' and 'a/b' overlap"):
+        drive("", radio={"keys": ["a/**", "a/b"]})
 
 
 ALL_KINDS = """

@@ -338,3 +338,17 @@ def test_clock_error_of_a_vehicle_is_that_of_its_program(drive: Drive) -> None:
     faults = [{"kind": "skew", "at_s": 0.0, "duration_s": 1.0, "nodes": ["v01"], "offset_ms": 250.0}]
     run = drive("import time\ntime.sleep(0.5)\nprint(round(time.time() % 100, 3))", fault=faults)
     assert log(run)[0] == "0.75"
+
+
+def test_a_program_that_waits_busily_comes_to_its_time(drive: Drive) -> None:
+    run = drive("import time\nend = time.monotonic() + 0.05\nwhile time.monotonic() < end: pass\nprint('done')")
+    assert log(run)[0] == "done"
+    (end,) = events(run, "finished")
+    assert 0.05 <= end["time_ns"] / 1e9 < 0.052
+
+
+def test_options_of_python_that_change_nothing_are_no_script(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "hello.py").write_text("import sys; print(sys.argv[1:])")
+    command = ["python", "-u", "-B", str(tmp_path / "hello.py"), "{id}"]
+    run = drive(program={"command": [command]})
+    assert log(run)[0] == "['v01']"

@@ -25,6 +25,7 @@ from concurrent import futures
 from contextvars import ContextVar
 from functools import cache, partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
+from itertools import dropwhile
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, NoReturn
@@ -39,6 +40,10 @@ from vnet.units import NS_PER_S
 
 EPOCH_NS = 1_735_689_600 * NS_PER_S
 """The wall clock of programs at the start of a run: 2025-01-01T00:00:00Z."""
+FLAGS = frozenset(["-u", "-B", "-E", "-I", "-O", "-OO", "-s", "-S", "-P", "-q"])
+"""Options of Python's command line that change nothing here."""
+MOST_LOOKS, BUSY_WAIT_S = 1000, 0.001
+"""Looks of a program at its clock at one instant after which it waits busily: it is let wait so long."""
 CORES = 4
 """Cores that a program sees: the size of a pool of threads may not depend on the machine."""
 _OWN_COPIES = (
@@ -135,6 +140,7 @@ class ProgramModules:
     def _find_main(self, words: Sequence[str]) -> tuple[Any, str, str | None]:
         """Return code, file and package of the program, and set `sys.argv` and `sys.path` for it."""
         here = str(Path.cwd())
+        words = [words[0], *dropwhile(FLAGS.__contains__, words[1:])]
         if words[1:2] == ["-m"] and len(words) > 2:
             self.path[:] = [here, *sys.path]
             spec = self._find_module(words[2])
@@ -147,12 +153,12 @@ class ProgramModules:
             return compile(words[2], "<string>", "exec", dont_inherit=True), "", None
         script = next(iter(words[1:]), "-")
         if script.startswith("-"):
-            raise ProgramError(f"program.options.command = {shown(list(words))}: a script or -m MODULE is expected")
+            raise ProgramError(f"program.command = {shown(list(words))}: a script or -m MODULE is expected")
         path = Path(script)
         try:
             source = path.read_bytes()
         except OSError as error:
-            raise ProgramError(f"program.options.command: {shown(script)}: {error.strerror}") from None
+            raise ProgramError(f"program.command: {shown(script)}: {error.strerror}") from None
         self.path[:] = [str(path.resolve().parent), *sys.path]
         self.argv[:] = list(words[1:])
         return compile(source, script, "exec", dont_inherit=True), script, None
@@ -162,7 +168,7 @@ class ProgramModules:
         if spec is not None and spec.submodule_search_locations is not None:
             spec = self._find(f"{name}.__main__")
         if spec is None or not isinstance(spec.loader, SourceFileLoader):
-            raise ProgramError(f"program.options.command: no module {shown(name)} in Python to run")
+            raise ProgramError(f"program.command: no module {shown(name)} in Python to run")
         return spec
 
     # Importing.
@@ -296,18 +302,25 @@ class ProgramModules:
 
     def _time(self) -> ModuleType:
         node = self.node
+        looked_ns, looks = -1, 0
 
         def ns() -> int:
-            return node.now_ns
+            nonlocal looked_ns, looks
+            now_ns = node.now_ns
+            looked_ns, looks = now_ns, looks + 1 if now_ns == looked_ns else 1
+            if looks > MOST_LOOKS and current_strand() is not None:  # it waits for the time to come
+                sleep(BUSY_WAIT_S)
+                return node.now_ns
+            return now_ns
 
         def seconds() -> float:
-            return node.now_ns / NS_PER_S
+            return ns() / NS_PER_S
 
         def unix_ns() -> int:
-            return EPOCH_NS + node.now_ns
+            return EPOCH_NS + ns()
 
         def unix() -> float:
-            return (EPOCH_NS + node.now_ns) / NS_PER_S
+            return (EPOCH_NS + ns()) / NS_PER_S
 
         def utc(at: float | None = None) -> time.struct_time:
             return time.gmtime(unix() if at is None else at)
