@@ -238,7 +238,7 @@ def test_callback_that_fails_is_told_and_zenoh_goes_on(drive: Drive) -> None:
 
 
 def test_command_that_is_no_python_and_keys_that_overlap_are_refused_by_name(drive: Drive) -> None:
-    with pytest.raises(ScenarioError, match="program.command = 'talker x'"):
+    with pytest.raises(ScenarioError, match=r"program\.command = 'talker x'"):
         drive("", program={"command": ["talker", "x"]})
     with pytest.raises(ScenarioError, match=r"radio\.keys.*'a/\*\*' and 'a/b' overlap"):
         drive("", radio={"keys": ["a/**", "a/b"]})
