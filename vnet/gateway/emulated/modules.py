@@ -351,7 +351,7 @@ class ProgramModules:
             "tzname": ("UTC", "UTC"),
         }
         # As those of `time`, they make no methods of classes that have them.
-        return Facade(time, **{name: partial(each) if callable(each) else each for name, each in own.items()})
+        return Facade(time, **{name: staticmethod(each) if callable(each) else each for name, each in own.items()})
 
     def _datetime(self) -> ModuleType:
         node = self.node
@@ -425,6 +425,9 @@ class ProgramModules:
         module.Random.seed = seed
         module.seed = module._inst.seed
         module.seed()
+
+    def _prepare_threading(self, module: Any) -> None:
+        module.local = self.load("_threading_local").local
 
     def _prepare_uuid(self, module: Any) -> None:
         module._node = self._random.getrandbits(48) | 1 << 40

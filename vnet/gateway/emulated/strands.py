@@ -329,6 +329,8 @@ class Threads:
             start_joinable_thread=self._start_joinable,
             _shutdown=self._shutdown,
         )
+        if sys.version_info >= (3, 12):  # `threading` wants it at its beginning, and gets the real one at its end
+            vars(module)["_local"] = type("_local", (), {})
         return module
 
 
