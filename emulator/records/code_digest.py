@@ -85,8 +85,7 @@ def _sources_of(scenario: Scenario) -> tuple[str, ...]:
     program = scenario.program
     if program.kind != "zenoh":
         return entries_of(scenario)
-    commands = [words for each in (program, *program.exceptions) for words in each.commands]
-    scripts = {Path(word).stem for words in commands for word in words[:2] if word.endswith(".py")}
+    scripts = {Path(word).stem for words in program.all_commands for word in words[:2] if word.endswith(".py")}
     return tuple(f"{script}:main" for script in sorted(scripts))
 
 

@@ -215,7 +215,7 @@ def with_rules(
     exceptions = [
         each.model_copy(update={"entry": found.entry("program.entry", each.entry)}) for each in program.exceptions
     ]
-    for command in (words for each in (program, *program.exceptions) for words in each.commands):
+    for command in program.all_commands:
         found.command(command)
     data = {
         "entry": found.entry("program.entry", program.entry),

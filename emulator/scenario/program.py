@@ -208,6 +208,11 @@ class Program(OneProgram):
         """Endpoints of programs of `kind = "zenoh"`."""
         return self.zenoh or ZenohSessions()
 
+    @property
+    def all_commands(self) -> list[tuple[str, ...]]:
+        """The commands of all vehicles."""
+        return [words for each in (self, *self.exceptions) for words in each.commands]
+
     def commands_of(self, node: str) -> list[list[str]]:
         """Return the commands of a node, with the paths of files that are in `folders`."""
         return [self._located(words) for words in self.of(node).commands]

@@ -255,7 +255,7 @@ class Scenario(Section):
         if self.run.pacing == "lockstep":
             if not self.program.commands:
                 raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
-            for words in (words for each in (self.program, *self.program.exceptions) for words in each.commands):
+            for words in self.program.all_commands:
                 if len(words) < 2 or words[0] not in PYTHON:
                     raise ValueError(
                         f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT … "

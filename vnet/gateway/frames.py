@@ -20,6 +20,8 @@ FRAGMENT_BYTES = 24
 MOST_UNFINISHED = 64
 """Messages in parts that are kept of each sender until the rest has come; the oldest go first."""
 MOST_FRAGMENTS = 65_535
+MOST_MESSAGES = 2**32
+"""Messages that an incarnation of a sender has numbers for."""
 
 Priority = Literal[
     "REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"
@@ -131,11 +133,12 @@ class TooLargeError(Exception):
 
 
 class Fragments:
-    """Cuts the messages of one sender into payloads of at most `max_payload` bytes."""
+    """Cuts the messages of one incarnation of a sender into payloads of at most `max_payload` bytes."""
 
-    def __init__(self, max_payload: int) -> None:
+    def __init__(self, max_payload: int, incarnation: int = 0) -> None:
         self._max_payload = max_payload
-        self._numbers = count()
+        # Receivers may still have parts of the last incarnation, which must complete no message of this one.
+        self._numbers = count(incarnation * MOST_MESSAGES)
 
     def of(self, message: Message) -> Iterator[bytes]:
         """Return the payloads of a message's frames. Raises TooLargeError."""

@@ -65,8 +65,8 @@ class Gateway:
         self._queries: dict[int, zenoh.Query] = {}
         self._query_numbers = count()
         self._reassembly = Reassembly()
-        self._declared: dict[str, zenoh.LivelinessToken] = {}
-        """Tokens of other vehicles, which are declared at this one's programs."""
+        self._declared: dict[str, zenoh.LivelinessToken | None] = {}
+        """Tokens of other vehicles, which are declared at this one's programs; None while that is under way."""
         self._taken_back: dict[str, float] = {}
         """Tokens of other vehicles that were taken back lately, and until when (s of the loop) echoes may come."""
         self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * settings.liveliness_s * NS_PER_S))
@@ -299,20 +299,13 @@ class Gateway:
         self._taken_back = {key: until_s for key, until_s in self._taken_back.items() if until_s > now_s}
         for key, is_there in changes:
             if not is_there:
-                self._declared.pop(key, _PENDING).undeclare()
+                if (token := self._declared.pop(key, None)) is not None:
+                    token.undeclare()  # type: ignore[no-untyped-call]
                 self._taken_back[key] = now_s + ECHO_S
             elif key not in self._tokens:
                 # Before the declaration, whose echo must not count as a token of this vehicle's own.
-                self._declared[key] = _PENDING
+                self._declared[key] = None
                 self._declared[key] = self._session.liveliness().declare_token(key)
-
-
-class _Pending:
-    def undeclare(self) -> None:
-        """Stand for a token whose declaration was refused."""
-
-
-_PENDING: Any = _Pending()
 
 
 def session_environment(

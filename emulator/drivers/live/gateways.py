@@ -17,8 +17,9 @@ import tempfile
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -49,6 +50,8 @@ HIGHEST_PORT = 65_535
 class _Vehicle:
     """A vehicle whose gateway is open, or is being opened."""
 
+    number: int
+    """Tells its incarnations apart."""
     gateway: Gateway
     reporter: Reporter
     nice: int
@@ -72,6 +75,11 @@ class _Vehicle:
     is_due: bool = False
     has_warned: bool = False
     """True once it was told that a message has more frames than the radio's queue."""
+
+    @property
+    def nonce(self) -> bytes:
+        """Stands for the secret of a process, which nothing in this one needs."""
+        return str(self.number).encode()
 
 
 class Gateways:
@@ -101,6 +109,7 @@ class Gateways:
         self._check(emulation.world.node_ids)
         self._folder = tempfile.TemporaryDirectory(prefix="vnet-")
         self._vehicles: dict[str, _Vehicle] = {}
+        self._numbers = count(1)
         self._closing: dict[str, asyncio.Task[None]] = {}
         """Gateways that are being closed, whose endpoints the next of their vehicles needs."""
         self._tasks: set[asyncio.Task[None]] = set()
@@ -111,11 +120,14 @@ class Gateways:
         self.endpoints: dict[str, str] = {}
         """The endpoint of each vehicle, which it keeps."""
 
+    def _now_ns(self) -> int:
+        """Emulated time; 0 before the start."""
+        return max(self._time_ns(), 0)
+
     def _check(self, node_ids: Sequence[str]) -> None:
         """Raise ProgramError for what is no command, and for vehicles without a port, before anything starts."""
-        for node in node_ids if self._starts else ():
-            for words in self._program.commands_of(node):
-                self._filled(words, {})
+        for words in self._program.all_commands if self._starts else ():
+            self._filled(words, {})
         port = int(self._settings.listen.rpartition(":")[2])
         if port and port + len(node_ids) - 1 > HIGHEST_PORT:
             raise ProgramError(
@@ -128,7 +140,7 @@ class Gateways:
     @property
     def pids(self) -> Mapping[str, int]:
         """Numbers that tell incarnations of a vehicle apart, of those that should be there."""
-        return {node: id(vehicle) for node, vehicle in self._vehicles.items()}
+        return {node: vehicle.number for node, vehicle in self._vehicles.items()}
 
     def is_prepared(self) -> bool:
         """Gateways need no preparation."""
@@ -144,7 +156,7 @@ class Gateways:
         for (node,) in groups:
             rules = None if self._ros2 is None else Ros2(node, self._ros2.inside, self._ros2.domain)
             gateway = Gateway(node, self._keys, self._settings, self._hear, rules)
-            vehicle = self._vehicles[node] = _Vehicle(gateway, Reporter(node), nice)
+            vehicle = self._vehicles[node] = _Vehicle(next(self._numbers), gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
@@ -161,20 +173,15 @@ class Gateways:
         if node in self._closing:
             await self._closing[node]
         try:
-            opening = asyncio.ensure_future(asyncio.to_thread(vehicle.gateway.open, self._listen(node)))
-            self.endpoints[node] = await asyncio.shield(opening)
-        except asyncio.CancelledError:  # the run is over; a router that stays open would not let the process end
-            await asyncio.gather(opening, return_exceptions=True)
-            await vehicle.gateway.close()
-            raise
+            self.endpoints[node] = await _opened(vehicle.gateway, self._listen(node))
         except VnetError as error:
-            self._say_hello(node, failure=str(error))
+            self._say_hello(vehicle, failure=str(error))
             return
         if self._vehicles.get(node) is not vehicle:  # a fault was faster
             await vehicle.gateway.close()
             return
         self._tell_endpoints()
-        self._say_hello(node)
+        self._say_hello(vehicle)
 
     def _listen(self, node: str) -> str:
         """Return the endpoint of a vehicle: that which it has had, or its place in the range of ports."""
@@ -185,17 +192,15 @@ class Gateways:
 
     def _tell_endpoints(self) -> None:
         """Write the endpoints of all vehicles, once they listen, and tell them to whoever starts the programs."""
-        if len(self.endpoints) < sum(node in self._vehicles for node in self._emulation.world.node_ids):
+        if not self._vehicles.keys() <= self.endpoints.keys():
             return
         if (path := self._emulation.folder.path) is not None:
-            endpoints = {node: self.endpoints[node] for node in sorted(self.endpoints, key=self._number)}
+            numbered = sorted(self.endpoints, key=self._emulation.number.__getitem__)
+            endpoints = {node: self.endpoints[node] for node in numbered}
             (path / ENDPOINTS).write_text(json.dumps(endpoints, indent=1) + "\n")
         if not self._starts:
             where = [f"{node} at {self.endpoints[node]}" for node in self._vehicles]
             self.on_state(f"waiting for programs of {first_names(where)} ({ENDPOINTS} has all)")
-
-    def _number(self, node: str) -> int:
-        return self._emulation.number[node]
 
     def signal(self, name: str, number: signal.Signals) -> None:
         """Send a signal to the commands of a vehicle."""
@@ -243,7 +248,7 @@ class Gateways:
             self._spawn(self._end(node))
             self._tell("ended", node, how)
         elif not vehicle.names and not vehicle.is_ready:
-            self._say_hello(node, failure="its commands have ended before they had connected")
+            self._say_hello(vehicle, failure="its commands have ended before they had connected")
         elif not vehicle.names:
             vehicle.endings.append(wire.Ending(node, "finished"))
             self._flush_soon(vehicle)
@@ -273,22 +278,20 @@ class Gateways:
         self._spawn(self._restart_endpoints(down_s))
 
     async def _restart_endpoints(self, down_s: float) -> None:
-        gateways = {node: vehicle.gateway for node, vehicle in self._vehicles.items()}
-        await asyncio.gather(*(gateway.close() for gateway in gateways.values()))
+        vehicles = list(self._vehicles.values())
+        await asyncio.gather(*(vehicle.gateway.close() for vehicle in vehicles))
         await asyncio.sleep(down_s)
-        for node, gateway in gateways.items():
-            if self._gateway_of(node) is not gateway:  # a fault has ended it meanwhile
-                continue
-            try:
-                await asyncio.to_thread(gateway.open, self.endpoints[node])
-            except VnetError as error:
-                self._tell("ended", node, Exit(1, str(error)))
-        time_ns = max(self._time_ns(), 0)
-        self._emulation.folder.event(time_ns, EventKind.router_restarted, None, down_s=down_s)
+        await asyncio.gather(*(self._open_again(vehicle) for vehicle in vehicles))
+        self._emulation.folder.event(self._now_ns(), EventKind.router_restarted, None, down_s=down_s)
 
-    def _gateway_of(self, node: str) -> Gateway | None:
-        vehicle = self._vehicles.get(node)
-        return None if vehicle is None else vehicle.gateway
+    async def _open_again(self, vehicle: _Vehicle) -> None:
+        node = vehicle.gateway.node
+        if self._vehicles.get(node) is not vehicle:  # a fault has ended it meanwhile
+            return
+        try:
+            await _opened(vehicle.gateway, self.endpoints[node])
+        except VnetError as error:
+            self._tell("ended", node, Exit(1, str(error)))
 
     async def close(self) -> None:
         """Close all gateways, and wait for what was told to end."""
@@ -307,14 +310,14 @@ class Gateways:
             return
         match message:
             case wire.Welcome():
-                vehicle.fragments = Fragments(message.max_payload)
+                vehicle.fragments = Fragments(message.max_payload, message.incarnation)
                 vehicle.acknowledges = message.acknowledges
                 self._start_commands(node, vehicle)
                 self._look_at_sessions(vehicle)
             case wire.Batch():
                 self._take_batch(vehicle, message)
             case wire.StackRequest():
-                self._tell("local", node, wire.StackDump(self._nonce(node), "", max(self._time_ns(), 0)))
+                self._tell("local", node, wire.StackDump(vehicle.nonce, "", self._now_ns()))
             case wire.End(refused=False):
                 self._flush(vehicle, final=True)
                 self._spawn(self._end(node))
@@ -338,7 +341,7 @@ class Gateways:
                 vehicle.names.append(name)
                 self._vehicle_of[name] = node
         except VnetError as error:
-            self._say_hello(node, failure=str(error))
+            self._say_hello(vehicle, failure=str(error))
 
     def _filled(self, words: Sequence[str], filled: Mapping[str, str]) -> list[str]:
         """Return the words of a command with all filled in. Raises ProgramError if there is no such command."""
@@ -350,7 +353,7 @@ class Gateways:
         return [found, *words[1:]]
 
     def _take_batch(self, vehicle: _Vehicle, batch: wire.Batch) -> None:
-        now_ns = max(self._time_ns(), 0)
+        now_ns = self._now_ns()
         vehicle.received_seq = batch.seq + 1
         if batch.origin_ns is not None and not vehicle.on_air:
             delay_s = max(batch.origin_ns + batch.start_ns - time.monotonic_ns(), 0) / NS_PER_S
@@ -377,7 +380,7 @@ class Gateways:
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:
         if self._ros2 is not None and self._is_there(vehicle):
-            vehicle.gateway.show_clock(max(self._time_ns(), 0))
+            vehicle.gateway.show_clock(self._now_ns())
             self._loop.call_later(1 / self._ros2.clock_hz, self._tell_clock, vehicle)
 
     def _acknowledge(self, vehicle: _Vehicle) -> None:
@@ -387,7 +390,7 @@ class Gateways:
 
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
-            vehicle.gateway.forget_tokens(max(self._time_ns(), 0))
+            vehicle.gateway.forget_tokens(self._now_ns())
             if (tokens := vehicle.gateway.tokens()) is not None and not vehicle.is_paused:
                 self._transmit(vehicle, tokens)
             self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)
@@ -397,14 +400,10 @@ class Gateways:
 
     # In the place of an agent: what it says.
 
-    def _say_hello(self, node: str, ready: bool = False, failure: str | None = None) -> None:
-        pid, host = os.getpid(), socket.gethostname()
-        self._tell(
-            "local", node, wire.Hello(node, node, self._nonce(node), pid, host, ready, failure, wire.VERSION)
-        )
-
-    def _nonce(self, node: str) -> bytes:
-        return str(self.pids.get(node, "")).encode()
+    def _say_hello(self, vehicle: _Vehicle, ready: bool = False, failure: str | None = None) -> None:
+        node, pid, host = vehicle.gateway.node, os.getpid(), socket.gethostname()
+        hello = wire.Hello(node, node, vehicle.nonce, pid, host, ready, failure, wire.VERSION)
+        self._tell("local", node, hello)
 
     def take(self, what: str, item: tuple[Gateway, Any]) -> None:
         """Take what a gateway has told, on the loop."""
@@ -428,7 +427,7 @@ class Gateways:
         if isinstance(message, CrossingTokens) and self._ros2 is not None and self._ros2.graph == "always":
             for other in self._vehicles.values():
                 if other is not vehicle:
-                    other.gateway.hear_tokens(node, message, max(self._time_ns(), 0))
+                    other.gateway.hear_tokens(node, message, self._now_ns())
             return
         if isinstance(message, CrossingReply) and vehicle.acknowledges:
             to = message.to
@@ -449,16 +448,15 @@ class Gateways:
         try:
             values = msgspec.msgpack.decode(content, type=dict[str, Any])
             estimate, covariance = values.pop("estimate_m", None), values.pop("covariance_m2", None)
-            report = vehicle.reporter.report(max(self._time_ns(), 0), estimate, covariance, values)
+            report = vehicle.reporter.report(self._now_ns(), estimate, covariance, values)
         except (msgspec.MsgspecError, TypeError, ValueError) as error:
             self._note(vehicle, "warning", f"{REPORT_KEY}: {error}")
         else:
             vehicle.reports.append(report)
             self._flush_soon(vehicle)
 
-    def _note(self, vehicle: _Vehicle, level: str, text: str) -> None:
-        time_ns = max(self._time_ns(), 0)
-        vehicle.notes.append(wire.Note(vehicle.gateway.node, time_ns, "log", level, text))  # type: ignore[arg-type]
+    def _note(self, vehicle: _Vehicle, level: Literal["debug", "warning", "error"], text: str) -> None:
+        vehicle.notes.append(wire.Note(vehicle.gateway.node, self._now_ns(), "log", level, text))
         self._flush_soon(vehicle)
 
     def _flush_soon(self, vehicle: _Vehicle) -> None:
@@ -474,8 +472,9 @@ class Gateways:
         traffic = wire.Traffic(vehicle.outbox, vehicle.reports, vehicle.endings, notes=vehicle.notes)
         vehicle.outbox, vehicle.reports, vehicle.endings, vehicle.notes = [], [], [], []
         lateness, late = wire.Lateness(list(vehicle.lateness)), vehicle.late
-        nonce = self._nonce(vehicle.gateway.node)
-        frames = wire.Frames(nonce, vehicle.seq, vehicle.received_seq, (), traffic, lateness, final, (), late)
+        frames = wire.Frames(
+            vehicle.nonce, vehicle.seq, vehicle.received_seq, (), traffic, lateness, final, (), late
+        )
         vehicle.late = []
         vehicle.seq += 1
         self._tell("local", vehicle.gateway.node, frames)
@@ -488,11 +487,11 @@ class Gateways:
         commands = len(self._program.of(node).commands) if self._starts else 0
         if not vehicle.is_ready and vehicle.fragments is not None and len(connected) >= max(commands, 1):
             vehicle.is_ready = True
-            self._say_hello(node, ready=True)
+            self._say_hello(vehicle, ready=True)
         most = self._settings.sessions or commands or None
         if most is not None and len(connected) > most:
             self._emulation.folder.event(
-                max(self._time_ns(), 0),
+                self._now_ns(),
                 EventKind.extra_session,
                 node,
                 count=len(connected),
@@ -510,3 +509,14 @@ class Gateways:
         return f"programs of {len(where)} of {total} vehicles have not connected within {timeout_s:g} s: " + (
             first_names(where)
         )
+
+
+async def _opened(gateway: Gateway, listen: str) -> str:
+    """Open a gateway; returns its endpoint. If the run ends meanwhile, its router would not let the process end."""
+    opening = asyncio.ensure_future(asyncio.to_thread(gateway.open, listen))
+    try:
+        return await asyncio.shield(opening)
+    except asyncio.CancelledError:
+        await asyncio.gather(opening, return_exceptions=True)
+        await gateway.close()
+        raise

@@ -65,6 +65,18 @@ def test_bytes_of_anybody_are_refused_or_are_a_message(content: bytes) -> None:
         Reassembly().take("v01", content)
 
 
+def test_parts_of_an_earlier_incarnation_do_not_complete_a_message_of_the_next() -> None:
+    before, after = (
+        list(Fragments(60, incarnation).of(CrossingQuery(0, "key", bytes([incarnation]) * 100, None, None)))
+        for incarnation in (0, 1)
+    )
+    assert len(before) == len(after) > 2
+    reassembly = Reassembly()
+    heard = [reassembly.take("v01", frame) for frame in [before[1], after[0], *after[2:]]]
+    assert heard == [None] * len(heard)
+    assert reassembly.take("v01", after[1]) == CrossingQuery(0, "key", b"\1" * 100, None, None)
+
+
 def test_unfinished_messages_do_not_fill_the_memory() -> None:
     fragments, reassembly = Fragments(100), Reassembly()
     message = CrossingQuery(0, "key", bytes(300), None, None)

@@ -68,7 +68,7 @@ class Vehicle:
         self._keys = [zenoh.KeyExpr(key) for key in keys]
         self._query_s, self._liveliness_s = query_s, liveliness_s
         self._loop = asyncio.get_running_loop()
-        self._fragments = Fragments(node.radio.max_payload)
+        self._fragments = Fragments(node.radio.max_payload, node.incarnation)
         self._reassembly = Reassembly()
         self.due = DueCallbacks()
         self._subscribers: list[Entity] = []
