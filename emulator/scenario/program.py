@@ -59,6 +59,10 @@ ZENOH_ENTRY = "vnet.gateway.emulated:main"
 _ENTRY = "agents.beacon:main"
 PYTHON = ("python", "python3")
 """First words of a command that stand for the interpreter of vnet."""
+FILLED_IN = ("{id}", "{endpoint}", "{port}")
+"""Words of a command that vnet fills in."""
+PLACEHOLDER = re.compile(r"\{[a-z_]+\}", re.IGNORECASE)
+"""A word that is meant to be filled in. Within a word braces may be a program's own."""
 
 
 class OneProgram(Section):
@@ -81,6 +85,9 @@ class OneProgram(Section):
         for words in commands or ():
             if not isinstance(words, list | tuple) or not words or not all(isinstance(word, str) for word in words):
                 raise ValueError('write its words, as ["python", "talker.py", "{id}"], or a list of such lists')
+            unknown = [word for word in words if PLACEHOLDER.fullmatch(word) and word not in FILLED_IN]
+            if unknown:
+                raise ValueError(f"{unknown[0]} is none of {', '.join(FILLED_IN)}, which are filled in")
         return commands
 
     @property

@@ -38,7 +38,7 @@ def observer_of(folder: Path) -> int:
 
 
 def wait_for_recording(folder: Path, process: subprocess.Popen[str], growths: int = 12) -> None:
-    """Wait until the recording has grown several times: its scene is written by then, and rows of the run with it."""
+    """Wait until the recording has grown several times: it has its scene by then, and rows of the run."""
     path = folder / "recording.rrd"
     sizes: set[int] = set()
 

@@ -11,6 +11,7 @@ import pytest
 
 from tests.support.paths import ROOT
 from tests.system.conftest import Finished, Vnet
+from vnet.transport.authority import issue_certificates
 
 PAGE = (ROOT / "docs/how-to/zenoh.md").read_text()
 WAITS = (
@@ -141,6 +142,30 @@ def test_commands_that_cannot_be_or_end_too_early_are_named_at_once(vnet: Vnet, 
     for words, text in (('["nosuch"]', "'nosuch' is no command"), ('["true"]', "ended before they had connected")):
         done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words)))
         assert (done.status, text in done.stderr) == (2, True), done.stderr
+
+
+@pytest.mark.parametrize("trusts", ["its authority", "another"])
+def test_commands_connect_by_tls_if_they_trust_the_authority_of_their_endpoint(
+    vnet: Vnet, tmp_path: Path, trusts: str
+) -> None:
+    issued = issue_certificates([], ["127.0.0.1"])
+    trusted = issued if trusts == "its authority" else issue_certificates([], ["127.0.0.1"])
+    (tmp_path / "router.pem").write_text(issued.router.certificate)
+    (tmp_path / "router.key").write_text(issued.router.private_key)
+    (tmp_path / "authority.pem").write_text(trusted.authority)
+    options = (
+        'listen = "tls/127.0.0.1:0", certificate = "router.pem", private_key = "router.key", '
+        'authority = "authority.pem"'
+    )
+    path = scenario(tmp_path, ('kind = "zenoh"', f'kind = "zenoh"\nzenoh = {{ {options} }}'))
+    if trusted is not issued:
+        assert vnet("run", path, "--set", "run.join_timeout_s=5").status == 2
+        return
+    done = vnet("run", path)
+    assert done.status in SLOW
+    assert heard(done, "v01").keys() > {"v01"}
+    endpoints = json.loads((done.folder / "endpoints.json").read_text())
+    assert all(endpoint.startswith("tls/127.0.0.1:") for endpoint in endpoints.values())
 
 
 @pytest.mark.parametrize("program", ["sh", "talker.py"])

@@ -30,6 +30,7 @@ def write(folder: Path, text: str) -> Path:
         ("[radio]\nloss = 0.1\nloss = much\n", ["not valid TOML", "line 3"]),
         ("[run]\nseed = " + "9" * 5000, ["not valid TOML"]),
         ("[run]\nseed = 0x" + "f" * 5000, ["run.seed = (int)", "64 bits"]),
+        ('[program]\nkind = "zenoh"\ncommand = ["a", "{car}"]', ["program.command", "{car} is none of {id}"]),
         ("[program.options]\na = " + "[" * 1000, ["not valid TOML", "nested more than 32 deep"]),
         ("a" + ".a" * 100_000 + " = 1", ["not valid TOML", "a key of more than 32 parts"]),
         ("[radio]\nlinks = '" + "a" * 5000 + "'", ["radio.links = 'aaa", "cannot be the name of a file"]),
