@@ -31,19 +31,21 @@ class Packet(Struct, frozen=True, gc=False):  # made six times as fast as a data
 class RadioAbilities(NamedTuple):
     """Limits of a choice for a frame: the largest power in dBm, or None, and the bit rates in Mbit/s.
 
-    `acknowledges` says that there is a MAC, which acknowledges frames to a single vehicle.
+    `acknowledges` says that there is a MAC that acknowledges frames to a single vehicle. `periods_ms` are the
+    intervals with which the radio can reserve resources; none if it reserves nothing.
     """
 
     max_power_dbm: float | None = None
     rates_mbps: Sequence[float] = ()
     acknowledges: bool = False
+    periods_ms: Sequence[float] = ()
 
 
 class SentFrame(Struct, frozen=True, array_like=True):
     """One frame that `node` enqueues, with the scenario's power and bit rate where it has none of its own.
 
     It is a broadcast, or addressed `to` one node; then `number` counts such frames of the sender, and its result
-    names it.
+    names it. `period_ms` is the interval in which the program will send, for a radio that reserves resources.
     """
 
     node: str
@@ -52,6 +54,7 @@ class SentFrame(Struct, frozen=True, array_like=True):
     rate_mbps: float | None = None
     to: str | None = None
     number: Annotated[int, Meta(ge=0, le=2**62)] = 0
+    period_ms: float | None = None
 
 
 class SendResult(NamedTuple):
@@ -96,6 +99,7 @@ class Radio:
         max_power_dbm: largest transmit power in dBm, which is the default; None where the radio has no powers.
         rates_mbps: bit rates in Mbit/s that a frame may have; none where they cannot be chosen.
         acknowledges: whether frames to a single vehicle are acknowledged, as `send` needs it.
+        periods_ms: intervals that a reservation of the radio may have; none where it reserves nothing.
     """
 
     def __init__(
@@ -106,6 +110,7 @@ class Radio:
         self.rates_mbps = tuple(abilities.rates_mbps)
         self.inbox: Mailbox[Packet] = Mailbox()
         self.acknowledges = abilities.acknowledges
+        self.periods_ms = tuple(abilities.periods_ms)
         self._next_send = 0
         self._sends: dict[int, asyncio.Future[SendResult]] = {}
         self._unknown: set[int] = set()
@@ -114,20 +119,28 @@ class Radio:
         self._transport = transport
 
     async def broadcast(
-        self, payload: bytes, *, power_dbm: float | None = None, rate_mbps: float | None = None
+        self,
+        payload: bytes,
+        *,
+        power_dbm: float | None = None,
+        rate_mbps: float | None = None,
+        period_ms: float | None = None,
     ) -> None:
         """Send one frame to all nodes in range, with the scenario's power and bit rate or others.
 
         `power_dbm` is at most `max_power_dbm`, and `rate_mbps` one of `rates_mbps`. Less power reaches less far; a
-        higher rate keeps the medium busy for a shorter time, but needs a better signal.
+        higher rate keeps the medium busy for a shorter time, but needs a better signal. `period_ms` is the interval
+        in which such frames follow: a radio that reserves resources (`periods_ms`) learns it from the frames if it
+        is not told, and others ignore it.
 
         Raise `PayloadTooLargeError` above `max_payload` bytes, TypeError for what is not bytes, and ValueError for
-        a power or a rate that the radio does not have.
+        a power, a rate or a period that the radio does not have.
         """
         power_dbm = self._checked_power("broadcast", power_dbm)
         rate_mbps = self._checked_rate("broadcast", rate_mbps)
+        period_ms = self._checked_period("broadcast", period_ms)
         content = self._checked_payload("broadcast", payload)
-        self._transport.send_frame(SentFrame(self._node_id, content, power_dbm, rate_mbps))
+        self._transport.send_frame(SentFrame(self._node_id, content, power_dbm, rate_mbps, period_ms=period_ms))
 
     async def send(
         self, to: str, payload: bytes, *, power_dbm: float | None = None, rate_mbps: float | None = None
@@ -136,12 +149,13 @@ class Radio:
 
         The frame is transmitted again until an acknowledgement comes, up to 7 times in all. The result comes one
         `radio.latency_ms` after the sender's MAC knows it. Cancelling the call stops no transmission. The other
-        arguments and exceptions are those of `broadcast`; raise ValueError also without `[radio.mac]`, and for a
-        `to` that is no other vehicle's name. A name that no vehicle has is not acknowledged, with 0 attempts.
+        arguments and exceptions are those of `broadcast`; raise ValueError also without `[radio.mac]` of 802.11p,
+        and for a `to` that is no other vehicle's name. A name that no vehicle has is not acknowledged, with 0
+        attempts.
         """
         if not self.acknowledges:
             raise ValueError(
-                f"send({shown(to)}, …): only with [radio.mac] a frame is acknowledged; use broadcast()"
+                f"send({shown(to)}, …): only with [radio.mac] of 802.11p a frame is acknowledged; use broadcast()"
             )
         if not _can_be_name(to) or to == self._node_id:
             raise ValueError(f"send({shown(to)}, …): the name of another vehicle is expected")
@@ -199,12 +213,23 @@ class Radio:
         if rate_mbps is None:
             return None
         if not self.rates_mbps:
-            text = "only with [radio.path_loss] or [radio.mac] a frame has a rate of its own"
+            text = "only with [radio.path_loss] or [radio.mac], and 802.11p, a frame has a rate of its own"
             raise ValueError(f"{call}(rate_mbps={shown(rate_mbps)}): {text}")
         number = number_or_nan(rate_mbps)
         if number not in self.rates_mbps:
             rates = ", ".join(f"{rate:g}" for rate in self.rates_mbps)
             raise ValueError(f"{call}(rate_mbps={shown(rate_mbps)}): 802.11p has {rates}")
+        return number
+
+    def _checked_period(self, call: str, period_ms: float | None) -> float | None:
+        """Return a period as a float, None if the radio reserves nothing. Raise ValueError for an unknown one."""
+        if period_ms is None or not self.periods_ms:
+            return None
+        number = number_or_nan(period_ms)
+        if number not in self.periods_ms:
+            short = [f"{each:g}" for each in self.periods_ms if each < 100]
+            text = ", ".join(short) if len(short) < 5 else f"{short[0]} to {short[-1]}"
+            raise ValueError(f"{call}(period_ms={shown(period_ms)}): allowed are {text}, 100, 200, … 1000 ms")
         return number
 
     @property

@@ -53,6 +53,7 @@ from emulator.scenario.faults import (
     StaleMessages,
     Throttle,
 )
+from emulator.scenario.radio import Edca
 from vnet.counted import counted
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_MS
@@ -457,10 +458,10 @@ def _slowed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
     they would have been on air by then, if no congestion control held them back.
     """
     radio, begin_ns = recorded.scenario.radio, recorded.on_air_ns
-    assert isinstance(planned.fault, Throttle) and radio.mac is not None
+    assert isinstance(planned.fault, Throttle)
     ready_ns = recorded.sent_ns + radio.access_jitter_ms * NS_PER_MS
     slow = begin_ns >= ready_ns + recorded.column("size_bytes") * 8_000 / planned.fault.bitrate_mbps - 1
-    if radio.congestion is None:
+    if radio.congestion is None and isinstance(radio.mac, Edca):
         on_air = np.flatnonzero(begin_ns >= 0)
         on_air = on_air[np.argsort(begin_ns[on_air])]
         silent_ns = np.maximum.accumulate(np.append(0, (begin_ns + recorded.airtime_ns)[on_air]))

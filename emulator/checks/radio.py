@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.checks.channel import nothing_seen, received_twice
+from emulator.checks.sidelink import broken_rules
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import DETECTION_NS, SIFS_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.reception import Threshold, milliwatts
+from emulator.radio.sidelink import Link
 from emulator.radio.unicast import MOST_ATTEMPTS, ack_airtime_ns
 from emulator.records.distributions import chi2_sf
 from emulator.records.recorded_run import ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, not_exercised, result
 from emulator.scenario.faults import Throttle
-from emulator.scenario.radio import EtsiReactive, Limeric, Receiver
+from emulator.scenario.radio import Edca, EtsiReactive, Limeric, Receiver
 from emulator.scenario.scenario import Radio
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
@@ -41,7 +43,10 @@ def check_fading(recorded: RecordedRun) -> Finding:
     radio = recorded.scenario.radio
     if not radio.is_physical:
         return not_exercised("unit-disc radio: no fading")
-    drawing = np.flatnonzero(recorded.outcome_is(*ON_AIR) & ~received_twice(recorded) & recorded.placed)
+    if radio.sidelink is not None and radio.sidelink.retransmit:
+        return not_exercised("frames are transmitted twice: how many fade depends on who transmits")
+    reached = recorded.outcome_is(*ON_AIR) & ~recorded.outcome_is("half_duplex")
+    drawing = np.flatnonzero(reached & ~received_twice(recorded) & recorded.placed)
     if not len(drawing):
         return nothing_seen(recorded, "no reception came as far as the receiver")
     survives = _survival(recorded, radio, drawing)
@@ -88,6 +93,8 @@ def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Ar
     survives = np.zeros(len(rows))
     heard = power_mw > 0
     airtime_ns, rate_mbps = recorded.airtime_ns[rows], recorded.bitrate_mbps[rows]
+    if radio.sidelink is not None:  # where not the time on air counts, but the share of the channel
+        airtime_ns = -(-recorded.column("size_bytes")[rows] // radio.sidelink.subchannel_bytes)
     kinds, kind = np.unique(np.column_stack([airtime_ns, rate_mbps]), axis=0, return_inverse=True)
     for number, m in enumerate(shapes):
         for index, (length_ns, mbps) in enumerate(kinds.tolist()):
@@ -98,10 +105,17 @@ def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Ar
 
 
 def _arrives(radio: Radio, m: float, airtime_ns: int, rate_mbps: float, power_db: Array) -> Array:
-    """Return the probability that frames arrive alone, by mean power; without fading m is infinite."""
+    """Return the probability that frames arrive alone, by mean power; without fading m is infinite.
+
+    On a sidelink `airtime_ns` is the number of subchannels, and what is not detected has not faded.
+    """
     threshold = Threshold(radio.receiver or Receiver())
+    link = Link(radio) if radio.sidelink is not None else None
 
     def of(power_mw: Array) -> Array:
+        if link is not None:
+            lost = link.error_rate(power_mw / link.noise_mw(max(airtime_ns, 1)))
+            return np.asarray(1 - np.where(power_mw >= link.sensing_mw, lost, 0.0))
         arrives = arrival_probability(power_mw / threshold.noise_mw, airtime_ns, rate_mbps)
         return np.asarray(np.where(power_mw >= threshold.alone_mw, arrives, 0.0))
 
@@ -190,6 +204,11 @@ def check_medium(recorded: RecordedRun) -> Finding:
     if not len(recorded.trace):
         return nothing_seen(recorded, "no frame was sent")
     air = _Air.of(recorded)
+    if (mac := recorded.scenario.radio.sidelink) is not None:
+        rules = broken_rules(recorded, mac)
+        return _judged(
+            recorded, air, {"mistimed": _mistimed(recorded), "collided_alone": _collided_alone(air), **rules}
+        )
     broken: dict[str, NDArray[np.intp]] = {
         "mistimed": _mistimed(recorded),
         "without_pause": _without_pause(air),
@@ -198,8 +217,12 @@ def check_medium(recorded: RecordedRun) -> Finding:
         "heard_while_sending": _heard_while_sending(air),
         "badly_acknowledged": _badly_acknowledged(recorded),
     }
-    counts: dict[str, Any] = {what: len(rows) for what, rows in broken.items()}
-    counts["too_idle"] = _too_idle(air)
+    return _judged(recorded, air, broken, too_idle=_too_idle(air))
+
+
+def _judged(recorded: RecordedRun, air: _Air, broken: dict[str, NDArray[np.intp]], **more: int) -> Finding:
+    """Return the finding of the rows that break each rule, and of what is counted without rows."""
+    counts: dict[str, Any] = {**{what: len(rows) for what, rows in broken.items()}, **more}
     total = sum(counts.values())
     collided = int(recorded.outcome_is("collided").sum())
     sent = counted(len(air.rows), "transmission")
@@ -227,13 +250,13 @@ def _mistimed(recorded: RecordedRun) -> NDArray[np.intp]:
 def _without_pause(air: _Air) -> NDArray[np.intp]:
     """Transmissions that begin too early after the same sender's last."""
     radio = air.recorded.scenario.radio
-    assert radio.mac is not None
+    assert isinstance(radio.mac, Edca)
     match radio.congestion:
         case EtsiReactive(pause_ms=pause_ms):
             least_ns = round(min(pause_ms) * 1_000_000)
         case Limeric():
             least_ns = LEAST_PAUSE_NS
-        case None:
+        case _:
             least_ns = 0
     early = [np.zeros(0, np.intp)]
     for some, pause_ns in ((np.arange(len(air.rows)), 0), (np.flatnonzero(~air.is_ack), least_ns)):
@@ -254,7 +277,7 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
     recorded, radio = air.recorded, air.recorded.scenario.radio
     if radio.fading is not None:
         return np.zeros(0, np.intp)
-    assert radio.mac is not None
+    assert isinstance(radio.mac, Edca)
     earlier, later = air.near(edca_parameters(radio.mac).aifs_ns)
     noticed = air.begin_ns[later] >= air.begin_ns[earlier] + DETECTION_NS
     earlier, later = earlier[noticed], later[noticed]

@@ -42,7 +42,7 @@ from emulator.records.tables import PayloadRecorder, background_table
 from emulator.records.tape import MediumOrder, TapeEntry, first_left, parse_tape, read_tape
 from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.program import Program, RoadsideUnit
-from emulator.scenario.scenario import Scenario, least_latency_ns
+from emulator.scenario.scenario import Scenario, least_transit_ns
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
 from emulator.world.gnss_faults import FaultyGnss, clock_of
@@ -485,7 +485,7 @@ class Emulation:
         self.orders = Orders(scenario)
         self.backbone = BackboneNetwork(scenario, self.up)
         self.news = NewsFeed(self.engine, self.backbone, self.up)
-        self.busy = BusyFeed(self.engine, world.node_ids, least_latency_ns(scenario.radio))
+        self.busy = BusyFeed(self.engine, world.node_ids, least_transit_ns(scenario.radio))
 
     def _nodes_at(self, period: int) -> Nodes:
         """Nodes as the selectors of faults see them in a period."""
@@ -528,6 +528,7 @@ class Emulation:
         scenario = self.scenario
         incarnation = self.incarnation[node]
         program = scenario.program.of(node)
+        abilities = abilities_of(scenario.radio, self._unit_of(node))
         return wire.Welcome(
             node,
             nonce,
@@ -546,8 +547,11 @@ class Emulation:
             wire.VERSION,
             self.orders.of_node(node, incarnation),
             self.driving.control_ns(node),
-            *abilities_of(scenario.radio, self._unit_of(node)),
+            abilities.max_power_dbm,
+            abilities.rates_mbps,
+            abilities.acknowledges,
             self.backbone.abilities(node),
+            abilities.periods_ms,
         )
 
     def _unit_of(self, node: str) -> RoadsideUnit | None:

@@ -1,7 +1,8 @@
 """The colours of all of vnet's pictures: pages, figures, maps, terminals and Rerun.
 
 Series have the colours of Okabe and Ito (2008), which the colour-blind tell apart, brighter on dark paper; sand,
-rust and navy are shades for more series than there are such colours. Nothing is told by colour alone.
+rust, navy, plum, teal and slate are shades for more series than there are such colours. Nothing is told by colour
+alone.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ PALETTE = {
     "sand": _colour("#bdb35c", "#8c8240", "#8c8232"),
     "rust": _colour("#8a3a00", "#c05a20", "#964208"),
     "navy": _colour("#004166", "#2c6f9e", "#285a8c"),
+    "plum": _colour("#6a3d7c", "#a274b8", "#825aa0"),
+    "teal": _colour("#3a7d7c", "#58a9a6", "#468c8c"),
+    "slate": _colour("#4a5568", "#8793a8", "#64738c"),
 }
 """Colours of series and of what is around them, by name; no two are alike on light paper."""
 PAGE = {

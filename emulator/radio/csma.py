@@ -61,10 +61,10 @@ from emulator.radio.unicast import (
     address,
     retry_of,
 )
-from emulator.scenario.radio import EtsiReactive, Limeric, Receiver
-from emulator.scenario.radio import Mac as MacSection
+from emulator.scenario.radio import Edca, EtsiReactive, Limeric, Receiver
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio, least_latency_ns
+from emulator.scenario.sidelink import CrLimit
 from vnet.types import Array
 from vnet.units import NS_PER_MS
 
@@ -92,7 +92,7 @@ class CongestionControl(Protocol):
 
 
 def congestion_control_of(
-    congestion: EtsiReactive | Limeric | None, count: int, seed: int
+    congestion: EtsiReactive | Limeric | CrLimit | None, count: int, seed: int
 ) -> CongestionControl | None:
     """Return the congestion control that a scenario configures for `count` senders, or None."""
     match congestion:
@@ -100,7 +100,7 @@ def congestion_control_of(
             return ReactiveControl(congestion, BusyRatioMeter(count, seed))
         case Limeric():
             return LimericControl(congestion, BusyRatioMeter(count, seed))
-        case None:
+        case _:
             return None
 
 
@@ -272,7 +272,7 @@ class EdcaParameters(NamedTuple):
         return min((self.window + 1 << attempts) - 1, self.max_window)
 
 
-def edca_parameters(mac: MacSection) -> EdcaParameters:
+def edca_parameters(mac: Edca) -> EdcaParameters:
     """Return the parameters of the access category that a scenario configures."""
     aifsn, window = AIFSN_AND_CW[mac.access_category]
     return EdcaParameters(SIFS_NS + aifsn * SLOT_NS, window, MAX_WINDOW[mac.access_category])
@@ -286,6 +286,7 @@ class Csma(Mac):
     """
 
     shares_medium = True
+    acknowledges = True
 
     def __init__(
         self,
@@ -299,7 +300,7 @@ class Csma(Mac):
     ) -> None:
         super().__init__()
         mac = radio.mac
-        assert mac is not None
+        assert isinstance(mac, Edca)
         self._edca = edca_parameters(mac)
         self._aifs_ns = self._edca.aifs_ns
         self._has_eifs = mac.eifs  # after broadcasts, too

@@ -86,6 +86,8 @@ def abilities_of(radio: Radio, unit: RoadsideUnit | None = None) -> RadioAbiliti
     power_dbm = None if radio.path_loss is None else radio.path_loss.tx_power_dbm
     if power_dbm is not None and unit is not None and unit.tx_power_dbm is not None:
         power_dbm = unit.tx_power_dbm
+    if radio.sidelink is not None:
+        return RadioAbilities(power_dbm, periods_ms=radio.sidelink.periods_ms)
     return RadioAbilities(power_dbm, RATES_MBPS if radio.is_physical else (), radio.mac is not None)
 
 

@@ -37,6 +37,7 @@ from emulator.radio.frames import (
     Transmission,
     UnicastResult,
     allowed_choices,
+    allowed_period_ms,
     flipped,
 )
 from emulator.radio.mac import Mac, TransmitQueue
@@ -44,6 +45,7 @@ from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
 from emulator.radio.propagation import transmit_powers_dbm
 from emulator.radio.reception import Reception, Signals
+from emulator.radio.sidelink import Sidelink, SidelinkReception
 from emulator.radio.stages import (
     LatencyStage,
     LossStage,
@@ -268,8 +270,10 @@ class InFlight:
             self._frames_kept = 2 * len(needed) + 64
 
 
-NO_CHOICES = None, None, None
-"""Power, bit rate and addressee of a frame without any of its own."""
+NO_CHOICES = None, None, None, None
+"""Power, bit rate, addressee and period of a frame without any of its own."""
+
+_choices = attrgetter("power_dbm", "rate_mbps", "to", "period_ms")
 
 _COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
 _CHOICES = attrgetter(*(f"frame.{name}" for name in CHOSEN))
@@ -305,8 +309,11 @@ class Engine:
         self._trace = Trace(node_ids, radio.mac is not None, knows_power=radio.path_loss is not None)
         self._copies = CopyNumbers()
         self._unicasts = Unicasts(least_latency_ns(radio), self._trace)
-        if radio.mac is not None and signals is not None:
-            self._mac: Mac = Csma(radio, signals, self._topology, self._trace, self._copies, self._unicasts, seed)
+        self._mac: Mac
+        if radio.sidelink is not None and signals is not None:
+            self._mac = Sidelink(radio, signals, seed)
+        elif radio.mac is not None and signals is not None:
+            self._mac = Csma(radio, signals, self._topology, self._trace, self._copies, self._unicasts, seed)
         else:
             self._mac = TransmitQueue(seed, radio)
         self._rules = rules or OwnRules(seed, node_ids)
@@ -314,7 +321,10 @@ class Engine:
         self._links = LinkFaults(seed, self._mac, count, self._rules)
         ask = partial(self._rules.ask_sender, max_bytes=radio.max_payload_bytes)
         self._senders = SenderFaults(self._node_ids, self._copies, ask)
-        self._reception = Reception(radio, signals) if signals is not None else None
+        self._reception: Reception | SidelinkReception | None = None
+        if signals is not None:
+            stage = SidelinkReception if radio.sidelink is not None else Reception
+            self._reception = stage(radio, signals)
         self.deciding: list[Stage] = [
             in_range,
             sender_side,
@@ -396,7 +406,7 @@ class Engine:
                 bitrate_mbps=self._radio.bitrate_mbps,
                 name=self._node_ids[node],
             )
-            if not isinstance(asked, bytes) and (asked.power_dbm, asked.rate_mbps, asked.to) != NO_CHOICES:
+            if isinstance(asked, SentFrame) and _choices(asked) != NO_CHOICES:
                 chosen = self._chosen(frame, asked)
                 if chosen is None:
                     continue
@@ -418,7 +428,7 @@ class Engine:
         to, ticket = BROADCAST, 0
         if asked.to is not None:
             to = self._number.get(asked.to, BROADCAST)
-            if not self._mac.shares_medium:
+            if not self._mac.acknowledges:
                 return None
             if to in (node, BROADCAST):
                 self._unicasts.refuse(node, asked.number, frame.sent_ns)
@@ -426,7 +436,8 @@ class Engine:
             ticket, self._trace.acknowledges = self._unicasts.register(node, asked.number), True
         if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
-        return replace(frame, gain_db=gain_db, bitrate_mbps=bitrate_mbps, to=to, ticket=ticket)
+        period_ms = allowed_period_ms(self._radio, asked)
+        return replace(frame, gain_db=gain_db, bitrate_mbps=bitrate_mbps, to=to, ticket=ticket, period_ms=period_ms)
 
     def _enqueue(self, frame: Frame) -> None:
         sent = Transmission(frame, attempt=int(frame.to != BROADCAST))

@@ -66,9 +66,15 @@ def allowed_choices(radio: Radio, asked: SentFrame, largest_dbm: float | None) -
     if asked.power_dbm is not None and largest_dbm is not None and math.isfinite(asked.power_dbm):
         power_dbm = max(asked.power_dbm, MIN_POWER_DBM)
         gain_db = round(min(power_dbm - largest_dbm, 0.0), DIGITS)
-    if radio.is_physical and asked.rate_mbps in RATES_MBPS:
+    if radio.is_physical and radio.sidelink is None and asked.rate_mbps in RATES_MBPS:
         bitrate_mbps = float(asked.rate_mbps or bitrate_mbps)
     return gain_db, bitrate_mbps
+
+
+def allowed_period_ms(radio: Radio, asked: SentFrame) -> int:
+    """Return the reservation interval that a program has asked for; 0 for none, or one that the radio lacks."""
+    periods_ms = () if radio.sidelink is None else radio.sidelink.periods_ms
+    return int(asked.period_ms) if asked.period_ms in periods_ms else 0
 
 
 @dataclass(slots=True, eq=False)
@@ -81,6 +87,9 @@ class Signal:
     `locked` marks the receivers that are locked on this frame; None if no other frame kept any from it. `pieces`
     are tuples (time, total power): until this time in ns the sum of all powers on air was this (N,), in mW. They
     are empty for a frame that was alone on air.
+
+    On a sidelink `slots` has instead, for each slot in which it was transmitted, the power of all other signals on
+    its resource (N,) in mW, and the mask (N,) of the vehicles that transmitted, and heard nothing.
     """
 
     random_draws: NDArray[np.uint64]
@@ -88,6 +97,7 @@ class Signal:
     sender_draws: int
     locked: NDArray[np.bool_] | None = None
     pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
+    slots: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -112,7 +122,8 @@ class Frame:
     or changes it. A frame that a rule has `dropped` is recorded, but not sent.
 
     It is sent at `bitrate_mbps`, with a power of `gain_db` above that of the scenario. `to` is the number of its
-    addressee, or BROADCAST; then `ticket` names what its program waits for.
+    addressee, or BROADCAST; then `ticket` names what its program waits for. `period_ms` is the reservation interval
+    that its program asks for, 0 if it leaves this to the MAC.
 
     `topology` and `effects` are those of the time it was enqueued.
     """
@@ -132,6 +143,7 @@ class Frame:
     dropped: bool = False
     to: int = BROADCAST
     ticket: int = 0
+    period_ms: int = 0
 
     @property
     def size_bytes(self) -> int:

@@ -28,7 +28,9 @@ class Mac:
     """
 
     shares_medium: ClassVar[bool] = False
-    """True if the vehicles share a medium: they sense how busy it is, and acknowledge frames to one of them."""
+    """True if the vehicles share a medium, and sense how busy it is."""
+    acknowledges: ClassVar[bool] = False
+    """True if frames to one vehicle are acknowledged."""
 
     def __init__(self) -> None:
         self.sent: list[Transmission] = []

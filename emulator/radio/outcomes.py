@@ -35,6 +35,10 @@ def _always(scenario: Scenario, vehicles: int) -> bool:
     return True
 
 
+def _has_grid(scenario: Scenario) -> bool:
+    return scenario.radio.sidelink is not None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Facts:
     """All that vnet states about an outcome.
@@ -169,7 +173,37 @@ class Outcome(IntEnum):
             stage=Stage.RECEPTION,
             colour="yellow",
             sign="▩",
-            is_possible=lambda scenario, vehicles: scenario.radio.mac is not None,
+            is_possible=lambda scenario, vehicles: scenario.radio.mac is not None and not _has_grid(scenario),
+        ),
+    )
+    half_duplex = (
+        14,
+        Facts(
+            meaning="the receiver transmitted in the same slot (sidelink)",
+            stage=Stage.RECEPTION,
+            colour="plum",
+            sign="▘",
+            is_possible=lambda scenario, vehicles: _has_grid(scenario),
+        ),
+    )
+    below_sensing = (
+        15,
+        Facts(
+            meaning="weaker than `radio.mac.sensing_dbm` (sidelink)",
+            stage=Stage.RECEPTION,
+            colour="teal",
+            sign="▝",
+            is_possible=lambda scenario, vehicles: _has_grid(scenario),
+        ),
+    )
+    no_grant = (
+        16,
+        Facts(
+            meaning="its sender may use no more of the channel, or had another frame in the slot (sidelink)",
+            stage=Stage.SENDER,
+            colour="slate",
+            sign="▖",
+            is_possible=lambda scenario, vehicles: _has_grid(scenario),
         ),
     )
 

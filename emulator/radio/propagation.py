@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.radio import Buildings as Section
-from emulator.scenario.radio import DualSlope, Fading, FreeSpace, LogDistance, Shadowing, TwoRay
+from emulator.scenario.radio import DualSlope, Fading, FreeSpace, LogDistance, Shadowing, TwoRay, WinnerB1
 from emulator.scenario.random_streams import Draws
 from emulator.world.buildings import Buildings
 from vnet.types import Array, Mask
@@ -31,6 +31,8 @@ VEHICLE_ANTENNA_M = 1.5
 """Height of a vehicle's antenna above the ground where the path loss does not say it."""
 NEAREST_M = 1.0
 """Least distance of the path loss models: below it, antennas are in each other's near field."""
+WINNER_NEAREST_M = 3.0
+"""Least distance of WINNER+ B1."""
 WAVES = 512
 """Plane waves whose sum is the shadowing."""
 QUANTILES = 1 << 16
@@ -40,7 +42,7 @@ DIGITS = 6
 the number of vehicles, then decides nothing."""
 
 
-PathLossModel = FreeSpace | LogDistance | DualSlope | TwoRay
+PathLossModel = FreeSpace | LogDistance | DualSlope | TwoRay | WinnerB1
 """A model of the path loss."""
 CELL_M = 20.0
 """Least side of the cells in which edges are looked up: about the length of a building's edge."""
@@ -57,7 +59,7 @@ Index = NDArray[np.intp]
 
 def vehicle_antenna_m(model: PathLossModel) -> float:
     """Return the height in m of the antennas of vehicles."""
-    return model.antenna_m if isinstance(model, TwoRay) else VEHICLE_ANTENNA_M
+    return model.antenna_m if isinstance(model, TwoRay | WinnerB1) else VEHICLE_ANTENNA_M
 
 
 def loss_db(model: PathLossModel, distance_m: Array, height_m: tuple[Array, Array] | None = None) -> Array:
@@ -69,6 +71,8 @@ def loss_db(model: PathLossModel, distance_m: Array, height_m: tuple[Array, Arra
     far_m = np.maximum(distance_m, NEAREST_M)
     if isinstance(model, TwoRay):
         return _two_ray_db(model, far_m, *(height_m or (model.antenna_m, model.antenna_m)))
+    if isinstance(model, WinnerB1):
+        return _winner_b1_db(model, distance_m, *(height_m or (model.antenna_m, model.antenna_m)))
     if height_m is not None:
         far_m = np.maximum(np.hypot(distance_m, height_m[0] - height_m[1]), NEAREST_M)
     match model:
@@ -92,6 +96,21 @@ def _two_ray_db(model: TwoRay, distance_m: Array, here_m: Array | float, there_m
     reflection = (sine - root) / (sine + root)
     rays = np.abs(1 + reflection * np.exp(1j * phase_rad))
     return np.asarray(20 * np.log10(4 * np.pi * direct_m / wavelength_m / np.maximum(rays, 1e-9)))
+
+
+def _winner_b1_db(model: WinnerB1, distance_m: Array, here_m: Array | float, there_m: Array | float) -> Array:
+    """Return the WINNER+ B1 path loss with line of sight between two heights, not less than free space.
+
+    WINNER+ D5.3, table 4-1, as 3GPP TR 36.885 and Gonzalez-Martin et al. (2019) take it: at least 3 m.
+    """
+    far_m = np.maximum(distance_m, WINNER_NEAREST_M)
+    here_m, there_m = (np.maximum(height_m - model.environment_m, 0.1) for height_m in (here_m, there_m))
+    break_m = 4 * here_m * there_m * model.frequency_ghz * 1e9 / LIGHT_M_S
+    log_ghz = np.log10(model.frequency_ghz)
+    near_db = 22.7 * np.log10(far_m) + 27 + 20 * log_ghz
+    beyond_db = 40 * np.log10(far_m) + 7.56 - 17.3 * np.log10(here_m) - 17.3 * np.log10(there_m) + 2.7 * log_ghz
+    free_db = 20 * np.log10(far_m) + 46.4 + 20 * np.log10(model.frequency_ghz / 5)
+    return np.asarray(np.maximum(np.where(far_m < break_m, near_db, beyond_db), free_db))
 
 
 def transmit_powers_dbm(

@@ -254,7 +254,10 @@ class RecordedRun:
 
     @cached_property
     def airtime_ns(self) -> IntArray:
-        """Duration of each row's transmission, but for throttles."""
+        """Duration of each row's transmission, but for throttles; on a sidelink until the last slot ends."""
+        if (mac := self.scenario.radio.sidelink) is not None:
+            lasts_ns = self.column("left_ns") - self.on_air_ns
+            return np.where(self.on_air_ns >= 0, lasts_ns, mac.slot_ns)
         return airtimes_ns(self.scenario.radio, self.column("size_bytes"), self.bitrate_mbps)
 
     @cached_property

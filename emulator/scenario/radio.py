@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from emulator.scenario.network import OriginDeg
 from emulator.scenario.sections import Section
+from emulator.scenario.sidelink import CrLimit, LteMode4, NrMode2
 
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
 """The bit rates of 802.11p in 10 MHz (802.11-2020, table 17-4)."""
@@ -76,7 +77,26 @@ class TwoRay(_PathLoss):
     """Relative permittivity of the ground."""
 
 
-PathLoss = Annotated[FreeSpace | LogDistance | DualSlope | TwoRay, Field(discriminator="kind")]
+class WinnerB1(_PathLoss):
+    """WINNER+ B1 with line of sight, at least free space: 3GPP's urban model for vehicles (TR 36.885)."""
+
+    kind: Literal["winner_b1"]
+    """This model."""
+    frequency_ghz: float = Field(5.9, ge=0.1, le=100)
+    """Carrier frequency."""
+    antenna_m: float = Field(1.5, gt=0, le=1000)
+    """Height of both antennas above the ground."""
+    environment_m: float = Field(0.0, ge=0, le=100)
+    """Effective height of the environment, less than that of the antennas."""
+
+    @model_validator(mode="after")
+    def _antennas_are_above_it(self) -> WinnerB1:
+        if self.environment_m >= self.antenna_m:
+            raise ValueError(f"environment_m = {self.environment_m:g}: must be less than antenna_m")
+        return self
+
+
+PathLoss = Annotated[FreeSpace | LogDistance | DualSlope | TwoRay | WinnerB1, Field(discriminator="kind")]
 
 
 class Shadowing(Section):
@@ -133,15 +153,21 @@ class Receiver(Section):
     """Least received power at which a frame is detected."""
 
 
-class Mac(Section):
-    """`[radio.mac]`: a shared medium with carrier sensing (802.11p's EDCA)."""
+class Edca(Section):
+    """A shared medium with carrier sensing: EDCA of 802.11p. It is the kind where none is given."""
 
+    kind: Literal["80211p"] = "80211p"
+    """This MAC."""
     access_category: Literal["VO", "VI", "BE", "BK"] = "BE"
     """Access category of EDCA; it sets the interframe space and the contention window."""
     carrier_sense_dbm: float = Field(-85.0, ge=-300, le=100)
     """Total received power from which the medium is busy."""
     eifs: bool = False
     """True if vehicles wait for EIFS also after broadcasts that they could not decode."""
+
+
+Mac = Annotated[Edca | LteMode4 | NrMode2, Field(discriminator="kind")]
+"""`[radio.mac]`: the vehicles share one medium."""
 
 
 class EtsiReactive(Section):
@@ -190,4 +216,4 @@ class Limeric(Section):
     """Frames that may wait; a newer frame replaces the oldest one (`held_back`)."""
 
 
-Congestion = Annotated[EtsiReactive | Limeric, Field(discriminator="kind")]
+Congestion = Annotated[EtsiReactive | Limeric | CrLimit, Field(discriminator="kind")]

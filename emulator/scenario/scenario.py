@@ -14,8 +14,19 @@ from pydantic import Field, field_validator, model_validator
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.network import Driven, Map, Network
 from emulator.scenario.program import PYTHON, Backbone, Program, RoadsideUnit, Ros2Topics, with_names
-from emulator.scenario.radio import RATES_MBPS, Buildings, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
+from emulator.scenario.radio import (
+    RATES_MBPS,
+    Buildings,
+    Congestion,
+    Edca,
+    Fading,
+    Mac,
+    PathLoss,
+    Receiver,
+    Shadowing,
+)
 from emulator.scenario.sections import DAY_S, FAR_M, Section
+from emulator.scenario.sidelink import CrLimit, Sidelink
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
 from vnet.errors import ProgramError, shown
 from vnet.units import NS_PER_MS, NS_PER_S, Grid
@@ -138,7 +149,8 @@ class Radio(Section):
     receiver: Receiver | None = None
     """Noise and detection thresholds; the defaults hold wherever a path loss is configured."""
     mac: Mac | None = None
-    """All share one medium, and listen before they talk; without it nobody is in anybody's way."""
+    """All share one medium: carrier sensing, or a grid of reserved resources; without it nobody is in anybody's
+    way."""
     congestion: Congestion | None = None
     """Senders send less where the medium is busy."""
     keys: tuple[str, ...] | None = None
@@ -153,8 +165,55 @@ class Radio(Section):
 
     @property
     def is_physical(self) -> bool:
-        """True if signals have a power, and frames the airtime of 802.11p."""
+        """True if signals have a power, and frames the airtime of 802.11p or of a sidelink."""
         return self.path_loss is not None or self.mac is not None
+
+    @property
+    def sidelink(self) -> Sidelink | None:
+        """The MAC, if it is a grid of resources."""
+        return self.mac if isinstance(self.mac, Sidelink) else None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _mac_has_a_kind(cls, data: Any) -> Any:
+        """Fill in 802.11p, and the largest payload that a sidelink's slot can carry."""
+        if not isinstance(data, dict) or not isinstance(mac := data.get("mac"), dict):
+            return data
+        data = {**data, "mac": {"kind": Edca.model_fields["kind"].default, **mac}}
+        fields, carried = Sidelink.model_fields, 1
+        for key in ("subchannels", "subchannel_bytes"):
+            given = mac.get(key, fields[key].default)
+            carried *= given if type(given) is int else 0
+        if (
+            mac.get("kind") in ("lte-mode4", "nr-mode2")
+            and 0 < carried < cls.model_fields["max_payload_bytes"].default
+        ):
+            data = {"max_payload_bytes": carried, **data}
+        return data
+
+    @model_validator(mode="after")
+    def _sections_fit_the_mac(self) -> Radio:
+        mac, receiver = self.sidelink, self.receiver
+        if mac is None:
+            if isinstance(self.congestion, CrLimit):
+                raise ValueError('congestion.kind = "cr_limit" goes with a MAC of kind "lte-mode4" or "nr-mode2"')
+            return self
+        carried = mac.subchannels * mac.subchannel_bytes
+        if self.max_payload_bytes > carried:
+            raise ValueError(
+                f"max_payload_bytes = {self.max_payload_bytes}: a slot of {mac.subchannels} subchannels carries at "
+                f"most {carried}"
+            )
+        if self.congestion is not None and not isinstance(self.congestion, CrLimit):
+            raise ValueError(f'congestion.kind = "{self.congestion.kind}" goes with mac.kind = "80211p"')
+        for name in ("min_snr_db", "min_rssi_dbm"):
+            if receiver is not None and getattr(receiver, name) != Receiver.model_fields[name].default:
+                raise ValueError(
+                    f'receiver.{name} goes with mac.kind = "80211p"; others have mac.sensing_dbm and bler'
+                )
+        if self.bitrate_mbps != type(self).model_fields["bitrate_mbps"].default:
+            raise ValueError('bitrate_mbps goes with mac.kind = "80211p"; others have mac.subchannel_bytes')
+        return self
 
     @model_validator(mode="after")
     def _stages_fit_together(self) -> Radio:
@@ -368,9 +427,15 @@ def least_latency_ns(radio: Radio) -> int:
     return max(int(radio.latency_ms * NS_PER_MS), MIN_LATENCY_NS)
 
 
+def least_transit_ns(radio: Radio) -> int:
+    """Return the shortest time from sending to arrival: on a sidelink a frame waits for `t1_slots` at least."""
+    mac = radio.sidelink
+    return least_latency_ns(radio) + (0 if mac is None else mac.t1_slots * mac.slot_ns)
+
+
 def lookahead_ns(scenario: Scenario) -> int:
     """Return the shortest time from sending to arrival: of frames, and of messages among roadside units."""
-    radio_ns = least_latency_ns(scenario.radio)
+    radio_ns = least_transit_ns(scenario.radio)
     if len(scenario.roadside) < 2:
         return radio_ns
     backbone = scenario.backbone or Backbone()

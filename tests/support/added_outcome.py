@@ -16,7 +16,7 @@ from tests.support.paths import ROOT
 
 MEMBER = """
     jammed = (
-        14,
+        17,
         Facts(
             meaning="an interferer was on the air",
             stage=Stage.RECEPTION,

@@ -117,7 +117,9 @@ class Host:
             max_payload=welcome.max_payload,
             incarnation=welcome.incarnation,
             control_ns=welcome.control_ns,
-            abilities=RadioAbilities(welcome.max_power_dbm, welcome.rates_mbps, welcome.acknowledges),
+            abilities=RadioAbilities(
+                welcome.max_power_dbm, welcome.rates_mbps, welcome.acknowledges, welcome.periods_ms
+            ),
             disk=partial(self._disks.of, welcome.node),
             unit=welcome.unit,
         )

@@ -364,6 +364,7 @@ class Welcome(Message, frozen=True):
     rates_mbps: Sequence[float] = ()
     acknowledges: bool = False
     unit: UnitAbilities | None = None
+    periods_ms: Sequence[float] = ()
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):

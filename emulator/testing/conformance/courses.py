@@ -9,7 +9,7 @@ import time
 from typing import Protocol
 
 from emulator.drivers.processes import check_yield
-from emulator.scenario.scenario import least_latency_ns
+from emulator.scenario.scenario import least_transit_ns
 from emulator.testing.conformance.scene import QUIET_S, Said, Scene, SceneOverError
 from vnet.transport import wire
 from vnet.units import NS_PER_S
@@ -58,7 +58,7 @@ class Barrier:
         self._offset_ns = 0
         self._period_ns = scene.emulation.world.period_ns
         self._next_fix = -(-now_ns // self._period_ns)
-        self._window_ns = least_latency_ns(scene.emulation.scenario.radio)
+        self._window_ns = least_transit_ns(scene.emulation.scenario.radio)
         self._count = 0
         self._answer: wire.Yield | None = None
         self._results: list[wire.WireSendResult] = []

@@ -20,7 +20,7 @@ def test_numbers_names_and_stages() -> None:
     assert DRAWN[0] is Outcome.delivered
     staged = {outcome for outcome in Outcome if outcome.facts.stage is not None}
     assert staged == {*DRAWN}
-    assert decided_at(Stage.SENDER) == ("queue_full", "oversize", "held_back")
+    assert decided_at(Stage.SENDER) == ("queue_full", "oversize", "held_back", "no_grant")
     assert decided_at(Stage.ARRIVAL) == ("delivered", "receiver_down", "transport")
 
 

@@ -1,0 +1,1 @@
+"""C-V2X beside published curves and closed forms: `python -m benchmarks.cv2x`."""

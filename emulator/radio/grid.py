@@ -1,0 +1,269 @@
+"""The resource grid of a sidelink: what each vehicle has sensed of it, and which resources it may select.
+
+A resource is a slot and some adjacent subchannels. All arrays cover all vehicles at once; slots count from the
+start of the run, and the last ones are kept in a ring.
+
+**Sensing and selection** are those of 3GPP TS 36.213, 14.1.1.6 (LTE mode 4), and TS 38.214, 8.1.4 (NR mode 2). Of
+the resources in the selection window those are excluded that another vehicle has reserved, if its signal was
+stronger than a threshold, and those that would repeat a slot in which the vehicle itself transmitted, and sensed
+nothing. The threshold is raised by 3 dB until the least share remains. LTE then takes the share that was quietest
+on average; both choose one at random. Unlike the standards, a vehicle that transmitted supposes that others have
+its own reservation interval, and not any that is allowed; where this leaves too few resources it is left out, which
+only NR says.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.radio.medium import SLICE_NS, WINDOW_NS
+from emulator.radio.reception import milliwatts
+from emulator.scenario.sidelink import Sidelink
+from vnet.types import Array, IntArray, Mask
+from vnet.units import NS_PER_MS
+
+STEP_DB = 3.0
+"""Step by which the threshold of exclusion is raised."""
+NOT_RESERVED_DBM = -np.inf
+
+
+class Wanted(NamedTuple):
+    """Resources that a vehicle looks for: `length` subchannels in a slot from `first` to `last`.
+
+    It will use them again every `period` slots, `times` times in all. It transmits anyway in the slots `booked`.
+    """
+
+    node: int
+    first: int
+    last: int
+    length: int
+    period: int
+    times: int
+    booked: frozenset[int] = frozenset()
+
+
+class Candidates(NamedTuple):
+    """Candidate resources: the first slot of the window, a mask (slots, subchannels), and mean powers or None.
+
+    A resource is named by its first subchannel. `power_mw` is the mean power sensed in earlier periods.
+    """
+
+    first: int
+    mask: Mask
+    power_mw: Array | None
+
+    def has(self, slot: int, subchannel: int) -> bool:
+        """Return true if a resource is a candidate."""
+        return 0 <= slot - self.first < len(self.mask) and bool(self.mask[slot - self.first, subchannel])
+
+    def chosen(self, uniform: float) -> tuple[int, int]:
+        """Return the slot and the subchannel of the candidate that a draw in [0, 1) chooses."""
+        index = np.flatnonzero(self.mask)
+        slot, subchannel = divmod(int(index[int(uniform * len(index))]), self.mask.shape[1])
+        return self.first + slot, subchannel
+
+    def quietest(self, share: float, ties: Array) -> Candidates:
+        """Return the share of all resources on which the least power was sensed; draws `ties` order equal ones."""
+        if self.power_mw is None:
+            return self
+        index = np.flatnonzero(self.mask)
+        most = int(np.ceil(share * self.mask.size))
+        order = np.lexsort((ties[index], self.power_mw.ravel()[index]))[:most]
+        mask = np.zeros(self.mask.size, bool)
+        mask[index[order]] = True
+        return self._replace(mask=mask.reshape(self.mask.shape))
+
+    def within(self, first: int, last: int) -> Candidates:
+        """Return the candidates in some slots."""
+        slots = self.first + np.arange(len(self.mask))
+        return self._replace(mask=self.mask & ((slots >= first) & (slots <= last))[:, None])
+
+
+class Heard(NamedTuple):
+    """Frames of a slot: received powers (K, N) in mW, who decoded what they reserve, and their places and periods.
+
+    A place is the first subchannel and their number; a period of 0 slots reserves nothing.
+    """
+
+    power_mw: Array
+    decoded: Mask
+    places: Sequence[tuple[int, int]]
+    periods: Sequence[int]
+
+
+class SensedGrid:
+    """What each of `count` vehicles has sensed in the sensing window of a MAC."""
+
+    def __init__(self, mac: Sidelink, count: int) -> None:
+        self._mac = mac
+        self._slots = mac.sensing_slots
+        self._ring = self._slots + mac.t1_slots + 1  # slots are decided ahead of their time
+        self._busy_mw = milliwatts(mac.busy_dbm)
+        shape = self._ring, mac.subchannels, count
+        self._reserved_dbm = np.full(shape, NOT_RESERVED_DBM, np.float16)
+        self._period = np.zeros(shape, np.int16)
+        self._power_mw = np.zeros(shape, np.float32) if mac.ranks_power else None
+        self._deaf = np.zeros((self._ring, count), bool)
+        self._next = 0
+
+    def advance(self, slot: int) -> None:
+        """Let all slots before this one be over: nobody transmitted in those that were not sensed."""
+        first = max(self._next, slot - self._ring)
+        if first >= slot:
+            return
+        rows = np.arange(first, slot) % self._ring
+        self._reserved_dbm[rows], self._period[rows], self._deaf[rows] = NOT_RESERVED_DBM, 0, False
+        if self._power_mw is not None:
+            self._power_mw[rows] = 0
+        self._next = slot
+
+    def sense(self, slot: int, power_mw: Array, deaf: Mask, heard: Heard) -> None:
+        """Note a slot: the power (subchannels, N) at each vehicle, who transmitted, and what others reserve.
+
+        Of the frames on one subchannel the strongest that a vehicle can decode counts.
+        """
+        self.advance(slot + 1)
+        row = slot % self._ring
+        self._deaf[row] = deaf
+        if self._power_mw is not None:
+            self._power_mw[row] = np.where(deaf | (power_mw < self._busy_mw), 0, power_mw)
+        for (first, length), period, own_mw, decoded in zip(
+            heard.places, heard.periods, heard.power_mw, heard.decoded, strict=True
+        ):
+            listener = np.flatnonzero(decoded) if period else ()
+            if not len(listener):
+                continue
+            dbm = (10 * np.log10(own_mw[listener])).astype(np.float16)
+            for each in range(first, first + length):
+                stronger = dbm > self._reserved_dbm[row, each, listener]
+                self._reserved_dbm[row, each, listener[stronger]] = dbm[stronger]
+                self._period[row, each, listener[stronger]] = period
+
+    def candidates(self, now: int, wanted: Wanted) -> Candidates:
+        """Return the candidates among the resources that a vehicle looks for in slot `now`.
+
+        It knows of the slots of the sensing window that have ended.
+        """
+        self.advance(now)
+        strongest_dbm = self._strongest_dbm(now, wanted)
+        free = np.ones(len(strongest_dbm), bool)
+        if wanted.booked:
+            free[[slot - wanted.first for slot in wanted.booked if 0 <= slot - wanted.first < len(free)]] = False
+        monitored = free & ~self._unmonitored(now, wanted)
+        least = int(np.ceil(self._mac.candidate_share * strongest_dbm.size))
+        if monitored.sum() * strongest_dbm.shape[1] < least:
+            monitored = free
+        remaining_dbm = np.where(monitored[:, None], strongest_dbm, np.inf)
+        threshold_dbm = self._mac.exclusion_dbm
+        enough_dbm = np.partition(remaining_dbm.ravel(), least - 1)[least - 1]
+        if np.isinf(enough_dbm) and enough_dbm > 0:  # own transmissions leave less than the share
+            threshold_dbm = np.finfo(float).max
+        elif enough_dbm > threshold_dbm:
+            threshold_dbm += STEP_DB * np.ceil((enough_dbm - threshold_dbm) / STEP_DB)
+        return Candidates(wanted.first, remaining_dbm <= threshold_dbm, self._mean_power_mw(now, wanted))
+
+    def _slot_of(self, row: NDArray[np.intp]) -> IntArray:
+        """Return the last slots that rows of the ring stand for."""
+        return np.asarray(self._next - 1 - (self._next - 1 - row) % self._ring)
+
+    def _strongest_dbm(self, now: int, wanted: Wanted) -> Array:
+        """Return the strongest signal (slots, places) whose sender has reserved a part of each resource."""
+        row, subchannel = np.nonzero(self._period[:, :, wanted.node])
+        slot = self._slot_of(row)
+        known = (slot < now) & (slot >= now - self._slots)
+        row, slot, subchannel = row[known], slot[known], subchannel[known]
+        period = self._period[row, subchannel, wanted.node].astype(np.int64)
+        dbm = self._reserved_dbm[row, subchannel, wanted.node].astype(float)
+        window = wanted.last - wanted.first + 1
+        strongest_dbm = np.full((window, self._mac.subchannels), NOT_RESERVED_DBM)
+        scale = min(100 * NS_PER_MS // self._mac.slot_ns, self._mac.sensing_slots)
+        repeats = np.where((period < scale) & (now - slot <= period), -(-scale // period), 1)
+        for nth in range(1, int(repeats.max(initial=0)) + 1):
+            again = nth <= repeats
+            reserved = slot[again] + nth * period[again]
+            self._mark(wanted, strongest_dbm, reserved, subchannel[again], dbm[again])
+        if wanted.length == 1:
+            return strongest_dbm
+        parts = [strongest_dbm[:, n : strongest_dbm.shape[1] - wanted.length + 1 + n] for n in range(wanted.length)]
+        return np.asarray(np.max(parts, axis=0))
+
+    def _mark(
+        self, wanted: Wanted, strongest_dbm: Array, reserved: IntArray, subchannel: NDArray[np.intp], dbm: Array
+    ) -> None:
+        """Mark the resources whose use, now or in one of the periods to come, would meet a reserved slot."""
+        period = max(wanted.period, 1)
+        offset = (reserved - wanted.first) % period if wanted.times > 1 else reserved - wanted.first
+        for lap in range(0, len(strongest_dbm), period):
+            index = offset + lap
+            ahead = reserved - wanted.first - index
+            meets = (index >= 0) & (index < len(strongest_dbm)) & (ahead >= 0) & (ahead < wanted.times * period)
+            np.maximum.at(strongest_dbm, (index[meets], subchannel[meets]), dbm[meets])
+            if wanted.times <= 1:
+                break
+
+    def _unmonitored(self, now: int, wanted: Wanted) -> Mask:
+        """Return the mask of the slots that repeat one in which the vehicle transmitted."""
+        unmonitored = np.zeros(wanted.last - wanted.first + 1, bool)
+        own = np.flatnonzero(self._deaf[:, wanted.node])
+        if len(own):
+            period = max(wanted.period, 1) if wanted.period else 100 * NS_PER_MS // self._mac.slot_ns
+            slot = self._slot_of(own)
+            slot = slot[(slot < now) & (slot >= now - self._slots)]
+            for lap in range(0, len(unmonitored), period):
+                index = (slot - wanted.first) % period + lap
+                unmonitored[index[index < len(unmonitored)]] = True
+        return unmonitored
+
+    def _mean_power_mw(self, now: int, wanted: Wanted) -> Array | None:
+        """Return the mean power (slots, places) in the slots whole periods before each resource."""
+        if self._power_mw is None:
+            return None
+        hundred = 100 * NS_PER_MS // self._mac.slot_ns
+        step = min(wanted.period, hundred) if wanted.period else hundred
+        slots = np.arange(wanted.first, wanted.last + 1)
+        latest = slots - step * -(-(slots - now + 1) // step)
+        each = latest[:, None] - step * np.arange((self._slots - 1) // step)
+        known = (each >= 0) & (each >= now - self._slots)
+        rows = each % self._ring
+        weight = (known & ~self._deaf[rows, wanted.node]).astype(np.float64)
+        power_mw = (self._power_mw[rows, :, wanted.node] * weight[:, :, None]).sum(axis=1)
+        power_mw /= np.maximum(weight.sum(axis=1), 1)[:, None]
+        places = self._mac.subchannels - wanted.length + 1
+        return np.asarray(sum(power_mw[:, n : n + places] for n in range(wanted.length)) / wanted.length)
+
+
+class BusyMeter:
+    """Channel busy ratio: the share of busy resources, counted in slices of 10 ms (TS 36.214, 5.1.30)."""
+
+    def __init__(self, mac: Sidelink, count: int, remembered_ns: int) -> None:
+        self._slot_ns, self._subchannels, self._count = mac.slot_ns, mac.subchannels, count
+        self._remembered = remembered_ns // SLICE_NS
+        self._busy: dict[int, IntArray] = defaultdict(lambda: np.zeros(count, np.int64))
+        self.windows: list[Array] = []
+        """Channel busy ratios (N,) of the windows that have ended."""
+
+    def add(self, slot: int, busy: IntArray) -> None:
+        """Add the number of busy subchannels (N,) in a slot; all before it are over."""
+        self.count(slot * self._slot_ns)
+        self._busy[slot * self._slot_ns // SLICE_NS] += busy
+
+    def count(self, time_ns: int) -> None:
+        """Close the windows that end by a time."""
+        while (end_ns := (len(self.windows) + 1) * WINDOW_NS) <= time_ns:
+            self.windows.append(self.at(end_ns))
+        oldest = time_ns // SLICE_NS - self._remembered
+        while self._busy and (first := next(iter(self._busy))) < oldest:
+            del self._busy[first]
+
+    def at(self, time_ns: int) -> Array:
+        """Return the channel busy ratios (N,) of the 100 ms before a multiple of 10 ms."""
+        some = [
+            self._busy[n] for n in range((time_ns - WINDOW_NS) // SLICE_NS, time_ns // SLICE_NS) if n in self._busy
+        ]
+        total = np.sum(some, axis=0) if some else np.zeros(self._count)
+        return np.asarray(total / (WINDOW_NS // self._slot_ns * self._subchannels))

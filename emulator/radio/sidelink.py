@@ -1,0 +1,592 @@
+"""Sidelink: the MAC of LTE-V2X mode 4 and NR-V2X mode 2, and the reception of its frames.
+
+**Slots.** Time is divided into slots and the channel into subchannels. A frame that is ready in slot n is
+transmitted in slot n + `t1_slots` or later, on one resource; so all that is on air in slot n + `t1_slots` is known
+as slot n ends. Its receptions are decided then, ahead of their time, which is what lets processes run alone for
+`t1_slots` longer than `latency_ms`. That is this MAC's only event beside frames that become ready (and, with
+re-evaluation, the checks of resources), ordered by time, kind and sender as in `csma`. A selection in slot n knows
+of the slots before n alone, whatever has been decided.
+
+**Grants.** A sender without a reservation selects a resource when a frame is ready (`grid`), and holds it for as
+many frames as its reselection counter says, one in each reservation interval. As the counter ends it keeps the
+resource with a probability, and selects another otherwise. Frames wait for their grant in a queue. A frame that
+would wait beyond the selection window gets a resource of its own, once; so does each frame with dynamic scheduling.
+
+**Draws** are those of the frame for which something is drawn: they depend on the seed, its sender and its number.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+
+import numpy as np
+
+from emulator.radio.frames import Frame, Receptions, Signal, Transmission
+from emulator.radio.grid import BusyMeter, Candidates, Heard, SensedGrid, Wanted
+from emulator.radio.mac import Mac, ThrottledQueue
+from emulator.radio.medium import SLICE_NS, WINDOW_NS
+from emulator.radio.outcomes import Outcome
+from emulator.radio.reception import JITTER, Signals, milliwatts, reception_draws, sender_draw
+from emulator.scenario.radio import Receiver
+from emulator.scenario.random_streams import Draws
+from emulator.scenario.scenario import Radio, least_transit_ns
+from emulator.scenario.sidelink import CrLimit, LteMode4, NrMode2
+from vnet.types import Array, IntArray, Mask
+from vnet.units import NS_PER_MS
+
+REPEAT_SLOTS = 15
+"""Most slots from a transmission to its blind retransmission (TS 36.321)."""
+UNUSED = 3
+"""Reservations in succession that a sender may leave unused before it gives them up (sl-ReselectAfter)."""
+INTERVALS = 8
+"""Intervals between frames from whose mean a period is learned."""
+ONE_SHOT = 2, 6
+"""Least and largest number of frames from one that is sent on a resource of its own to the next (J3161/1)."""
+OCCUPANCY_MS = 1000
+"""Time over which the channel occupancy ratio is measured (TS 36.214, 5.1.31)."""
+SCI_SNR_DB = 0.0
+"""Least ratio of signal to noise and interference at which a reservation is decoded."""
+CHANNEL_KHZ = 9000
+"""Width of the 50 resource blocks of 10 MHz, over which `radio.receiver.noise_dbm` is given."""
+_CHOICE, _COUNTER, _KEEP, _REPEAT, _SHOT, _AGAIN, _TIES = range(7)
+"""Indices of a frame's draws."""
+_SECOND = np.uint64(0x9E3779B97F4A7C15)
+"""Odd factor that makes the draws of a second transmission out of those of the first."""
+
+DECISION, READY, CHECK = range(3)
+"""Kinds of events, in the order in which those of one time are processed."""
+
+
+@dataclass(slots=True, eq=False)
+class _Grant:
+    """A reservation: `length` subchannels every `period` slots, next in `slot`, for `counter` more frames.
+
+    `repeat` is the resource of the second transmission: slots after the first, and subchannel. Of the next
+    reservations `skips` are left alone, because their frames were sent elsewhere.
+    """
+
+    slot: int
+    subchannel: int
+    length: int
+    period: int
+    counter: int
+    repeat: tuple[int, int] | None
+    unused: int = 0
+    skips: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Station:
+    """A sender: its waiting frames with the slots in which they became ready, its grant, and what it has booked.
+
+    `coming` counts the frames that will be ready, `ready_ns` is when the last of them is. `sent_ns` are the last
+    times at which frames came, `used` the last slots and lengths of its transmissions.
+    """
+
+    node: int
+    queue: deque[tuple[int, Transmission]] = field(default_factory=deque)
+    coming: int = 0
+    ready_ns: int = 0
+    grant: _Grant | None = None
+    booked: set[int] = field(default_factory=set)
+    sent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS + 1))
+    used: deque[tuple[int, int]] = field(default_factory=deque)
+    until_shot: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Booking:
+    """One use of a resource: by a frame, or (None) by the next frame that waits for a grant.
+
+    `period` is the interval in slots with which its sender reserves it again, 0 for never; `last` is the last slot
+    that was allowed. `is_repeat` marks a second transmission.
+    """
+
+    station: _Station
+    slot: int
+    subchannel: int
+    length: int
+    sent: Transmission | None = None
+    grant: _Grant | None = None
+    repeat: tuple[int, int] | None = None
+    period: int = 0
+    last: int = 0
+    is_repeat: bool = False
+
+
+_Event = tuple[int, int, int, int, Transmission | _Booking | None]
+"""An event: its time in ns, kind, sender, number of the event, and what it is about."""
+
+
+class Sidelink(Mac):
+    """MAC of vehicles that share a resource grid; see the module's docstring."""
+
+    shares_medium = True
+
+    def __init__(self, radio: Radio, signals: Signals, seed: int) -> None:
+        super().__init__()
+        mac = radio.sidelink
+        assert mac is not None
+        self._mac = mac
+        self._slot_ns = mac.slot_ns
+        self._t2_slots = mac.t2_ms * NS_PER_MS // mac.slot_ns
+        self._signals = signals
+        self._draws = Draws(seed, "sidelink")
+        self._jitter_ns = radio.access_jitter_ms * NS_PER_MS
+        self._limit = radio.queue_frames
+        self._congestion = radio.congestion if isinstance(radio.congestion, CrLimit) else None
+        self._link = Link(radio)
+        self._grid = SensedGrid(mac, signals.count)
+        self._meter = BusyMeter(mac, signals.count, 2 * least_transit_ns(radio) + 2 * WINDOW_NS)
+        self._is_dynamic = isinstance(mac, NrMode2) and mac.scheduling == "dynamic"
+        self._checks_again = isinstance(mac, NrMode2) and mac.re_evaluation
+        self._one_shot = isinstance(mac, LteMode4) and mac.one_shot
+        self._throttle = ThrottledQueue()
+        self._stations: dict[int, _Station] = {}
+        self._booked: dict[int, list[_Booking]] = {}
+        self._events: list[_Event] = []
+        self._planned = 0
+        self._now_ns = 0
+
+    # Frames that are enqueued, and events.
+
+    def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
+        """Throttle exactly these senders from now on: their frames reach the MAC at these bitrates."""
+        self._throttle.set(bitrate_mbps)
+
+    def enqueue(self, sent: Transmission) -> None:
+        """Take a frame; it is ready after its access jitter, and not before the sender's earlier frames."""
+        frame = sent.frame
+        station = self._stations.setdefault(frame.sender, _Station(frame.sender))
+        sent.signal = self._signals.of(frame)
+        ready_ns = frame.sent_ns
+        if self._jitter_ns:
+            ready_ns += int(self._jitter_ns * sender_draw(sent, JITTER))
+        slow_ns: int | None = ready_ns
+        if self._throttle.slows(frame.sender):
+            slow_ns = self._throttle.put(frame, ready_ns, self._limit)
+        if slow_ns is None or station.coming + len(station.queue) >= self._limit:
+            self._leave(sent, Outcome.queue_full, frame.sent_ns)
+            return
+        station.ready_ns = max(slow_ns, station.ready_ns)
+        station.coming += 1
+        self._plan(station.ready_ns, READY, frame.sender, sent)
+
+    def _leave(self, sent: Transmission, sender_outcome: Outcome, time_ns: int) -> None:
+        sent.sender_outcome, sent.end_ns = sender_outcome, time_ns
+        self.sent.append(sent)
+
+    def _plan(self, time_ns: int, kind: int, node: int, about: Transmission | _Booking | None = None) -> None:
+        self._planned += 1  # in real time a frame may reach the emulator a little after its time
+        heappush(self._events, (max(time_ns, self._now_ns), kind, node, self._planned, about))
+
+    def next_ns(self) -> int | None:
+        """Return the time of the next event, or None."""
+        return self._events[0][0] if self._events else None
+
+    def run(self, time_ns: int | None) -> None:
+        """Process all events before `time_ns`, or all if it is None."""
+        while self._events and (time_ns is None or self._events[0][0] < time_ns):
+            self.step()
+        self._now_ns = max(self._now_ns, time_ns or 0)
+
+    def step(self) -> None:
+        """Process the next event."""
+        self._now_ns, kind, node, _, about = heappop(self._events)
+        if kind == DECISION:
+            self._decide(node)
+        elif isinstance(about, _Booking):
+            self._check_again(about)
+        else:
+            assert about is not None
+            self._ready(self._stations[node], about)
+
+    def _draw(self, frame: Frame, index: int) -> float:
+        return float(self._draws.uniform(frame.sender, frame.seq, _TIES, frame.draw)[index])
+
+    # Selecting resources.
+
+    def _ready(self, station: _Station, sent: Transmission) -> None:
+        """Give a frame a place in its sender's grant, or a resource of its own."""
+        frame, slot = sent.frame, self._now_ns // self._slot_ns
+        station.coming -= 1
+        station.sent_ns.append(frame.sent_ns)
+        length = -(-max(frame.size_bytes, 1) // self._mac.subchannel_bytes)
+        told = frame.period_ms * NS_PER_MS // self._slot_ns
+        grant = station.grant
+        if grant is not None and (grant.length < length or (told and told != grant.period)):
+            station.grant = grant = None
+        if self._is_dynamic:
+            self._send_alone(station, sent, slot, length)
+        elif grant is None:
+            station.queue.append((slot, sent))
+            self._reserve(station, slot)
+        elif self._is_one_shot(station, frame):
+            grant.skips += 1
+            self._send_alone(station, sent, slot, length)
+        else:
+            late = max(0, -(-(slot + self._mac.t1_slots - grant.slot) // grant.period))
+            turn = grant.slot + grant.period * max(late, len(station.queue) + grant.skips)
+            if turn > slot + max(self._t2_slots, grant.period):
+                self._send_alone(station, sent, slot, length)
+            else:
+                station.queue.append((slot, sent))
+
+    def _is_one_shot(self, station: _Station, frame: Frame) -> bool:
+        """Return true if it is time to send one frame elsewhere, which a persistent collision cannot reach."""
+        if not self._one_shot:
+            return False
+        station.until_shot -= 1
+        if station.until_shot > 0:
+            return False
+        least, most = ONE_SHOT
+        is_first = station.until_shot < 0
+        station.until_shot = least + int(self._draw(frame, _SHOT) * (most - least + 1))
+        return not is_first
+
+    def _period(self, station: _Station, frame: Frame) -> int:
+        """Return the reservation interval in slots: what a program says, or what its frames' intervals are."""
+        period_ms = frame.period_ms or self._mac.reservation_ms
+        times_ns = station.sent_ns
+        if not frame.period_ms and len(times_ns) > 1 and times_ns[-1] > times_ns[0]:
+            mean_ms = (times_ns[-1] - times_ns[0]) / (len(times_ns) - 1) / NS_PER_MS
+            period_ms = min(self._mac.periods_ms, key=lambda each: (abs(each - mean_ms), each))
+        return period_ms * NS_PER_MS // self._slot_ns
+
+    def _reserve(self, station: _Station, slot: int) -> None:
+        """Select a resource in `slot` for the frames that wait, and for those to come."""
+        frame = station.queue[0][1].frame
+        largest = max(sent.frame.size_bytes for _, sent in station.queue)
+        length = -(-max(largest, 1) // self._mac.subchannel_bytes)
+        period = self._period(station, frame)
+        counter = self._counter(frame, period)
+        last = slot + max(self._mac.t1_slots, min(self._t2_slots, period))
+        wanted = Wanted(station.node, slot + self._mac.t1_slots, last, length, period, 10 * counter)
+        first, subchannel, repeat = self._select(station, frame, wanted, _CHOICE)
+        station.grant = _Grant(first, subchannel, length, period, counter, repeat)
+        self._book(self._use_of(station, last), checks=True)
+
+    def _counter(self, frame: Frame, period: int) -> int:
+        least, most = self._mac.counters(period * self._slot_ns // NS_PER_MS)
+        return least + int(self._draw(frame, _COUNTER) * (most - least + 1))
+
+    def _use_of(self, station: _Station, last: int = 0) -> _Booking:
+        """Return the next use of a station's grant."""
+        grant = station.grant
+        assert grant is not None
+        return _Booking(
+            station=station,
+            slot=grant.slot,
+            subchannel=grant.subchannel,
+            length=grant.length,
+            grant=grant,
+            repeat=grant.repeat,
+            period=grant.period,
+            last=last,
+        )
+
+    def _send_alone(self, station: _Station, sent: Transmission, slot: int, length: int) -> None:
+        """Select a resource for one frame."""
+        last = slot + self._t2_slots
+        wanted = Wanted(station.node, slot + self._mac.t1_slots, last, length, 0, 1)
+        first, subchannel, repeat = self._select(station, sent.frame, wanted, _CHOICE)
+        self._book(_Booking(station, first, subchannel, length, sent, repeat=repeat, last=last), checks=True)
+
+    def _select(
+        self, station: _Station, frame: Frame, wanted: Wanted, which: int
+    ) -> tuple[int, int, tuple[int, int] | None]:
+        """Return the slot and the subchannel of a resource, and (slots later, subchannel) of a second one."""
+        found = self._candidates(station, frame, wanted)
+        slot, subchannel = found.chosen(self._draw(frame, which))
+        repeat = None
+        if self._mac.retransmit:
+            later = found.within(slot + 1, slot + REPEAT_SLOTS)
+            if later.mask.any():
+                second = later.chosen(self._draw(frame, _REPEAT))
+                repeat = second[0] - slot, second[1]
+        return slot, subchannel, repeat
+
+    def _candidates(self, station: _Station, frame: Frame, wanted: Wanted) -> Candidates:
+        booked = set(station.booked)
+        if (grant := station.grant) is not None:
+            for slot in range(grant.slot, wanted.last + 1, grant.period):
+                booked |= {slot, slot + grant.repeat[0]} if grant.repeat else {slot}
+        found = self._grid.candidates(self._now_ns // self._slot_ns, wanted._replace(booked=frozenset(booked)))
+        if self._mac.ranks_power:
+            ties = self._draws.uniform(frame.sender, frame.seq, _TIES + found.mask.size, frame.draw)[_TIES:]
+            found = found.quietest(self._mac.candidate_share, ties)
+        return found
+
+    def _book(self, booking: _Booking, checks: bool = False) -> None:
+        """Plan the use of a resource; one that is new is checked again before it is used."""
+        if booking.slot not in self._booked:
+            self._booked[booking.slot] = []
+            known = booking.slot - self._mac.t1_slots + 1
+            self._plan(known * self._slot_ns, DECISION, booking.slot)
+        self._booked[booking.slot].append(booking)
+        booking.station.booked.add(booking.slot)
+        check_ns = (booking.slot - self._mac.t1_slots) * self._slot_ns
+        if checks and self._checks_again and check_ns > self._now_ns:
+            self._plan(check_ns, CHECK, booking.station.node, booking)
+
+    def _check_again(self, booking: _Booking) -> None:
+        """Select another resource if the one that was selected has been reserved meanwhile (re-evaluation)."""
+        station, grant = booking.station, booking.grant
+        if grant is not None and (station.grant is not grant or not station.queue):
+            return
+        sent = booking.sent or station.queue[0][1]
+        times = 10 * grant.counter if grant is not None else 1
+        wanted = Wanted(station.node, booking.slot, booking.last, booking.length, booking.period, times)
+        station.booked.discard(booking.slot)
+        if grant is not None:
+            station.grant = None  # whose own slots are free to it
+        found = self._candidates(station, sent.frame, wanted)
+        if grant is not None:
+            station.grant = grant
+        if found.has(booking.slot, booking.subchannel) or not found.mask.any():
+            station.booked.add(booking.slot)
+            return
+        self._booked[booking.slot].remove(booking)
+        booking.slot, booking.subchannel = found.chosen(self._draw(sent.frame, _AGAIN))
+        if grant is not None:
+            grant.slot, grant.subchannel = booking.slot, booking.subchannel
+        self._book(booking)
+
+    # Slots.
+
+    def _decide(self, slot: int) -> None:
+        """Transmit in a slot what was booked for it: from now on nothing can be."""
+        on_air: list[_Booking] = []
+        bookings = sorted(self._booked.pop(slot), key=lambda each: (each.station.node, each.grant is not None))
+        for booking in bookings:
+            booking.station.booked.discard(slot)
+            is_free = all(other.station is not booking.station for other in on_air)
+            if booking.grant is not None and not booking.is_repeat:
+                self._use_grant(booking, is_free)
+            elif not is_free or not self._may_send(booking):
+                self._give_up(booking)
+            if booking.sent is not None:
+                on_air.append(booking)
+        if on_air:
+            self._transmit(slot, on_air)
+        for booking in on_air:
+            self._follow(booking)
+
+    def _use_grant(self, booking: _Booking, is_free: bool) -> None:
+        """Take the frame that is sent on a grant's next resource, if any waits, and book the one after it."""
+        station, grant = booking.station, booking.grant
+        if grant is None or station.grant is not grant or grant.slot != booking.slot:
+            return
+        latest = booking.slot - self._mac.t1_slots
+        if grant.skips:
+            grant.skips, grant.unused = grant.skips - 1, 0
+            grant.counter -= 1
+        elif is_free and station.queue and station.queue[0][0] <= latest:
+            booking.sent = station.queue.popleft()[1]
+            grant.unused = 0
+            grant.counter -= 1
+            if grant.counter <= 0 and self._draw(booking.sent.frame, _KEEP) < self._mac.keep_probability:
+                grant.counter = self._counter(booking.sent.frame, grant.period)
+            if not self._may_send(booking):
+                self._give_up(booking)
+        else:
+            grant.unused += 1
+        grant.slot += grant.period
+        if grant.counter > 0 and grant.unused < UNUSED:
+            self._book(self._use_of(station))
+            return
+        station.grant, booking.period = None, 0
+        if station.queue:
+            self._reserve(station, self._now_ns // self._slot_ns)
+
+    def _give_up(self, booking: _Booking) -> None:
+        """Drop a frame that may not be sent; one that was sent before is complete without the second time."""
+        if booking.sent is not None:
+            outcome = Outcome.pending if booking.is_repeat else Outcome.no_grant
+            self._leave(booking.sent, outcome, booking.sent.end_ns if booking.is_repeat else self._now_ns)
+        booking.sent = None
+
+    def _may_send(self, booking: _Booking) -> bool:
+        """Return true if congestion control allows its station this transmission."""
+        if self._congestion is None:
+            return True
+        station, slots = booking.station, OCCUPANCY_MS * NS_PER_MS // self._slot_ns
+        while station.used and station.used[0][0] <= booking.slot - slots:
+            station.used.popleft()
+        ratio = self._meter.at(self._now_ns // SLICE_NS * SLICE_NS)[station.node]
+        limits = [
+            most for busy, most in zip(self._congestion.busy, self._congestion.most, strict=True) if ratio >= busy
+        ]
+        occupied = booking.length + sum(length for _, length in station.used)
+        return not limits or occupied <= limits[-1] * slots * self._mac.subchannels
+
+    def _transmit(self, slot: int, on_air: Sequence[_Booking]) -> None:
+        """Decide what everybody receives and senses in a slot."""
+        deaf = np.zeros(self._signals.count, bool)
+        deaf[[each.station.node for each in on_air]] = True
+        power_mw = np.array([_signal(each.sent).power_mw for each in on_air])
+        places = [(each.subchannel, each.length) for each in on_air]
+        sensed_mw = self._link.sensed_mw(power_mw, places)
+        others_mw = [sensed_mw[first : first + length].sum(axis=0) for first, length in places] - power_mw
+        np.maximum(others_mw, 0.0, out=others_mw)
+        lengths = np.array([length for _, length in places])
+        decoded = self._link.decodes_reservation(power_mw, others_mw, lengths) & ~deaf
+        busy = (sensed_mw >= self._link.busy_mw).sum(axis=0)
+        for index, booking in enumerate(on_air):
+            sent = booking.sent
+            assert sent is not None
+            _signal(sent).slots.append((others_mw[index], deaf))
+            busy[booking.station.node] = booking.length
+            if self._congestion is not None:
+                booking.station.used.append((slot, booking.length))
+            if not booking.is_repeat:
+                sent.on_air_ns = slot * self._slot_ns
+            sent.end_ns = (slot + 1) * self._slot_ns
+        self._grid.sense(slot, sensed_mw, deaf, Heard(power_mw, decoded, places, [each.period for each in on_air]))
+        self._meter.add(slot, busy)
+
+    def _follow(self, booking: _Booking) -> None:
+        """Book the second transmission of a frame, or leave it to be judged."""
+        assert booking.sent is not None
+        if booking.repeat is None:
+            self._leave(booking.sent, Outcome.pending, booking.sent.end_ns)
+            return
+        gap, subchannel = booking.repeat
+        self._book(
+            _Booking(
+                station=booking.station,
+                slot=booking.slot + gap,
+                subchannel=subchannel,
+                length=booking.length,
+                sent=booking.sent,
+                period=booking.period,
+                is_repeat=True,
+            )
+        )
+
+    # How busy the channel is.
+
+    def busy_ratios(self, time_ns: int) -> list[Array]:
+        """See `Mac`."""
+        self._meter.count(time_ns)
+        return self._meter.windows[: time_ns // WINDOW_NS]
+
+    def busy_ratios_at(self, time_ns: int) -> Array:
+        """See `Mac`; the time is no more than two lookaheads and a window back."""
+        return self._meter.at(time_ns)
+
+
+class Link:
+    """What a receiver detects and decodes: noise, thresholds, and block error rates."""
+
+    def __init__(self, radio: Radio) -> None:
+        mac = radio.sidelink
+        assert mac is not None
+        receiver = radio.receiver or Receiver()
+        self._subchannels = mac.subchannels
+        share = mac.data_blocks * mac.block_khz / CHANNEL_KHZ
+        self._noise_mw = milliwatts(receiver.noise_dbm + receiver.noise_figure_db) * share
+        self.sensing_mw = milliwatts(mac.sensing_dbm)
+        """Least power at which a frame is detected."""
+        self.busy_mw = milliwatts(mac.busy_dbm)
+        """Least power at which a subchannel is busy."""
+        self._leak = milliwatts(-mac.in_band_emission_db)
+        self._sci = milliwatts(SCI_SNR_DB)
+        self._table = np.array(mac.bler_sinr_db), np.array(mac.bler)
+        self._bytes = mac.subchannel_bytes
+
+    def noise_mw(self, length: int) -> float:
+        """Return the noise in the data of so many subchannels."""
+        return self._noise_mw * length
+
+    def length(self, size_bytes: int) -> int:
+        """Return the number of subchannels that a frame takes."""
+        return -(-max(size_bytes, 1) // self._bytes)
+
+    def sensed_mw(self, power_mw: Array, places: Sequence[tuple[int, int]]) -> Array:
+        """Return the power (subchannels, N) of signals with these powers (K, N) and places, with their leakage."""
+        sensed_mw = np.zeros((self._subchannels, len(power_mw[0])))
+        for own_mw, (first, length) in zip(power_mw, places, strict=True):
+            each_mw = own_mw / length
+            sensed_mw += each_mw * self._leak
+            sensed_mw[first : first + length] += each_mw * (1 - self._leak)
+        return sensed_mw
+
+    def decodes_reservation(self, own_mw: Array, others_mw: Array, lengths: IntArray) -> Mask:
+        """Return the mask (K, N) of receivers that decode the control information of frames of K lengths."""
+        least_mw = self._sci * (self._noise_mw * lengths[:, None] + others_mw)
+        return np.asarray((own_mw >= self.sensing_mw) & (own_mw >= least_mw))
+
+    def error_rate(self, ratio: Array) -> Array:
+        """Return the block error rates at these ratios (any shape) of signal to noise and interference."""
+        return np.asarray(np.interp(10 * np.log10(np.maximum(ratio, 1e-30)), *self._table))
+
+
+class SidelinkReception:
+    """The stage of the receiver: decides `half_duplex`, `below_sensing`, `faded` and `collided`, in this order.
+
+    One draw decides about a transmission at a receiver, with and without the interference that it met. Of two
+    transmissions of a frame one must be received.
+    """
+
+    def __init__(self, radio: Radio, signals: Signals) -> None:
+        self._link = Link(radio)
+        self._count = signals.count
+
+    def __call__(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
+        """Decide the receptions of the frames that were sent."""
+        sent = [index for index, one in enumerate(transmissions) if one.sender_outcome == Outcome.pending]
+        if not sent:
+            return
+        signals = [_signal(transmissions[index]) for index in sent]
+        sizes = [self._link.length(transmissions[index].frame.size_bytes) for index in sent]
+        noise_mw = np.array([self._link.noise_mw(length) for length in sizes])[:, None]
+        power_mw = np.array([signal.power_mw for signal in signals])
+        words = np.array([signal.random_draws for signal in signals])
+        detected = power_mw >= self._link.sensing_mw
+        deaf, alone, received = np.ones((3, *power_mw.shape), bool)
+        alone[:], received[:] = False, False
+        for nth in range(max(len(signal.slots) for signal in signals)):
+            slots = [signal.slots[nth] if nth < len(signal.slots) else None for signal in signals]
+            silent = np.array([np.ones(self._count, bool) if slot is None else slot[1] for slot in slots])
+            others_mw = np.array([np.zeros(self._count) if slot is None else slot[0] for slot in slots])
+            deaf &= silent
+            able = detected & ~silent
+            own_mw, noise = power_mw[able], np.broadcast_to(noise_mw, able.shape)[able]
+            draws = reception_draws(words[able] * _SECOND if nth else words[able])
+            alone[able] |= draws >= self._link.error_rate(own_mw / noise)
+            received[able] |= draws >= self._link.error_rate(own_mw / (noise + others_mw[able]))
+        for mask, outcome in (
+            (deaf, Outcome.half_duplex),
+            (~detected, Outcome.below_sensing),
+            (~alone, Outcome.faded),
+            (~received, Outcome.collided),
+        ):
+            some = np.zeros(receptions.outcome.shape, bool)
+            some[sent] = mask
+            receptions.decide(some, outcome)
+
+    def powers_db(self, transmissions: Sequence[Transmission], frame_index: IntArray, receiver: IntArray) -> Array:
+        """Return received powers in dBm, and their ratios to noise and interference in dB, as an array (2, n).
+
+        `frame_index` and `receiver` (n,) name the receptions. Of two transmissions the ratio is the better one.
+        Both are NaN for a frame that was not sent, and out of range.
+        """
+        own_mw, others_mw = np.full((2, len(transmissions), self._count), np.nan)
+        for index, sent in enumerate(transmissions):
+            if sent.sender_outcome == Outcome.pending:
+                signal = _signal(sent)
+                own_mw[index] = signal.power_mw
+                others_mw[index] = self._link.noise_mw(self._link.length(sent.frame.size_bytes))
+                others_mw[index] += np.min([others for others, _ in signal.slots], axis=0)
+        power_mw = own_mw[frame_index, receiver]
+        power_mw[power_mw == 0] = np.nan
+        return np.asarray(10 * np.log10([power_mw, power_mw / others_mw[frame_index, receiver]]))
+
+
+def _signal(sent: Transmission | None) -> Signal:
+    assert sent is not None and sent.signal is not None
+    return sent.signal

@@ -1,0 +1,150 @@
+"""The resource grid: selection is that of the standards, computed here once more, resource by resource."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.radio.grid import BusyMeter, Candidates, Heard, SensedGrid, Wanted
+from emulator.scenario.sidelink import LteMode4, NrMode2, Sidelink
+
+QUIET_DBM, LOUD_DBM = -100.0, -60.0
+
+
+def lte(**keys: Any) -> LteMode4:
+    return LteMode4.model_validate({"kind": "lte-mode4", "busy_dbm": -120, **keys})
+
+
+def sense(grid: SensedGrid, mac: Sidelink, slot: int, frames: list[tuple[int, int, int, float]]) -> None:
+    """Let vehicle 1 transmit frames, which vehicle 0 hears: first subchannel, length, period, power in dBm."""
+    power_mw = np.zeros((mac.subchannels, 2))
+    for first, length, _, dbm in frames:
+        power_mw[first : first + length, 0] += 10 ** (dbm / 10) / length
+    own_mw = np.array([[10 ** (dbm / 10), 1.0] for *_, dbm in frames])
+    decoded = np.array([[True, False]] * len(frames))
+    places, periods = [frame[:2] for frame in frames], [frame[2] for frame in frames]
+    grid.sense(slot, power_mw, np.array([False, True]), Heard(own_mw, decoded, places, periods))
+
+
+frame_lists = st.lists(
+    st.tuples(
+        st.integers(0, 119),
+        st.integers(0, 2),
+        st.integers(1, 2),
+        st.sampled_from([0, 20, 50, 100]),
+        st.sampled_from([-108.0, -95.0, -80.0, -60.0]),
+    ),
+    max_size=12,
+    unique_by=lambda each: each[:2],
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(frame_lists, st.sampled_from([20, 50, 100]), st.integers(1, 2), st.sampled_from([1, 3, 50]))
+def test_excluded_are_the_resources_that_others_reserved(
+    frames: list[tuple[int, int, int, int, float]], period: int, length: int, times: int
+) -> None:
+    mac, now = lte(subchannels=4, exclusion_dbm=-100.0), 120
+    grid = SensedGrid(mac, 2)
+    strongest: dict[tuple[int, int], tuple[float, int]] = {}
+    for slot in sorted({each[0] for each in frames}):
+        some = [each[1:] for each in frames if each[0] == slot]
+        sense(grid, mac, slot, some)
+        for first, of, reserved, dbm in some:
+            for subchannel in range(first, first + of):
+                known = strongest.get((slot, subchannel), (-math.inf, 0))
+                if reserved and dbm > known[0]:
+                    strongest[slot, subchannel] = dbm, reserved
+    wanted = Wanted(0, now + 4, now + period, length, period, times)
+    found = grid.candidates(now, wanted)
+    met: dict[tuple[int, int], float] = {}
+    for (slot, subchannel), (dbm, reserved) in strongest.items():
+        repeats = -(-100 // reserved) if reserved < 100 and now - slot <= reserved else 1
+        for nth in range(1, repeats + 1):
+            for use in range(times):
+                candidate = slot + nth * reserved - use * period
+                if wanted.first <= candidate <= wanted.last:
+                    met[candidate, subchannel] = max(dbm, met.get((candidate, subchannel), -math.inf))
+    expected = {
+        (slot, first): max(met.get((slot, first + n), -math.inf) for n in range(length))
+        for slot in range(wanted.first, wanted.last + 1)
+        for first in range(4 - length + 1)
+    }
+    threshold_dbm = -100.0
+    while sum(dbm <= threshold_dbm for dbm in expected.values()) < 0.2 * len(expected):
+        threshold_dbm += 3
+    assert found.mask.size == len(expected)
+    for (slot, first), dbm in expected.items():
+        assert found.has(slot, first) == (dbm <= threshold_dbm), (slot, first, dbm)
+
+
+def test_threshold_rises_until_a_fifth_remains() -> None:
+    mac = lte(subchannels=1)
+    grid = SensedGrid(mac, 2)
+    powers_dbm = [-109.0 + 0.5 * slot for slot in range(100)]
+    for slot, dbm in enumerate(powers_dbm):
+        sense(grid, mac, slot, [(0, 1, 100, dbm)])
+    found = grid.candidates(100, Wanted(0, 104, 199, 1, 100, 10))
+    limit_dbm = next(-110 + 3 * n for n in range(100) if sum(p <= -110 + 3 * n for p in powers_dbm[4:]) >= 0.2 * 96)
+    assert found.mask[:, 0].tolist() == [dbm <= limit_dbm for dbm in powers_dbm[4:]]
+
+
+def test_slots_of_own_transmissions_are_not_selected_again() -> None:
+    mac = lte()
+    grid = SensedGrid(mac, 2)
+    sense(grid, mac, 7, [(0, 1, 100, LOUD_DBM)])
+    found = grid.candidates(20, Wanted(1, 24, 120, 1, 100, 10))
+    assert not found.mask[107 - 24].any() and found.mask.sum() == found.mask.size - mac.subchannels
+    after = grid.candidates(2000, Wanted(1, 2004, 2100, 1, 100, 10))
+    assert after.mask.all(), "out of the sensing window"
+
+
+def test_a_selection_knows_nothing_of_slots_to_come() -> None:
+    mac = lte()
+    grid = SensedGrid(mac, 2)
+    sense(grid, mac, 12, [(0, 4, 20, LOUD_DBM)])
+    assert grid.candidates(12, Wanted(0, 16, 112, 1, 100, 10)).mask.all()
+    assert not grid.candidates(13, Wanted(0, 17, 112, 1, 100, 10)).mask.all()
+
+
+def test_the_quietest_fifth_is_taken_and_equal_ones_by_lot() -> None:
+    mac = lte(subchannels=1, exclusion_dbm=0.0)
+    grid = SensedGrid(mac, 2)
+    for slot in range(100):
+        if slot % 2:
+            sense(grid, mac, slot, [(0, 1, 0, QUIET_DBM)])
+    found = grid.candidates(100, Wanted(0, 101, 200, 1, 100, 10))
+    ties = np.random.default_rng(1).random(100)
+    quiet = found.quietest(0.2, ties)
+    chosen = np.flatnonzero(quiet.mask[:, 0])
+    assert len(chosen) == 20 and not (chosen + 101).astype(int)[(chosen + 101) % 2 == 1].size
+    even = np.flatnonzero((np.arange(100) + 101) % 2 == 0)
+    assert set(chosen) == set(even[np.argsort(ties[even])[:20]])
+
+
+def test_nr_takes_any_of_the_candidates() -> None:
+    mac = NrMode2.model_validate({"kind": "nr-mode2", "scs_khz": 60, "subchannels": 2, "sensing_ms": 100})
+    grid = SensedGrid(mac, 1)
+    found = grid.candidates(0, Wanted(0, 1, 40, 1, 400, 10))
+    assert found.quietest(0.2, np.zeros(found.mask.size)) is found and found.mask.all()
+    assert [found.chosen(u / 80) for u in range(80)] == [(1 + n // 2, n % 2) for n in range(80)]
+
+
+def test_candidates_within_slots() -> None:
+    found = Candidates(10, np.ones((5, 2), bool), None).within(12, 13)
+    assert found.mask.sum() == 4 and found.has(12, 0) and not found.has(14, 0) and not found.has(9, 0)
+
+
+@pytest.mark.parametrize("scs_khz", [15, 30, 60])
+def test_busy_ratio_is_the_share_of_busy_resources(scs_khz: int) -> None:
+    mac = NrMode2.model_validate({"kind": "nr-mode2", "scs_khz": scs_khz, "subchannels": 5})
+    meter = BusyMeter(mac, 1, 10**9)
+    each = scs_khz // 15
+    for slot in range(0, 200 * each, 2 * each):
+        meter.add(slot, np.array([3]))
+    meter.count(200_000_000)
+    assert [window[0] for window in meter.windows] == pytest.approx([50 * 3 / (100 * each * 5)] * 2)
+    assert meter.at(150_000_000)[0] == pytest.approx(50 * 3 / (100 * each * 5))

@@ -1,0 +1,306 @@
+"""Sidelinks: laws of the MAC, outcomes in their order, and exact probabilities of small grids."""
+
+from collections import Counter
+from itertools import pairwise, product
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.radio.propagation import loss_db
+from emulator.scenario.faults import Duplicate, Throttle
+from emulator.scenario.loading import scenario_of
+from emulator.scenario.radio import WinnerB1
+from emulator.scenario.scenario import Radio, least_transit_ns
+from tests.emulator.radio.test_csma import crowds, planned, run, scattered
+from tests.support.faulty_engine import FaultyEngine
+from tests.support.radio import engine, line
+from vnet.errors import ScenarioError
+from vnet.radio import SentFrame
+
+MS, S = 1_000_000, 1_000_000_000
+WINNER: dict[str, Any] = {"path_loss": {"kind": "winner_b1", "floor_dbm": -110.0}}
+LTE: dict[str, Any] = {**WINNER, "mac": {"kind": "lte-mode4"}}
+NR: dict[str, Any] = {**WINNER, "mac": {"kind": "nr-mode2"}}
+kinds = st.sampled_from([LTE, NR])
+keys = st.fixed_dictionaries(
+    {},
+    optional={
+        "retransmit": st.just(True),
+        "subchannels": st.sampled_from([1, 4]),
+        "keep_probability": st.just(0.8),
+        "reservation_ms": st.sampled_from([20, 100]),
+    },
+)
+
+
+def with_mac(radio: dict[str, Any], **keys: Any) -> dict[str, Any]:
+    return {**radio, "mac": {**radio["mac"], **keys}}
+
+
+def beacons(
+    subject: Any, count: int, seconds: float, period_ms: int = 100, size: int = 100
+) -> list[dict[str, Any]]:
+    """Let vehicles send with periods of random phases; return the rows of the trace."""
+    phase_ns = np.random.default_rng(1).integers(0, period_ms * MS, count)
+    sends = sorted(
+        (int(phase) + n * period_ms * MS, node)
+        for node, phase in enumerate(phase_ns)
+        for n in range(round(1000 * seconds / period_ms))
+    )
+    for time_ns, node in sends:
+        subject.transmit(time_ns, node, [SentFrame("", bytes(size), period_ms=period_ms)])
+        subject.advance(time_ns)
+    subject.drain()
+    return subject.trace.to_table().to_pylist()
+
+
+# Reading.
+
+
+@pytest.mark.parametrize(
+    ("radio", "message"),
+    [
+        ({"mac": {"kind": "lte"}}, "lte-mode4"),
+        ({"mac": {"kind": "lte-mode4", "access_category": "BE"}}, "allowed here: .*subchannels"),
+        ({"mac": {"kind": "lte-mode4", "scs_khz": 30}}, "unknown key"),
+        ({"mac": {"subchannels": 4}}, "allowed here: access_category"),
+        ({"mac": {"kind": "lte-mode4", "reservation_ms": 30}}, "allowed are 20, 50, 100"),
+        ({"mac": {"kind": "nr-mode2", "reservation_ms": 150}}, "allowed are 1 to 99 and 100"),
+        ({"mac": {"kind": "lte-mode4", "subchannels": 1}, "max_payload_bytes": 200}, "carries at most 190"),
+        ({"mac": {"kind": "lte-mode4", "bler": [1.0, 0.5]}}, "as many"),
+        ({"mac": {"kind": "lte-mode4", "bler": [0.5, 1.0], "bler_sinr_db": [0, 1]}}, "must not grow"),
+        ({"mac": {"kind": "lte-mode4", "bler": [1.0, 0.5], "bler_sinr_db": [1, 1]}}, "must grow"),
+        ({"mac": {"kind": "lte-mode4", "t1_slots": 5}}, "less than or equal to 4"),
+        ({"mac": {"kind": "lte-mode4"}, "congestion": {"kind": "etsi"}}, "80211p"),
+        ({"mac": {}, "congestion": {"kind": "cr_limit", "busy": [0.3], "most": [0.1]}}, "lte-mode4"),
+        ({"mac": {"kind": "lte-mode4"}, "congestion": {"kind": "cr_limit", "busy": [0.3], "most": []}}, "as many"),
+        ({"mac": {"kind": "lte-mode4"}, "receiver": {"min_snr_db": 5}}, "sensing_dbm"),
+        ({"mac": {"kind": "lte-mode4"}, "bitrate_mbps": 12}, "subchannel_bytes"),
+        ({"path_loss": {"kind": "winner_b1", "environment_m": 2}}, "less than antenna_m"),
+    ],
+)
+def test_a_scenario_that_cannot_be_is_refused_in_one_line(radio: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message) as raised:
+        scenario_of({"radio": radio}, {})
+    assert "\n" not in str(raised.value)
+
+
+def test_kind_is_80211p_where_none_is_given_and_a_slot_bounds_the_payload() -> None:
+    plain, named = ({"radio": {"mac": mac}} for mac in ({}, {"kind": "80211p"}))
+    assert scenario_of(plain, {}).radio == scenario_of(named, {}).radio
+    assert Radio.model_validate(LTE).max_payload_bytes == 760
+    assert Radio.model_validate(with_mac(LTE, subchannels=20)).max_payload_bytes == 1400
+    assert Radio.model_validate({**LTE, "max_payload_bytes": 300}).max_payload_bytes == 300
+
+
+def test_winner_b1_is_the_published_formula() -> None:
+    model = WinnerB1(kind="winner_b1", frequency_ghz=5.91)
+    far_m = np.array([1.0, 3.0, 20.0, 100.0, 177.0, 178.0, 500.0])
+    at = np.maximum(far_m, 3)
+    near = 22.7 * np.log10(at) + 27 + 20 * np.log10(5.91)
+    beyond = 40 * np.log10(at) + 7.56 - 2 * 17.3 * np.log10(1.5) + 2.7 * np.log10(5.91)
+    free = 20 * np.log10(at) + 46.4 + 20 * np.log10(5.91 / 5)
+    expected = np.maximum(np.where(far_m < 177.4, near, beyond), free)
+    assert loss_db(model, far_m) == pytest.approx(expected)
+    high = loss_db(model, np.array([300.0]), (np.array([6.0]), np.array([1.5])))
+    assert high == pytest.approx(22.7 * np.log10(300) + 27 + 20 * np.log10(5.91)), (
+        "the breakpoint is four times as far"
+    )
+
+
+# Time.
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**63 - 1), crowds, kinds, keys, st.lists(st.integers(0, 200 * MS), max_size=20))
+def test_however_time_is_cut_the_same_happens(
+    seed: int, sends: list[tuple[int, int, int]], radio: dict[str, Any], keys: dict[str, Any], stops: list[int]
+) -> None:
+    position_m = scattered(6, seed, side_m=500.0)
+    radio = with_mac(radio, **keys) | {"shadowing": {}, "fading": {}}
+    sends = [(10 * time_ns, node, min(size, 190)) for time_ns, node, size in sends]
+    one, other = (engine(position_m, seed, **radio) for _ in range(2))
+    assert run(one, sends) == run(other, sends, stops)
+    assert one.trace.sha256() == other.trace.sha256() and one.counts == other.counts
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(0, 400 * MS), min_size=1, max_size=12, unique=True), kinds, keys)
+def test_frames_go_on_air_in_whole_slots_and_never_arrive_within_the_window(
+    times_ns: list[int], radio: dict[str, Any], keys: dict[str, Any]
+) -> None:
+    subject = engine(line(0, 50), **with_mac(radio, **keys))
+    for time_ns in sorted(times_ns):
+        subject.transmit(time_ns, 0, [b"x"])
+    subject.drain()
+    section = Radio.model_validate(with_mac(radio, **keys))
+    mac = section.sidelink
+    assert mac is not None
+    rows = subject.trace.to_table().to_pylist()
+    assert len(rows) == len(times_ns)
+    for row in rows:
+        assert row["outcome"] == "delivered"
+        assert row["on_air_ns"] % mac.slot_ns == row["left_ns"] % mac.slot_ns == 0
+        assert row["on_air_ns"] >= (row["sent_ns"] // mac.slot_ns + mac.t1_slots) * mac.slot_ns
+        assert row["arrival_ns"] > row["sent_ns"] + least_transit_ns(section) - 1
+    begins = [row["on_air_ns"] for row in rows]
+    assert len(set(begins)) == len(begins), "one frame a slot"
+
+
+def test_periodic_frames_keep_their_resource_for_the_counter_and_change_it_then() -> None:
+    rows = beacons(engine(line(0, 50), **LTE), 1, 20.0)
+    phases = [row["on_air_ns"] % (100 * MS) for row in rows]
+    runs = [1]
+    for before, after in pairwise(phases):
+        if before == after:
+            runs[-1] += 1
+        else:
+            runs.append(1)
+    assert all(5 <= length <= 15 for length in runs[:-1]) and len(runs) > 10
+    kept = beacons(engine(line(0, 50), **with_mac(LTE, keep_probability=0.8)), 1, 20.0)
+    assert len({row["on_air_ns"] % (100 * MS) for row in kept}) < len(runs) / 2
+
+
+def test_a_period_is_learned_from_frames_where_a_program_does_not_say_it() -> None:
+    subject = engine(line(0, 50), **LTE)
+    for n in range(60):
+        subject.transmit(n * 50 * MS, 0, [b"x"])
+        subject.advance(n * 50 * MS)
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()[30:]
+    gaps = Counter((b["on_air_ns"] - a["on_air_ns"]) // MS for a, b in pairwise(rows))
+    assert gaps[50] > 0.7 * len(rows)
+
+
+def test_one_shots_leave_the_reservation_now_and_then() -> None:
+    rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True, keep_probability=0.8)), 1, 20.0)
+    phases = Counter(row["on_air_ns"] % (100 * MS) for row in rows)
+    elsewhere = sum(1 for count in phases.values() if count <= 2)
+    assert 200 / 6 - 10 <= elsewhere <= 200 / 2
+
+
+# Outcomes.
+
+
+def test_outcomes_in_their_order() -> None:
+    """Near receivers hear; far ones do not detect; those that transmit in the slot hear nothing."""
+    rows = beacons(engine(line(0, 50, 420, 800), **WINNER | {"mac": {"kind": "lte-mode4"}}), 2, 10.0)
+    far = Counter(row["outcome"] for row in rows if row["receiver"] == "v3")
+    assert set(far) == {"below_sensing"}
+    between = [row for row in rows if {row["sender"], row["receiver"]} == {"v0", "v1"}]
+    same = {row["on_air_ns"] for row in between if row["sender"] == "v0"} & {
+        row["on_air_ns"] for row in between if row["sender"] == "v1"
+    }
+    assert all((row["outcome"] == "half_duplex") == (row["on_air_ns"] in same) for row in between)
+
+
+def test_equal_signals_on_one_resource_collide_and_beside_each_other_do_not() -> None:
+    for subchannels, outcome in ((1, "collided"), (2, "delivered")):
+        mac = {"kind": "nr-mode2", "scs_khz": 15, "subchannels": subchannels, "t1_slots": 1, "t2_ms": 10}
+        subject = engine(line(-50, 50, 0), **WINNER | {"mac": mac | {"scheduling": "dynamic"}})
+        for n in range(300):
+            for node in (0, 1):
+                subject.transmit(n * 50 * MS, node, [b"x"])
+        subject.drain()
+        rows = subject.trace.to_table().to_pylist()
+        heard = [row for row in rows if row["receiver"] == "v2"]
+        times = Counter(row["on_air_ns"] for row in heard)
+        together = [row["outcome"] for row in heard if times[row["on_air_ns"]] == 2]
+        assert together and (set(together) == {outcome} if subchannels == 1 else outcome in together)
+        assert {row["outcome"] for row in heard if times[row["on_air_ns"]] == 1} == {"delivered"}
+
+
+def test_a_second_transmission_saves_frames_and_arrives_after_it() -> None:
+    once, twice = (
+        beacons(engine(line(*range(0, 750, 50)), **with_mac(LTE, retransmit=again)), 15, 4.0)
+        for again in (False, True)
+    )
+    share = [sum(row["outcome"] == "delivered" for row in rows) / len(rows) for rows in (once, twice)]
+    assert share[1] > share[0]
+    assert {(row["left_ns"] - row["on_air_ns"]) // MS for row in twice} <= set(range(1, 17))
+    assert {(row["left_ns"] - row["on_air_ns"]) // MS for row in once} == {1}
+
+
+def test_occupancy_limit_drops_frames_of_a_busy_channel_alone() -> None:
+    """Each may send four frames a second, however busy the channel is, or if a fifth of it is busy."""
+    limit: dict[str, Any] = {"congestion": {"kind": "cr_limit", "busy": [0.0], "most": [0.001]}}
+    rows = beacons(engine(line(*range(0, 120, 6)), **LTE | limit), 20, 3.0)
+    outcomes = Counter(row["outcome"] for row in rows if row["receiver"] == "v0")
+    assert outcomes["no_grant"] > 0.3 * outcomes.total()
+    sent = {(row["sender"], row["on_air_ns"]) for row in rows if row["on_air_ns"] is not None}
+    for sender in {sender for sender, _ in sent}:
+        begins = sorted(on_air_ns for each, on_air_ns in sent if each == sender)
+        assert all(later - first >= S for first, later in zip(begins, begins[4:], strict=False))
+    quiet = beacons(engine(line(0, 50), **LTE | {"congestion": {**limit["congestion"], "busy": [0.2]}}), 2, 3.0)
+    assert "no_grant" not in {row["outcome"] for row in quiet}
+
+
+def test_a_full_queue_and_a_throttle_act_as_on_other_macs() -> None:
+    subject = engine(line(0, 50), queue_frames=1, **LTE)
+    subject.transmit(0, 0, [b"x", b"y", b"z"])
+    subject.drain()
+    outcomes = Counter(row["outcome"] for row in subject.trace.to_table().to_pylist())
+    assert outcomes == {"delivered": 1, "queue_full": 2}
+    slowed = engine(line(0, 50), **LTE)
+    throttle = Throttle(kind="throttle", bitrate_mbps=0.01, at_s=0.0, duration_s=1.0)
+    slowed.set_faults([planned(0, throttle, (0, S), 2, 0)], 0)
+    slowed.transmit(0, 0, [bytes(100)])
+    slowed.drain()
+    (row,) = slowed.trace.to_table().to_pylist()
+    assert row["on_air_ns"] >= 80 * MS
+
+
+def test_duplicates_and_copies_are_as_on_other_macs() -> None:
+    subject = engine(line(0, 50), **LTE)
+    again = Duplicate(kind="duplicate", probability=1.0, delay_ms=2.0, at_s=0.0, duration_s=1.0)
+    subject.set_faults([planned(0, again, (0, S), 2)], 0)
+    subject.transmit(0, 0, [b"x"])
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()
+    assert [row["copy"] for row in rows] == [0, 1] and rows[1]["arrival_ns"] == rows[0]["arrival_ns"] + 2 * MS
+
+
+def test_cut_links_lose_frames_that_interfere_all_the_same() -> None:
+    subject = FaultyEngine([{"kind": "block", "at_s": 0.0, "duration_s": 5.0}], 2, 1, access_jitter_ms=0, **LTE)
+    subject.chat(10)
+    assert {row["outcome"] for row in subject.rows()} <= {"fault", "half_duplex"}
+
+
+# Exact probabilities of small grids.
+
+
+def chance(successes: int, trials: int, probability: float) -> bool:
+    """Return whether a count is within five standard deviations of its expectation."""
+    return abs(successes - trials * probability) <= 5 * sqrt(trials * probability * (1 - probability)) + 1
+
+
+@pytest.mark.parametrize(("slots", "subchannels"), [(10, 1), (10, 2), (14, 3)])
+def test_dynamic_selections_meet_as_often_as_all_pairs_of_choices_say(slots: int, subchannels: int) -> None:
+    """Two vehicles that know nothing of each other choose among all resources of the window, independently."""
+    mac = {
+        "kind": "nr-mode2",
+        "scs_khz": 15,
+        "subchannels": subchannels,
+        "t1_slots": 1,
+        "t2_ms": slots,
+        "scheduling": "dynamic",
+        "in_band_emission_db": 300,
+    }
+    subject = engine(line(-50, 50, 0), **WINNER | {"mac": mac})
+    trials = 600
+    for n in range(trials):
+        for node in (0, 1):
+            subject.transmit(n * 300 * MS + MS // 2, node, [b"x"])
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()
+    pairs = list(product(product(range(slots), range(subchannels)), repeat=2))
+    same_slot = sum(one[0] == other[0] for one, other in pairs) / len(pairs)
+    same = sum(one == other for one, other in pairs) / len(pairs)
+    deaf = sum(row["outcome"] == "half_duplex" for row in rows if row["receiver"] != "v2") // 2
+    collided = sum(row["outcome"] == "collided" for row in rows if row["receiver"] == "v2") // 2
+    assert chance(deaf, trials, same_slot), (deaf, trials * same_slot)
+    assert chance(collided, trials, same), (collided, trials * same)
