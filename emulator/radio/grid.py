@@ -97,7 +97,7 @@ class Heard(NamedTuple):
 
 
 class SensedGrid:
-    """What each of `count` vehicles has sensed in the sensing window of a MAC."""
+    """Powers and reservations that each of `count` vehicles has sensed in the sensing window of a MAC."""
 
     def __init__(self, mac: Sidelink, count: int) -> None:
         self._mac = mac

@@ -480,7 +480,7 @@ class Sidelink(Mac):
 
 
 class Link:
-    """What a receiver detects and decodes: noise, thresholds, and block error rates."""
+    """Detection and decoding at a receiver: noise, thresholds, and block error rates."""
 
     def __init__(self, radio: Radio) -> None:
         mac = radio.sidelink
