@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from emulator.api import run, simulate
     from emulator.cells.sweep import sweep
     from emulator.checks.own import Result
-    from emulator.learning.environment import environment
+    from emulator.learning.environment import environment, radio_for
     from emulator.learning.episode import Moment
     from emulator.radio.own_rules import Answer, RadioFrame
     from emulator.report.notebook import Run
@@ -27,6 +27,7 @@ __all__ = [
     "Run",
     "SensedTruth",
     "environment",
+    "radio_for",
     "run",
     "simulate",
     "sweep",
@@ -40,6 +41,7 @@ _PUBLIC = {
     "Run": "emulator.report.notebook",
     "SensedTruth": "emulator.world.own_sensors",
     "environment": "emulator.learning.environment",
+    "radio_for": "emulator.learning.environment",
     "run": "emulator.api",
     "simulate": "emulator.api",
     "sweep": "emulator.cells.sweep",

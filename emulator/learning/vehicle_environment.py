@@ -67,7 +67,7 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         """
         self.close()
         if seed is not None:
-            self._seed = _whole_seed(seed)
+            self._seed = whole_seed(seed)
         run = self._scenario.run.model_copy(update={"seed": self._seed})
         self._seed += 1
         self._episodes += 1
@@ -148,7 +148,7 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
             self.close()
 
 
-def _whole_seed(seed: Any) -> int:
+def whole_seed(seed: Any) -> int:
     """Return a seed as a plain number. Raises VnetError for one that no scenario can have."""
     with suppress(TypeError):
         if 0 <= index(seed) < SEEDS:

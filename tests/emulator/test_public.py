@@ -48,6 +48,7 @@ def test_the_public_names_are_these_and_no_more() -> None:
         "Run",
         "SensedTruth",
         "environment",
+        "radio_for",
         "run",
         "simulate",
         "sweep",

@@ -1,0 +1,290 @@
+"""`emulator.radio_for`: PettingZoo's particle worlds and HighwayEnv's crossing with vnet's radio between agents."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+from mpe2 import simple_reference_v3, simple_speaker_listener_v4
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+import emulator
+from docs.examples.highway import FEATURES, Crossing
+from vnet import Packet
+from vnet.errors import VnetError
+
+pytestmark = pytest.mark.slow
+
+WORDS = {simple_speaker_listener_v4: 3, simple_reference_v3: 10}
+"""Words of each world, whose one-hot vector (for continuous actions any vector) ends a listener's observation."""
+METRE = 100.0
+"""Metres of a unit of length of the particle worlds, in which agents begin anywhere from -1 to 1."""
+PERFECT = {"radio": {"range_m": 1e6}}
+
+
+def spoken(env: Any, words: int) -> Callable[[str, Any, Any], bytes | None]:
+    """Return a function that takes the message out of an action, as these worlds do."""
+
+    def send(agent: str, observation: Any, action: Any) -> bytes | None:
+        if agent.startswith("listener"):
+            return None
+        if isinstance(env.action_space(agent), Box):
+            return np.asarray(action[-words:], np.float32).tobytes()
+        moves = env.action_space(agent).n // words
+        return np.eye(words, dtype=np.float32)[action // moves].tobytes()
+
+    return send
+
+
+def heard(words: int) -> Callable[[str, Any, Sequence[Packet]], Any]:
+    """Return a function that puts what was received in the place of what the world lets agents hear."""
+
+    def receive(agent: str, observation: Any, packets: Sequence[Packet]) -> Any:
+        if agent.startswith("speaker"):
+            return observation
+        word = np.frombuffer(packets[-1].payload, np.float32) if packets else np.zeros(words, np.float32)
+        return np.concatenate([observation[:-words], word])
+
+    return receive
+
+
+def particles(world: Any, scenario: Mapping[str, Any], continuous: bool = False) -> Any:
+    """Return a particle world with a radio."""
+    env = world.parallel_env(continuous_actions=continuous)
+
+    def position_m(agent: str) -> Any:
+        return next(each.state.p_pos for each in env.unwrapped.world.agents if each.name == agent) * METRE
+
+    send, receive = spoken(env, WORDS[world]), heard(WORDS[world])
+    return emulator.radio_for(env, scenario, position_m=position_m, send=send, receive=receive)
+
+
+def cars(scenario: Mapping[str, Any], vehicles: int = 4) -> Any:
+    """Return the crossing, where each vehicle observes itself and what it has received of each other."""
+    env = Crossing(vehicles)
+
+    def send(agent: str, observation: Any, action: Any) -> bytes:
+        return bytes(observation[0].tobytes())
+
+    def receive(agent: str, observation: Any, packets: Sequence[Packet]) -> Any:
+        rows = np.zeros((1 + vehicles, len(FEATURES)), np.float32)
+        rows[0] = observation
+        for packet in packets:
+            rows[1 + env.possible_agents.index(packet.sender)] = np.frombuffer(packet.payload, np.float32)
+        return rows
+
+    space = Box(-np.inf, np.inf, (1 + vehicles, len(FEATURES)), np.float32)
+    return emulator.radio_for(
+        env,
+        scenario,
+        position_m=env.position_m,
+        send=send,
+        receive=receive,
+        observation_space=space,
+        step_s=env.step_s,
+    )
+
+
+def both(plain: Any, radio: Any, seed: int) -> None:
+    """Step both with the same actions, and expect the same of both."""
+    assert_same(plain.reset(seed=seed), radio.reset(seed=seed))
+    for agent in plain.possible_agents:
+        plain.action_space(agent).seed(seed)
+    while plain.agents:
+        actions = {agent: plain.action_space(agent).sample() for agent in plain.agents}
+        assert_same(plain.step(actions), radio.step(actions))
+        assert plain.agents == radio.agents
+
+
+def assert_same(one: Any, other: Any) -> None:
+    """Expect equal results, down to the arrays in them."""
+    for left, right in zip(one, other, strict=True):
+        assert left.keys() == right.keys()
+        for agent, value in left.items():
+            np.testing.assert_array_equal(value, right[agent])
+
+
+@pytest.mark.parametrize("continuous", [False, True], ids=["discrete", "continuous"])
+@pytest.mark.parametrize("world", WORDS, ids=["speaker and listener", "reference"])
+def test_with_a_perfect_radio_a_particle_world_is_itself(world: Any, continuous: bool) -> None:
+    radio, plain = particles(world, PERFECT, continuous), world.parallel_env(continuous_actions=continuous)
+    speakers = 2 if world is simple_reference_v3 else 1
+    for seed in range(3):
+        both(plain, radio, seed)
+        assert radio.outcomes == {"delivered": 25 * speakers}
+
+
+def test_it_passes_pettingzoo_s_tests(capsys: pytest.CaptureFixture[str]) -> None:
+    lossy = {"radio": {"loss": 0.5}}
+    parallel_api_test(particles(simple_reference_v3, lossy), num_cycles=60)
+    parallel_seed_test(lambda: particles(simple_reference_v3, lossy), num_cycles=30)
+    assert "Passed Parallel API test" in capsys.readouterr().out
+
+
+def test_words_arrive_within_the_disc_alone() -> None:
+    radio = particles(simple_reference_v3, {"radio": {"range_m": 80.0}})
+    inside = outside = 0
+    for seed in range(20):
+        radio.reset(seed=seed)
+        while radio.agents:
+            one, other = (np.array(agent.state.p_pos) for agent in radio.unwrapped.world.agents)
+            within = bool(np.hypot(*(one - other)) * METRE <= 80.0)
+            actions = {agent: radio.action_space(agent).sample() for agent in radio.agents}
+            observations, *_ = radio.step(actions)
+            for agent, listener in permutations(actions):
+                word = np.eye(10)[actions[agent] // 5] if within else np.zeros(10)
+                np.testing.assert_array_equal(observations[listener][-10:], word)
+            inside, outside = inside + within, outside + (not within)
+    assert inside > 50 and outside > 50
+
+
+def test_the_share_that_arrives_is_the_disc_s_closed_form() -> None:
+    """Two points in a square of side a are within r ≤ a with probability π q² - 8/3 q³ + q⁴/2, where q = r/a."""
+    range_m, loss, episodes = 120.0, 0.25, 500
+    radio = particles(simple_speaker_listener_v4, {"radio": {"range_m": range_m, "loss": loss}})
+    q = range_m / (2 * METRE)
+    within = math.pi * q**2 - 8 / 3 * q**3 + q**4 / 2
+    expected = within * (1 - loss)
+    received = 0
+    for seed in range(episodes):
+        radio.reset(seed=seed)
+        observations, *_ = radio.step({"speaker_0": 1, "listener_0": 0})
+        received += int(observations["listener_0"][-2])
+    assert received / episodes == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / episodes))
+
+
+def test_with_a_perfect_radio_vehicles_of_a_crossing_have_each_other_s_observation() -> None:
+    radio, plain = cars(PERFECT), Crossing()
+    before, _ = plain.reset(seed=3)
+    assert radio.reset(seed=3)[0]["car_1"][0].tolist() == before["car_1"].tolist()
+    while radio.agents:
+        actions = dict.fromkeys(radio.agents, 1)
+        observations, *rest = radio.step(actions)
+        after, *plain_rest = plain.step(actions)
+        for car, rows in observations.items():
+            np.testing.assert_array_equal(rows[0], after[car])
+            for number, other in enumerate(plain.possible_agents, start=1):
+                np.testing.assert_array_equal(rows[number], before[other] * (other != car))
+        assert_same(rest, plain_rest)
+        before = after
+
+
+def test_vehicles_of_a_crossing_receive_those_within_the_disc() -> None:
+    radio = cars({"radio": {"range_m": 60.0}})
+    shares = set()
+    for seed in range(3):
+        radio.reset(seed=seed)
+        while radio.agents:
+            place_m = {car: np.array(radio.env.position_m(car)) for car in radio.possible_agents}
+            observations, *_ = radio.step(dict.fromkeys(radio.agents, 1))
+            for number, sender in enumerate(radio.possible_agents, start=1):
+                for car in radio.possible_agents:
+                    within = car != sender and np.hypot(*(place_m[car] - place_m[sender])) <= 60.0
+                    assert observations[car][number, 0] == within
+                    shares.add(bool(within))
+    assert shares == {True, False}
+
+
+def test_vehicles_share_the_medium_of_80211p() -> None:
+    physical = {"path_loss": {"kind": "free_space"}, "mac": {}, "access_jitter_ms": 0.0}
+    radio = cars({"radio": physical})
+    radio.reset(seed=1)
+    radio.step(dict.fromkeys(radio.agents, 1))
+    assert radio.outcomes == {"collided": 12}  # all begin at the same slot
+    apart = cars({"radio": physical | {"access_jitter_ms": 100.0}})
+    apart.reset(seed=1)
+    apart.step(dict.fromkeys(apart.agents, 1))
+    assert apart.outcomes == {"delivered": 12}
+
+
+def test_a_message_that_is_late_arrives_in_a_later_step() -> None:
+    late = particles(simple_speaker_listener_v4, {"radio": {"latency_ms": 150.0, "jitter_ms": 0.0}})
+    late.reset(seed=1)
+    listened = [
+        late.step({"speaker_0": word, "listener_0": 0})[0]["listener_0"][-3:].tolist() for word in (0, 1, 2)
+    ]
+    assert listened == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+def test_episodes_have_the_seed_that_is_given_or_the_next() -> None:
+    radio = particles(simple_speaker_listener_v4, {"run": {"seed": 7}, "radio": {"loss": 0.5}})
+
+    def listen(seed: int | None) -> list[float]:
+        radio.reset(seed=seed)
+        steps = [radio.step({"speaker_0": 1, "listener_0": 0}) for _ in range(25)]
+        return [step[0]["listener_0"][-2] for step in steps]
+
+    first, second = listen(None), listen(None)
+    assert (listen(7), listen(8)) == (first, second)
+    assert first != second
+
+
+def test_agents_whose_episode_is_over_neither_send_nor_receive() -> None:
+    class Leaving(Crossing):
+        def step(self, actions: dict[str, Any]) -> Any:
+            seen, *rest = super().step(actions)
+            if self.agents:
+                self.agents = self.agents[:-1] or self.agents
+            return seen, *rest
+
+    env = Leaving(3)
+    told: list[str] = []
+
+    def tell(agent: str, observation: Any, action: Any) -> bytes:
+        told.append(agent)
+        return b"here"
+
+    radio = emulator.radio_for(
+        env,
+        PERFECT,
+        position_m=env.position_m,
+        send=tell,
+        receive=lambda agent, observation, packets: len(packets),
+    )
+    radio.reset(seed=1)
+    assert radio.step(dict.fromkeys(env.possible_agents, 1))[0] == {"car_0": 2, "car_1": 2, "car_2": 2}
+    assert radio.step(dict.fromkeys(env.possible_agents, 1))[0] == {"car_0": 1, "car_1": 1, "car_2": 0}
+    assert told == ["car_0", "car_1", "car_2", "car_0", "car_1"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "line"),
+    [
+        ({"env": 3}, "radio_for: env = 3: a ParallelEnv of pettingzoo is needed"),
+        ({"send": None}, "radio_for: send = None: a function is needed"),
+        ({"observation_space": 1}, "radio_for: observation_space = 1: a space of gymnasium, or a function"),
+        ({"step_s": 0}, "radio_for: step_s = 0: a number of seconds from 1e-06 to "),
+        ({"scenario": {"radio": {"loss": 2}}}, r"radio.loss = 2"),
+        (
+            {"scenario": {"fault": [{"kind": "loss", "at_s": 1, "duration_s": 1}]}},
+            r"radio_for: the scenario has \[\[fault\]\]",
+        ),
+    ],
+)
+def test_what_cannot_be_is_one_line(wrong: dict[str, Any], line: str) -> None:
+    given: dict[str, Any] = {"env": Crossing(2), "scenario": PERFECT, "position_m": lambda agent: (0, 0)}
+    given |= {"send": lambda *_: b"", "receive": lambda agent, observation, packets: observation} | wrong
+    with pytest.raises(VnetError, match=line):
+        emulator.radio_for(given.pop("env"), given.pop("scenario"), **given)
+
+
+@pytest.mark.parametrize(
+    ("functions", "line"),
+    [
+        ({"position_m": lambda agent: None}, r"position_m\('car_0'\) = None: two finite numbers in m are needed"),
+        ({"position_m": lambda agent: (0, math.nan)}, r"position_m\('car_0'\) = .*: two finite numbers"),
+        ({"send": lambda *_: "hello"}, r"send\('car_0'\) = 'hello': bytes are needed, or None"),
+    ],
+)
+def test_what_functions_return_is_checked(functions: dict[str, Any], line: str) -> None:
+    env = Crossing(2)
+    given: dict[str, Any] = {"position_m": env.position_m, "send": lambda *_: None, "receive": lambda *all: all[1]}
+    radio = emulator.radio_for(env, PERFECT, **given | functions)
+    with pytest.raises(VnetError, match=r"step: no episode has begun: reset\(\)"):
+        radio.step({})
+    radio.reset(seed=1)
+    with pytest.raises(VnetError, match=line):
+        radio.step(dict.fromkeys(radio.agents, 1))
