@@ -259,7 +259,7 @@ def test_agents_whose_episode_is_over_neither_send_nor_receive() -> None:
         ({"step_s": 0}, "radio_for: step_s = 0: a number of seconds from 1e-06 to "),
         ({"scenario": {"radio": {"loss": 2}}}, r"radio.loss = 2"),
         (
-            {"scenario": {"fault": [{"kind": "loss", "at_s": 1, "duration_s": 1}]}},
+            {"scenario": {"fault": [{"kind": "kill", "at_s": 1, "duration_s": 1}]}},
             r"radio_for: the scenario has \[\[fault\]\]",
         ),
     ],
