@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from vnet.errors import VnetError
 
 EXTRA_OF = {
+    "asn1tools": "its",
     "cryptography": "tls",
     "cvxpy": "sdp",
     "daqp": "cooperative",

@@ -1,0 +1,240 @@
+"""CPM and VAM of ETSI's release 2, and the BSM of SAE J2735, by schemas of ASN.1: docs/how-to/standard-messages.md.
+
+asn1tools (extra `its`) compiles the schemas and encodes in unaligned PER. `its2.asn` has what the examples send of
+CPM and VAM; ETSI's own modules may stand in its place. The schema of J2735 is SAE's: bring your copy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import asn1tools
+
+from vnet.errors import VnetError
+
+PROFILE = Path(__file__).with_name("its2.asn")
+ORIGIN_DEG = 48.7758, 9.1829
+"""Latitude and longitude of the scenario's origin."""
+DEGREE_M = 111_320.0
+"""Length of a degree of latitude."""
+START_MS = 694_310_405_000
+"""The run's beginning, in milliseconds from 2004-01-01 as TimestampIts counts (with leap seconds): 2026-01-01."""
+CPM_HEADER, VAM_HEADER = {"protocolVersion": 2, "messageId": 14}, {"protocolVersion": 3, "messageId": 16}
+VEHICLE_CONTAINER, OBJECT_CONTAINER = 1, 5
+"""Numbers of a CPM's containers."""
+CYCLIST = 2
+"""Station type of a VAM."""
+BSM = 20
+"""`messageId` of a BSM in a `MessageFrame`."""
+NOT_KNOWN = 127
+"""Confidence of speeds and angles: unavailable."""
+Xy = tuple[float, float]
+
+
+@cache
+def schema(path: str | Path = PROFILE) -> Any:
+    """Return the compiled types of a file of ASN.1, or of all `*.asn` in a folder. Raises VnetError in one line."""
+    path = Path(path)
+    files = sorted(path.rglob("*.asn")) if path.is_dir() else [path]
+    if not files or not all(file.is_file() for file in files):
+        raise VnetError(f"program.options.asn1 = '{path}': a file of ASN.1, or a folder with *.asn, is needed")
+    try:
+        return asn1tools.compile_files([str(file) for file in files], "uper", encoding="latin-1")
+    except (asn1tools.ParseError, asn1tools.CompileError) as error:
+        raise VnetError(f"program.options.asn1 = '{path}': {str(error).splitlines()[0]}") from None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A road user at `position_m` with `velocity_m_s`, east and north, `age_s` before the message's time."""
+
+    position_m: Xy
+    velocity_m_s: Xy
+    age_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Message:
+    """Content of a message, as far as the examples use it: its sender and, in a CPM, what that sees of others."""
+
+    station: int
+    time_ns: int
+    position_m: Xy
+    heading_rad: float = 0.0
+    speed_m_s: float = 0.0
+    objects: tuple[Seen, ...] = ()
+
+
+def encode_cpm(message: Message, types: Any) -> bytes:
+    """Return a CPM with the containers of a vehicle and of objects, in m east and north of the vehicle."""
+    objects = [_object(number, message, seen) for number, seen in enumerate(message.objects)]
+    vehicle = {"orientationAngle": {"value": _to_north(message.heading_rad), "confidence": NOT_KNOWN}}
+    perceived = {"numberOfPerceivedObjects": len(objects), "perceivedObjects": objects}
+    containers = {
+        VEHICLE_CONTAINER: types.encode("OriginatingVehicleContainer", vehicle),
+        OBJECT_CONTAINER: types.encode("PerceivedObjectContainer", perceived),
+    }
+    ellipse = {"semiMajorConfidence": 4095, "semiMinorConfidence": 4095, "semiMajorOrientation": 3601}
+    management = {
+        "referenceTime": START_MS + message.time_ns // 1_000_000,
+        "referencePosition": _place(message.position_m) | {"positionConfidenceEllipse": ellipse},
+    }
+    wrapped = [{"containerId": key, "containerData": data} for key, data in containers.items()]
+    payload = {"managementContainer": management, "cpmContainers": wrapped}
+    value = {"header": CPM_HEADER | {"stationId": message.station}, "payload": payload}
+    return bytes(types.encode("CollectivePerceptionMessage", value))
+
+
+def _object(number: int, message: Message, seen: Seen) -> dict[str, Any]:
+    coordinates = {
+        f"{axis}Coordinate": {"value": round(100 * (there_m - here_m)), "confidence": 4096}
+        for axis, there_m, here_m in zip("xy", seen.position_m, message.position_m, strict=True)
+    }
+    velocity = {
+        f"{axis}Velocity": {"value": round(100 * speed_m_s), "confidence": NOT_KNOWN}
+        for axis, speed_m_s in zip("xy", seen.velocity_m_s, strict=True)
+    }
+    return {
+        "objectId": number,
+        "measurementDeltaTime": round(-1000 * seen.age_s),
+        "position": coordinates,
+        "velocity": ("cartesianVelocity", velocity),
+    }
+
+
+def decode_cpm(payload: bytes, types: Any) -> Message | None:
+    """Return a CPM; None for bytes that are none, which the radio may well deliver."""
+    if payload[:2] != bytes(CPM_HEADER.values()):
+        return None
+    try:
+        value = types.decode("CollectivePerceptionMessage", payload)
+        of = {each["containerId"]: each["containerData"] for each in value["payload"]["cpmContainers"]}
+        heading = types.decode("OriginatingVehicleContainer", of[VEHICLE_CONTAINER])["orientationAngle"]["value"]
+        found = types.decode("PerceivedObjectContainer", of[OBJECT_CONTAINER])["perceivedObjects"]
+    except Exception:  # asn1tools has many kinds of errors for damaged bytes
+        return None
+    management = value["payload"]["managementContainer"]
+    position_m = _metres(management["referencePosition"])
+    time_ns = (management["referenceTime"] - START_MS) * 1_000_000
+    objects = tuple(_seen(each, position_m) for each in found)
+    return Message(value["header"]["stationId"], time_ns, position_m, _from_north(heading), objects=objects)
+
+
+def _seen(found: dict[str, Any], origin_m: Xy) -> Seen:
+    x_m, y_m = (found["position"][f"{axis}Coordinate"]["value"] / 100 for axis in "xy")
+    _, velocity = found["velocity"]
+    x_m_s, y_m_s = (velocity[f"{axis}Velocity"]["value"] / 100 for axis in "xy")
+    return Seen((origin_m[0] + x_m, origin_m[1] + y_m), (x_m_s, y_m_s), found["measurementDeltaTime"] / -1000)
+
+
+def encode_vam(message: Message, types: Any) -> bytes:
+    """Return a VAM of a cyclist with the containers that each one must have."""
+    ellipse = {"semiMajorAxisLength": 4095, "semiMinorAxisLength": 4095, "semiMajorAxisOrientation": 3601}
+    basic = {
+        "stationType": CYCLIST,
+        "referencePosition": _place(message.position_m) | {"positionConfidenceEllipse": ellipse},
+    }
+    moves = {
+        "heading": {"value": _to_north(message.heading_rad), "confidence": NOT_KNOWN},
+        "speed": {"speedValue": min(round(100 * message.speed_m_s), 16382), "speedConfidence": NOT_KNOWN},
+        "longitudinalAcceleration": {
+            "longitudinalAccelerationValue": 161,
+            "longitudinalAccelerationConfidence": 102,
+        },
+    }
+    body = {
+        "generationDeltaTime": (START_MS + message.time_ns // 1_000_000) % 65536,
+        "vamParameters": {"basicContainer": basic, "vruHighFrequencyContainer": moves},
+    }
+    return bytes(types.encode("VAM", {"header": VAM_HEADER | {"stationId": message.station}, "vam": body}))
+
+
+def decode_vam(payload: bytes, types: Any, now_ns: int) -> Message | None:
+    """Return a VAM of the last minute; None for bytes that are none."""
+    if payload[:2] != bytes(VAM_HEADER.values()):
+        return None
+    try:
+        value = types.decode("VAM", payload)
+    except Exception:
+        return None
+    now_ms = START_MS + now_ns // 1_000_000
+    age_ms = (now_ms - value["vam"]["generationDeltaTime"]) % 65536
+    parameters = value["vam"]["vamParameters"]
+    moves = parameters["vruHighFrequencyContainer"]
+    return Message(
+        station=value["header"]["stationId"],
+        time_ns=(now_ms - age_ms - START_MS) * 1_000_000,
+        position_m=_metres(parameters["basicContainer"]["referencePosition"]),
+        heading_rad=_from_north(moves["heading"]["value"]),
+        speed_m_s=moves["speed"]["speedValue"] / 100,
+    )
+
+
+def encode_bsm(message: Message, count: int, types: Any) -> bytes:
+    """Return a `MessageFrame` with a BSM, the `count`-th of its station, whose core data say what is not known."""
+    place = _place(message.position_m)
+    core = {
+        "msgCnt": count % 128,
+        "id": message.station.to_bytes(4, "big"),
+        "secMark": message.time_ns // 1_000_000 % 60_000,
+        "lat": place["latitude"],
+        "long": place["longitude"],
+        "elev": -4096,
+        "accuracy": {"semiMajor": 255, "semiMinor": 255, "orientation": 65535},
+        "transmission": "unavailable",
+        "speed": min(round(message.speed_m_s / 0.02), 8190),
+        "heading": round(math.degrees(math.pi / 2 - message.heading_rad) % 360 / 0.0125) % 28800,
+        "angle": 127,
+        "accelSet": {"long": 2001, "lat": 2001, "vert": -127, "yaw": 0},
+        "brakes": {
+            "wheelBrakes": (b"\x80", 5),
+            **dict.fromkeys(("traction", "abs", "scs", "brakeBoost", "auxBrakes"), "unavailable"),
+        },
+        "size": {"width": 180, "length": 450},
+    }
+    value = types.encode("BasicSafetyMessage", {"coreData": core})
+    return bytes(types.encode("MessageFrame", {"messageId": BSM, "value": value}))
+
+
+def decode_bsm(payload: bytes, types: Any) -> Message | None:
+    """Return a BSM, its time within a minute; None for bytes that are none."""
+    try:
+        frame = types.decode("MessageFrame", payload)
+        core = types.decode("BasicSafetyMessage", frame["value"])["coreData"] if frame["messageId"] == BSM else None
+    except Exception:
+        return None
+    if core is None:
+        return None
+    return Message(
+        station=int.from_bytes(core["id"], "big"),
+        time_ns=core["secMark"] * 1_000_000,
+        position_m=_metres({"latitude": core["lat"], "longitude": core["long"]}),
+        heading_rad=math.radians(90 - core["heading"] * 0.0125) % math.tau,
+        speed_m_s=core["speed"] * 0.02,
+    )
+
+
+def _to_north(heading_rad: float) -> int:
+    """Return a heading from east as ETSI's tenths of a degree from north, clockwise."""
+    return round(10 * (math.degrees(math.pi / 2 - heading_rad) % 360)) % 3600
+
+
+def _from_north(angle: int) -> float:
+    return math.radians(90 - angle / 10) % math.tau
+
+
+def _place(position_m: Xy) -> dict[str, Any]:
+    latitude_deg = ORIGIN_DEG[0] + position_m[1] / DEGREE_M
+    longitude_deg = ORIGIN_DEG[1] + position_m[0] / (DEGREE_M * math.cos(math.radians(ORIGIN_DEG[0])))
+    altitude = {"altitudeValue": 800001, "altitudeConfidence": "unavailable"}
+    return {"latitude": round(latitude_deg * 1e7), "longitude": round(longitude_deg * 1e7), "altitude": altitude}
+
+
+def _metres(place: dict[str, Any]) -> Xy:
+    north_m = (place["latitude"] / 1e7 - ORIGIN_DEG[0]) * DEGREE_M
+    east_m = (place["longitude"] / 1e7 - ORIGIN_DEG[1]) * DEGREE_M * math.cos(math.radians(ORIGIN_DEG[0]))
+    return east_m, north_m
