@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +106,7 @@ def _object(number: int, message: Message, seen: Seen) -> dict[str, Any]:
     }
 
 
+@lru_cache(maxsize=1024)  # in a simulation all receivers decode the same bytes
 def decode_cpm(payload: bytes, types: Any) -> Message | None:
     """Return a CPM; None for bytes that are none, which the radio may well deliver."""
     if payload[:2] != bytes(CPM_HEADER.values()):

@@ -6,6 +6,7 @@ Options: `shares`, whether they send; `asn1`, ETSI's own schema in place of that
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -99,7 +100,7 @@ def fused(now_ns: int, own_m: Xy, seen: Iterable[Seen], heard: Iterable[tuple[Me
     places: list[Xy] = [own_m]
     for age_s, each in [*((0.0, each) for each in seen), *sorted(told, key=lambda one: one[0])]:
         x_m, y_m = (at + age_s * speed for at, speed in zip(each.position_m, each.velocity_m_s, strict=True))
-        if all(np.hypot(x_m - other[0], y_m - other[1]) > SAME_M for other in places):
+        if all(math.hypot(x_m - other[0], y_m - other[1]) > SAME_M for other in places):
             places.append((x_m, y_m))
     return places[1:]
 
@@ -133,7 +134,7 @@ async def main(node: Node) -> None:
 
 
 def _row(places: list[Xy]) -> list[float]:
-    nearest = sorted(places, key=lambda place: float(np.hypot(*place)))[:PLACES]
+    nearest = sorted(places, key=lambda place: math.hypot(*place))[:PLACES]
     return [at for place in nearest for at in place] + [NOWHERE_M] * 2 * (PLACES - len(nearest))
 
 

@@ -1,0 +1,259 @@
+"""The examples of release 2 and of J2735: messages against a second codec, what vehicles see, and a cyclist."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import emulator
+from docs.examples.its2.messages import (
+    PROFILE,
+    Message,
+    Seen,
+    decode_bsm,
+    decode_cpm,
+    decode_vam,
+    encode_bsm,
+    encode_cpm,
+    encode_vam,
+    schema,
+)
+from docs.examples.its2.perception import NOWHERE_M, PLACES, fused, seen_of
+from docs.examples.its2.sight import sensor
+from emulator import SensedTruth
+from tests.support.paths import ROOT
+from vnet.errors import VnetError
+from vnet.runtime.programs import load_program
+
+pytestmark = pytest.mark.slow
+
+ETSI, J2735 = (os.environ.get(name) for name in ("VNET_ETSI_ASN1", "VNET_J2735_ASN1"))
+"""Folder of ETSI's modules of CPM, VAM and CDD, and file or folder of SAE's: no package carries them."""
+NO_J2735 = pytest.mark.skipif(J2735 is None, reason="VNET_J2735_ASN1 names no ASN.1 of SAE J2735")
+EXAMPLE = ROOT / "docs" / "examples" / "its2"
+STAND_IN = Path(__file__).with_name("frame.asn")
+"""A schema in which a BSM has the names and ranges that the example uses. It is no schema of SAE's."""
+LENGTH_M = st.floats(-1000, 1000)
+SPEED_M_S = st.floats(-60, 60)
+MESSAGES = st.builds(
+    Message,
+    station=st.integers(0, 2**32 - 1),
+    time_ns=st.integers(0, 10**5).map(lambda ms: ms * 1_000_000),
+    position_m=st.tuples(LENGTH_M, LENGTH_M),
+    heading_rad=st.floats(0, 6.28),
+    speed_m_s=st.floats(0, 60),
+    objects=st.lists(
+        st.builds(
+            Seen,
+            position_m=st.tuples(st.floats(-300, 300), st.floats(-300, 300)),
+            velocity_m_s=st.tuples(SPEED_M_S, SPEED_M_S),
+            age_s=st.integers(0, 2000).map(lambda ms: ms / 1000),
+        ),
+        max_size=20,
+    ).map(tuple),
+)
+
+
+def compiled(file: Path, folder: Path) -> ModuleType:
+    """Return a schema as pycrate compiles it: a codec that shares no code with asn1tools."""
+    target = folder / f"{file.stem}_by_pycrate.py"
+    command = Path(sys.executable).with_name("pycrate_asn1compile.py")
+    words = [sys.executable, command, "-i", file, "-o", target.with_suffix("")]
+    subprocess.run(words, check=True, capture_output=True, timeout=100)  # it keeps what it has compiled
+    spec = importlib.util.spec_from_file_location(target.stem, target)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def second(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The examples' schema by pycrate."""
+    return compiled(PROFILE, tmp_path_factory.mktemp("pycrate")).Its2Profile
+
+
+def assert_close(one: Message, other: Message | None) -> None:
+    """Expect a message to have come through, to the resolution of the standards."""
+    assert other is not None
+    assert (one.station, len(one.objects)) == (other.station, len(other.objects))
+    np.testing.assert_allclose(one.position_m, other.position_m, atol=0.02)
+    assert abs(np.angle(np.exp(1j * (one.heading_rad - other.heading_rad)))) < 0.002
+    for sent, read in zip(one.objects, other.objects, strict=True):
+        np.testing.assert_allclose(sent.position_m, read.position_m, atol=0.03)
+        np.testing.assert_allclose(sent.velocity_m_s, read.velocity_m_s, atol=0.006)
+        assert sent.age_s == pytest.approx(read.age_s, abs=1e-9)
+
+
+@given(MESSAGES)
+def test_a_cpm_is_read_by_a_second_codec_and_written_with_the_same_bytes(second: Any, message: Message) -> None:
+    payload = encode_cpm(message, schema())
+    codec = second.CollectivePerceptionMessage
+    codec.from_uper(payload)
+    value = codec.get_val()
+    assert value["header"] == {"protocolVersion": 2, "messageId": 14, "stationId": message.station}
+    codec.set_val(value)
+    assert codec.to_uper() == payload
+    decoded = decode_cpm(payload, schema())
+    assert_close(message, decoded)
+    assert decoded is not None and decoded.time_ns == message.time_ns
+
+
+@given(MESSAGES)
+def test_a_vam_is_read_by_a_second_codec_and_written_with_the_same_bytes(second: Any, message: Message) -> None:
+    payload = encode_vam(message, schema())
+    second.VAM.from_uper(payload)
+    value = second.VAM.get_val()
+    assert value["vam"]["vamParameters"]["vruHighFrequencyContainer"]["speed"]["speedValue"] == round(
+        100 * message.speed_m_s
+    )
+    second.VAM.set_val(value)
+    assert second.VAM.to_uper() == payload
+    decoded = decode_vam(payload, schema(), message.time_ns + 60_000_000_000)
+    assert decoded is not None and decoded.time_ns == message.time_ns
+    assert_close(Message(message.station, 0, message.position_m, message.heading_rad), decoded)
+    assert decoded.speed_m_s == pytest.approx(message.speed_m_s, abs=0.006)
+
+
+@pytest.mark.skipif(ETSI is None, reason="VNET_ETSI_ASN1 names no folder with ETSI's ASN.1 of CPM, VAM and CDD")
+@given(MESSAGES)
+def test_the_examples_schema_has_the_bytes_of_etsi_s_own(message: Message) -> None:
+    assert ETSI is not None
+    full = schema(ETSI)
+    assert encode_cpm(message, full) == (cpm := encode_cpm(message, schema()))
+    assert encode_vam(message, full) == (vam := encode_vam(message, schema()))
+    assert decode_cpm(cpm, full) == decode_cpm(cpm, schema())
+    assert decode_vam(vam, full, message.time_ns) == decode_vam(vam, schema(), message.time_ns)
+
+
+@pytest.mark.parametrize("path", [STAND_IN, pytest.param(J2735, marks=NO_J2735)])
+@given(MESSAGES)
+def test_a_bsm_comes_through(path: Any, message: Message) -> None:
+    types = schema(path)
+    payload = encode_bsm(message, 130, types)
+    assert (
+        types.decode("BasicSafetyMessage", types.decode("MessageFrame", payload)["value"])["coreData"]["msgCnt"]
+        == 2
+    )
+    decoded = decode_bsm(payload, types)
+    assert_close(Message(message.station, 0, message.position_m, message.heading_rad), decoded)
+    assert decoded is not None and decoded.time_ns == message.time_ns % 60_000_000_000
+    assert decoded.speed_m_s == pytest.approx(message.speed_m_s, abs=0.011)
+
+
+def test_a_bsm_is_read_by_a_second_codec_and_written_with_the_same_bytes(tmp_path: Path) -> None:
+    frame = compiled(STAND_IN, tmp_path).StandIn.MessageFrame
+    payload = encode_bsm(Message(7, 1_234_000_000, (12.3, -45.6), 1.0, 13.9), 5, schema(STAND_IN))
+    frame.from_uper(payload)
+    name, value = frame.get_val()["value"]
+    assert (name, value["coreData"]["speed"], value["coreData"]["msgCnt"]) == ("BasicSafetyMessage", 695, 5)
+    frame.set_val(frame.get_val())
+    assert frame.to_uper() == payload
+
+
+@given(st.binary(max_size=200))
+def test_other_bytes_are_no_message(data: bytes) -> None:
+    for payload in (data, b"\x02\x0e" + data, b"\x03\x10" + data):
+        for decoded in (decode_cpm(payload, schema()), decode_vam(payload, schema(), 0)):
+            assert decoded is None or isinstance(decoded, Message)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (None, "a file of ASN.1, or a folder with"),
+        ("Broken DEFINITIONS ::= BEGIN x END", "program.options.asn1 = "),
+    ],
+)
+def test_a_schema_that_cannot_be_is_one_line(text: str | None, line: str, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "broken.asn").write_text(text)
+    with pytest.raises(VnetError, match=line) as raised:
+        schema(tmp_path)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_vehicle_and_a_building_hide_what_is_behind() -> None:
+    place_m = np.array([[-40.0, 0.0], [-10.0, 0.0], [30.0, 0.0], [0.0, -40.0], [0.0, 5.0]])
+    truth = SensedTruth(
+        time_ns=0,
+        node_ids=("a", "b", "c", "d", "e"),
+        position_m=place_m,
+        heading_rad=np.zeros(5),
+        speed_m_s=np.full(5, 14.0),
+        options={"range_m": 80.0, "misses": 0.0, "sigma": 0.0},
+        rng=np.random.default_rng(1),
+    )
+    readings = {name: np.reshape(numbers, (-1, 4)) for name, numbers in sensor(truth, {}).items()}
+    places_m = {
+        name: sorted(map(tuple, (rows[:, :2] + place_m["abcde".index(name)]).tolist()))
+        for name, rows in readings.items()
+    }
+    assert places_m["a"] == [(-10.0, 0.0), (0.0, 5.0)]  # b hides c, and a building d
+    assert (0.0, -40.0) in places_m["e"] and (30.0, 0.0) in places_m["e"]
+    assert readings["a"][:, 2:].tolist() == [[14.0, 0.0]] * 2
+
+
+def test_what_several_tell_of_one_vehicle_is_one_place() -> None:
+    seen = [Seen((50.0, 0.0), (10.0, 0.0))]
+    told = Message(2, 0, (-30.0, 0.0), objects=(Seen((49.0, 0.5), (10.0, 0.0)), Seen((0.5, 0.0), (0.0, 0.0))))
+    old = Message(3, -400_000_000, (200.0, 0.0))
+    places = fused(100_000_000, (0.0, 0.0), seen, [(told, (10.0, 0.0)), (old, (0.0, 0.0))])
+    assert places == [(50.0, 0.0), (-29.0, 0.0), (200.0, 0.0)]  # the third object is the vehicle itself
+    assert fused(200_000_000, (0.0, 0.0), (), [(old, (0.0, 0.0))]) == []
+
+
+def test_the_share_that_is_seen_and_ghosts_are_those_of_the_truth() -> None:
+    position_m = np.array([[0.0, 0.0], [20.0, 0.0], [0.0, 50.0], [500.0, 0.0]])
+    knows = [[(20.0, 1.0), (0.0, 60.0)], [(0.0, 0.0), (0.0, 50.0)], [], []]
+    row = np.full((4, 2 * PLACES), NOWHERE_M)
+    for number, places in enumerate(knows):
+        row[number, : 2 * len(places)] = np.ravel(places)
+    assert seen_of(position_m, row) == (pytest.approx((1 / 2 + 1 + 0) / 3), pytest.approx(1 / 3))
+
+
+def test_a_crossing_is_seen_better_together(tmp_path: Path) -> None:
+    shares = []
+    for number, changes in enumerate(({"program.options.shares": False}, {})):
+        run = emulator.simulate(
+            EXAMPLE / "perception.toml", duration_s=2.0, set=changes, out=tmp_path / str(number)
+        )
+        shares.append(float(run.metrics["seen_share"].to_numpy()[10:].mean()))
+        assert run.verdict == ("unknown" if number == 0 else "valid")
+    assert shares[0] < 0.5 and shares[1] > 0.95
+
+
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_car_that_heeds_vams_does_not_run_into_a_cyclist(listens: bool, tmp_path: Path) -> None:
+    scenario = {
+        "run": {"duration_s": 20.0, "settle_s": 0.0},
+        "network": {
+            "kind": "driven",
+            "vehicles": 2,
+            "driven": {"start_m": [200.0, 50.0], "speed_mps": [5.0, 14.0]},
+        },
+        "radio": {"range_m": 300.0, "loss": 0.3},
+        "program": {
+            "entry": "docs.examples.its2.vulnerable:main",
+            "options": {"cyclist": "v01", "listens": listens},
+        },
+    }
+    run = emulator.simulate(scenario, out=tmp_path / "run")
+    assert any(event.kind == "collision" for event in run.events) is not listens
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "asn1tools", None)
+    for name in ("messages", "vulnerable"):
+        monkeypatch.delitem(sys.modules, f"docs.examples.its2.{name}", raising=False)
+    with pytest.raises(VnetError, match=r"needs asn1tools: pip install 'vnet-emulator\[its\]'") as raised:
+        load_program("docs.examples.its2.vulnerable:main")
+    assert "\n" not in str(raised.value)
