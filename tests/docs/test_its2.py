@@ -14,7 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import emulator
-from docs.examples.its2.messages import (
+from docs.examples.its2.perception import NOWHERE_M, PLACES, fused, seen_of
+from docs.examples.its2.sight import sensor
+from docs.examples.its2.standard_messages import (
     PROFILE,
     Message,
     Seen,
@@ -26,8 +28,6 @@ from docs.examples.its2.messages import (
     encode_vam,
     schema,
 )
-from docs.examples.its2.perception import NOWHERE_M, PLACES, fused, seen_of
-from docs.examples.its2.sight import sensor
 from emulator import SensedTruth
 from tests.support.paths import ROOT
 from vnet.errors import VnetError
@@ -252,7 +252,7 @@ def test_a_car_that_heeds_vams_does_not_run_into_a_cyclist(listens: bool, tmp_pa
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "asn1tools", None)
-    for name in ("messages", "vulnerable"):
+    for name in ("standard_messages", "vulnerable"):
         monkeypatch.delitem(sys.modules, f"docs.examples.its2.{name}", raising=False)
     with pytest.raises(VnetError, match=r"needs asn1tools: pip install 'vnet-emulator\[its\]'") as raised:
         load_program("docs.examples.its2.vulnerable:main")

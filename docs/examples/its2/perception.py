@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from docs.examples.its2.messages import PROFILE, Message, Seen, Xy, decode_cpm, encode_cpm, schema
+from docs.examples.its2.standard_messages import PROFILE, Message, Seen, Xy, decode_cpm, encode_cpm, schema
 from vnet import Fix, Node
 from vnet.types import Array
 

@@ -7,7 +7,7 @@ Options: `asn1`, the file or folder of your copy of SAE's schema.
 
 from __future__ import annotations
 
-from docs.examples.its2.messages import Message, decode_bsm, encode_bsm, schema
+from docs.examples.its2.standard_messages import Message, decode_bsm, encode_bsm, schema
 from vnet import Node
 from vnet.errors import VnetError
 

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from docs.examples.its2.messages import PROFILE, Message, decode_vam, encode_vam, schema
+from docs.examples.its2.standard_messages import PROFILE, Message, decode_vam, encode_vam, schema
 from vnet import Fix, Node
 
 POSITION_M, SPEED_M_S, HEADING_RAD, LONGEST_S = 4.0, 0.5, math.radians(4), 5.0
