@@ -1,6 +1,7 @@
-"""Compare LTE-V2X mode 4 with published simulations: a table on stdout. The data are not part of the project.
+"""Compare C-V2X and 802.11p with published curves and closed forms: tables on stdout.
 
-`python -m benchmarks.cv2x --data FOLDER` needs `lte_mode4.csv` there, or in `VNET_CV2X_DATA`.
+`python -m benchmarks.cv2x [lte nr 80211p speed]` prints some of the tables. The curves are not part of the project:
+`--data FOLDER`, or `VNET_CV2X_DATA`, names the folder with `lte_mode4.csv`, `80211p.csv` and `80211p_cbr.csv`.
 """
 
 from __future__ import annotations
@@ -12,49 +13,121 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cv2x.highway import Curves, Setting, deviations, drive, mode4_radio, published, together
+from benchmarks.cv2x import closed_forms, dot11p, speed
+from benchmarks.cv2x.highway import (
+    Curves,
+    Measured,
+    Setting,
+    deviations,
+    drive,
+    mode4_radio,
+    published,
+    together,
+)
 
-LIMIT = 2.5
-"""Largest mean absolute deviation, in percentage points."""
+LIMITS = {"lte": 2.5, "nr": 3.0, "80211p": 5.0}
+"""Largest deviations, in percentage points."""
+TABLES = ("lte", "nr", "80211p", "speed")
 
 
 def main() -> int:
-    """Print the table, and return 1 if a deviation is too large."""
+    """Print the tables, and return 1 if a deviation is too large."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.cv2x")
+    parser.add_argument("tables", nargs="*", choices=[*TABLES, []], help="tables to print; all if left out")
     parser.add_argument("--data", type=Path, default=os.environ.get("VNET_CV2X_DATA"), help="folder of the curves")
     parser.add_argument("--seconds", type=float, default=20.0, help="emulated time of a run")
     parser.add_argument("--seeds", type=int, default=3, help="runs of a setting, each with its own shadowing")
     parser.add_argument("--density", type=float, help="only settings with so many vehicles a metre")
     parser.add_argument("--curves", action="store_true", help="print the curves, too")
     options = parser.parse_args()
-    if options.data is None:
-        parser.error("--data, or VNET_CV2X_DATA, must name the folder with lte_mode4.csv")
-    found = published(Path(options.data) / "lte_mode4.csv")
+    tables = options.tables or list(TABLES)
+    if options.data is None and {"lte", "80211p"} & {*tables}:
+        parser.error("--data, or VNET_CV2X_DATA, must name the folder of the published curves")
+    print_table = {"lte": _lte, "nr": _nr, "80211p": _dot11p, "speed": _speed}
+    broken = 0
+    for table in tables:
+        worst = print_table[table](options)
+        if table in LIMITS:
+            print(f"largest deviation: {worst:.2f} percentage points; {LIMITS[table]:g} are allowed\n", flush=True)
+            broken |= worst > LIMITS[table]
+    return int(broken)
+
+
+def _runs(options: argparse.Namespace, radio_of: object, setting: Setting) -> Measured:
+    assert callable(radio_of)
+    seeds = range(1, options.seeds + 1)
+    return together([drive(radio_of(setting), setting, options.seconds, seed) for seed in seeds])
+
+
+def _print_curves(ours: Curves, theirs: Curves) -> None:
+    for name in theirs.keys() & ours.keys():
+        print(f"  {name}: {np.round(ours[name], 3).tolist()} published {np.round(theirs[name], 3).tolist()}")
+
+
+def _lte(options: argparse.Namespace) -> float:
+    """Print the table of mode 4, and return the largest deviation."""
     print(
-        "| setting | PDR | HD | SEN | PRO | COL | CBR | CPU time (s) |",
-        "|---|---|---|---|---|---|---|---|",
+        "| mode 4 | PDR | HD | SEN | PRO | COL | CBR | CPU time (s) |",
+        "|---|" + "---|" * 7,
         sep="\n",
     )
     worst = 0.0
+    found = published(Path(options.data) / "lte_mode4.csv")
     for setting, theirs in sorted(found.items(), key=lambda each: each[0].name):
-        if options.density in (None, setting.density_per_m):
-            worst = max(worst, _compare(setting, theirs, options))
-    print(f"largest deviation: {worst:.2f} percentage points; at most {LIMIT:g} are allowed")
-    return int(worst > LIMIT)
+        if options.density not in (None, setting.density_per_m):
+            continue
+        measured = _runs(options, mode4_radio, setting)
+        away = deviations(measured.curves(), theirs)
+        cells = " | ".join(f"{away[name]:.2f}" for name in ("PDR", "HD", "SEN", "PRO", "COL"))
+        print(f"| {setting.name} | {cells} | {measured.busy.mean():.3f} | {measured.cpu_s:.0f} |", flush=True)
+        if options.curves:
+            _print_curves(measured.curves(), theirs)
+        worst = max(worst, *away.values())
+    return worst
 
 
-def _compare(setting: Setting, theirs: Curves, options: argparse.Namespace) -> float:
-    """Print a row, and return the largest deviation."""
-    seeds = range(1, options.seeds + 1)
-    measured = together([drive(mode4_radio(setting), setting, options.seconds, seed) for seed in seeds])
-    ours = measured.curves()
-    away = deviations(ours, theirs)
-    cells = " | ".join(f"{away[name]:.2f}" for name in ("PDR", "HD", "SEN", "PRO", "COL"))
-    print(f"| {setting.name} | {cells} | {measured.busy.mean():.3f} | {measured.cpu_s:.0f} |", flush=True)
-    if options.curves:
-        for name, curve in theirs.items():
-            print(f"  {name}: {np.round(ours[name], 3).tolist()} published {np.round(curve, 3).tolist()}")
-    return max(away.values())
+def _nr(options: argparse.Namespace) -> float:
+    """Print the table of mode 2, and return the largest deviation."""
+    print("| mode 2 | closed form (%) | measured (%) |", "|---|---|---|", sep="\n")
+    worst = 0.0
+    for case in closed_forms.CASES:
+        expected = closed_forms.meets(case)
+        found = float(np.mean([closed_forms.measured(case, options.seconds, n + 1) for n in range(options.seeds)]))
+        print(f"| {case.name} | {100 * expected:.2f} | {100 * found:.2f} |", flush=True)
+        worst = max(worst, 100 * abs(found - expected))
+    return worst
+
+
+def _dot11p(options: argparse.Namespace) -> float:
+    """Print the table of 802.11p, and return the largest deviation."""
+    print("| 802.11p | PDR | CBR | published CBR | CPU time (s) |", "|---|---|---|---|---|", sep="\n")
+    worst = 0.0
+    folder = Path(options.data)
+    busy = dot11p.published_busy(folder / "80211p_cbr.csv")
+    found = published(folder / "80211p.csv")
+    for setting, theirs in sorted(found.items(), key=lambda each: each[0].name):
+        if options.density not in (None, setting.density_per_m):
+            continue
+        measured = _runs(options, dot11p.radio, setting)
+        away = deviations(measured.curves(), {"PDR": theirs["PDR"]})["PDR"]
+        ours, known = float(measured.busy.mean()), busy.get(setting)
+        text = "–" if known is None else f"{known:.3f}"
+        print(f"| {setting.name} | {away:.2f} | {ours:.3f} | {text} | {measured.cpu_s:.0f} |", flush=True)
+        if options.curves:
+            _print_curves(measured.curves(), theirs)
+        worst = max(worst, away, 0.0 if known is None else 100 * abs(ours - known))
+    return worst
+
+
+def _speed(options: argparse.Namespace) -> float:
+    """Print the table of real-time factors."""
+    print("| vehicles on 2 km | 802.11p | mode 4 | mode 2 |", "|---|---|---|---|", sep="\n")
+    for vehicles in (100, 200, 400):
+        factors = [
+            speed.real_time_factor(vehicles, mac) for mac in ({}, {"kind": "lte-mode4"}, {"kind": "nr-mode2"})
+        ]
+        print(f"| {vehicles} | {' | '.join(f'{factor:.2f}' for factor in factors)} |", flush=True)
+    return 0.0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """The resource grid of a sidelink: what each vehicle has sensed of it, and which resources it may select.
 
-A resource is a slot and some adjacent subchannels. All arrays cover all vehicles at once; slots count from the
-start of the run, and the last ones are kept in a ring.
+A resource is a slot and some adjacent subchannels. All arrays cover all vehicles at once, and what one of them has
+sensed lies together, because selections read it. Slots count from the start of the run, and the last ones are kept
+in a ring.
 
 **Sensing and selection** are those of 3GPP TS 36.213, 14.1.1.6 (LTE mode 4), and TS 38.214, 8.1.4 (NR mode 2). Of
 the resources in the selection window those are excluded that another vehicle has reserved, if its signal was
@@ -104,11 +105,11 @@ class SensedGrid:
         self._slots = mac.sensing_slots
         self._ring = self._slots + mac.t1_slots + 1  # slots are decided ahead of their time
         self._busy_mw = milliwatts(mac.busy_dbm)
-        shape = self._ring, mac.subchannels, count
+        shape = count, self._ring, mac.subchannels
         self._reserved_dbm = np.full(shape, NOT_RESERVED_DBM, np.float16)
         self._period = np.zeros(shape, np.int16)
         self._power_mw = np.zeros(shape, np.float32) if mac.ranks_power else None
-        self._deaf = np.zeros((self._ring, count), bool)
+        self._deaf = np.zeros((count, self._ring), bool)
         self._next = 0
 
     def advance(self, slot: int) -> None:
@@ -117,9 +118,9 @@ class SensedGrid:
         if first >= slot:
             return
         rows = np.arange(first, slot) % self._ring
-        self._reserved_dbm[rows], self._period[rows], self._deaf[rows] = NOT_RESERVED_DBM, 0, False
+        self._reserved_dbm[:, rows], self._period[:, rows], self._deaf[:, rows] = NOT_RESERVED_DBM, 0, False
         if self._power_mw is not None:
-            self._power_mw[rows] = 0
+            self._power_mw[:, rows] = 0
         self._next = slot
 
     def sense(self, slot: int, power_mw: Array, deaf: Mask, heard: Heard) -> None:
@@ -129,9 +130,9 @@ class SensedGrid:
         """
         self.advance(slot + 1)
         row = slot % self._ring
-        self._deaf[row] = deaf
+        self._deaf[:, row] = deaf
         if self._power_mw is not None:
-            self._power_mw[row] = np.where(deaf | (power_mw < self._busy_mw), 0, power_mw)
+            self._power_mw[:, row] = np.where(deaf | (power_mw < self._busy_mw), 0, power_mw).T
         for (first, length), period, own_mw, decoded in zip(
             heard.places, heard.periods, heard.power_mw, heard.decoded, strict=True
         ):
@@ -140,9 +141,9 @@ class SensedGrid:
                 continue
             dbm = (10 * np.log10(own_mw[listener])).astype(np.float16)
             for each in range(first, first + length):
-                stronger = dbm > self._reserved_dbm[row, each, listener]
-                self._reserved_dbm[row, each, listener[stronger]] = dbm[stronger]
-                self._period[row, each, listener[stronger]] = period
+                stronger = dbm > self._reserved_dbm[listener, row, each]
+                self._reserved_dbm[listener[stronger], row, each] = dbm[stronger]
+                self._period[listener[stronger], row, each] = period
 
     def candidates(self, now: int, wanted: Wanted) -> Candidates:
         """Return the candidates among the resources that a vehicle looks for in slot `now`.
@@ -173,12 +174,12 @@ class SensedGrid:
 
     def _strongest_dbm(self, now: int, wanted: Wanted) -> Array:
         """Return the strongest signal (slots, places) whose sender has reserved a part of each resource."""
-        row, subchannel = np.nonzero(self._period[:, :, wanted.node])
+        row, subchannel = np.nonzero(self._period[wanted.node])
         slot = self._slot_of(row)
         known = (slot < now) & (slot >= now - self._slots)
         row, slot, subchannel = row[known], slot[known], subchannel[known]
-        period = self._period[row, subchannel, wanted.node].astype(np.int64)
-        dbm = self._reserved_dbm[row, subchannel, wanted.node].astype(float)
+        period = self._period[wanted.node, row, subchannel].astype(np.int64)
+        dbm = self._reserved_dbm[wanted.node, row, subchannel].astype(float)
         window = wanted.last - wanted.first + 1
         strongest_dbm = np.full((window, self._mac.subchannels), NOT_RESERVED_DBM)
         scale = min(100 * NS_PER_MS // self._mac.slot_ns, self._mac.sensing_slots)
@@ -209,7 +210,7 @@ class SensedGrid:
     def _unmonitored(self, now: int, wanted: Wanted) -> Mask:
         """Return the mask of the slots that repeat one in which the vehicle transmitted."""
         unmonitored = np.zeros(wanted.last - wanted.first + 1, bool)
-        own = np.flatnonzero(self._deaf[:, wanted.node])
+        own = np.flatnonzero(self._deaf[wanted.node])
         if len(own):
             period = max(wanted.period, 1) if wanted.period else 100 * NS_PER_MS // self._mac.slot_ns
             slot = self._slot_of(own)
@@ -230,8 +231,8 @@ class SensedGrid:
         each = latest[:, None] - step * np.arange((self._slots - 1) // step)
         known = (each >= 0) & (each >= now - self._slots)
         rows = each % self._ring
-        weight = (known & ~self._deaf[rows, wanted.node]).astype(np.float64)
-        power_mw = (self._power_mw[rows, :, wanted.node] * weight[:, :, None]).sum(axis=1)
+        weight = (known & ~self._deaf[wanted.node, rows]).astype(np.float64)
+        power_mw = (self._power_mw[wanted.node, rows] * weight[:, :, None]).sum(axis=1)
         power_mw /= np.maximum(weight.sum(axis=1), 1)[:, None]
         places = self._mac.subchannels - wanted.length + 1
         return np.asarray(sum(power_mw[:, n : n + places] for n in range(wanted.length)) / wanted.length)
