@@ -32,7 +32,8 @@ Gozalvez, IEEE TVT 68(2), 2019, as published in their repository msepulcre/C-V2X
 def away(setting: Setting, seconds: float, seeds: int) -> dict[str, float]:
     """Return the deviations of a setting from its published points."""
     runs = together([drive(mode4_radio(setting), setting, seconds, seed) for seed in range(1, seeds + 1)])
-    return deviations({name: curve[::4] for name, curve in runs.curves().items()}, CURVES[setting])
+    theirs = {name: np.array(curve) for name, curve in CURVES[setting].items()}
+    return deviations({name: curve[::4] for name, curve in runs.curves().items()}, theirs)
 
 
 def test_mode_4_is_near_its_published_curves() -> None:
