@@ -18,15 +18,18 @@ from scipy import stats
 import emulator
 
 SCENARIO = Path(__file__).parent / "perception.toml"
+BETWEEN_BUILDINGS: Mapping[str, Any] = {
+    "radio.path_loss": {"kind": "dual_slope"},
+    "radio.buildings": {"path": "blocks.csv"},
+}
 RADIOS: Mapping[str, Mapping[str, Any]] = {
     "disc of 400 m": {},
-    "802.11p between buildings": {
-        "radio.path_loss": {"kind": "dual_slope"},
-        "radio.mac": {},
-        "radio.buildings": {"path": "blocks.csv"},
-    },
+    "802.11p": {**BETWEEN_BUILDINGS, "radio.mac": {}},
+    "LTE-V2X mode 4": {**BETWEEN_BUILDINGS, "radio.mac": {"kind": "lte-mode4"}},
+    "NR-V2X mode 2": {**BETWEEN_BUILDINGS, "radio.mac": {"kind": "nr-mode2"}},
 }
-COLOURS = ("#0072b2", "#d55e00")
+"""The disc, and three radios between buildings."""
+COLOURS = ("#0072b2", "#d55e00", "#cc79a7", "#e69f00")
 SETTLES_S = 1.0
 """Time until everybody has heard of everybody, which is left out."""
 
@@ -47,7 +50,7 @@ def main() -> None:
     """Simulate, print and draw."""
     parser = argparse.ArgumentParser()
     parser.add_argument("picture")
-    parser.add_argument("--losses", default="0,0.5,0.8,0.9,0.95")
+    parser.add_argument("--losses", default="0,0.5,0.8")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--duration-s", type=float, default=6.0)
     options = parser.parse_args()

@@ -130,7 +130,7 @@ async def main(node: Node) -> None:
         if node.options.get("shares", True) and (fix.time_ns // node.period_ns + station) % EVERY == 0:
             await asyncio.sleep(apart_s)
             told = Message(station, fix.time_ns, here, fix.heading_rad or 0.0, objects=seen)
-            await node.radio.broadcast(encode_cpm(told, types))
+            await node.radio.broadcast(encode_cpm(told, types), period_ms=EVERY * node.period_ns / 1e6)
 
 
 def _row(places: list[Xy]) -> list[float]:
