@@ -21,12 +21,15 @@ from numpy.typing import NDArray
 from agents.cooperative.admission import Admission
 from agents.cooperative.cmm.consensus import Share, tracked_mean
 from agents.cooperative.cmm.information import Five, Information, plain_moments
-from agents.cooperative.cmm.own_vehicle import own_vehicle
+from agents.cooperative.cmm.lane_exchange import LaneExchange
+from agents.cooperative.cmm.lane_memory import information_of, is_of_lane, kind_of_increment
+from agents.cooperative.cmm.own_vehicle import OwnVehicle, own_vehicle
 from agents.cooperative.cmm.plausibility import (
     INCREMENT_FACTOR,
     PRIOR_FACTOR,
     SELF_SHARE,
     SPREAD_GATE,
+    Belief,
     Origins,
     cut_to,
     median_belief,
@@ -35,6 +38,7 @@ from agents.cooperative.cmm.plausibility import (
     scaled_by,
     scaled_down,
     spread_limit_m,
+    trace_of,
     unless_most_disagree,
 )
 from agents.cooperative.cmm.rbpf import Observation
@@ -74,9 +78,9 @@ _SENT = struct.Struct("<5f")
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def as_sent(information: Information) -> Five:
-    """Return the five numbers of `information` with the precision in which frames carry them."""
-    a, b, d, x, y = _SENT.unpack(_SENT.pack(*information.numbers))
+def as_sent(numbers: Five) -> Five:
+    """Return five numbers with the precision in which frames carry them."""
+    a, b, d, x, y = _SENT.unpack(_SENT.pack(*numbers))
     return a, b, d, x, y
 
 
@@ -84,11 +88,6 @@ def as_sent(information: Information) -> Five:
 def _out_neighbours_by_name(heard: frozenset[str], out_neighbours: frozenset[str]) -> Mapping[str, bool]:
     """Return whether each of `heard` is one of `out_neighbours`, for as many as a frame can name."""
     return MappingProxyType({name: name in out_neighbours for name in sorted(heard)[:MAX_HEARD]})
-
-
-def _trace(information: Five) -> float:
-    """Return the trace of the matrix."""
-    return information[0] + information[2]
 
 
 def _pooled(weights: Sequence[float], priors: Sequence[Five], increments: Iterable[Five]) -> Information:
@@ -125,6 +124,8 @@ class InformationEstimator:
     ) -> None:
         self.name = short_name(node_id)
         self.own = own_vehicle(options.own_config(), lanes, rng)
+        self.period_s = period_ns / NS_PER_S
+        self._lanes = LaneExchange(self.own, self.period_s) if isinstance(self.own, OwnVehicle) else None
         self._admission = Admission(self.name, period_ns, decode)
         self.consensus = mean_consensus(options, self.name, self.rejected)
         self.fused_m = self.own.estimate_m
@@ -136,7 +137,6 @@ class InformationEstimator:
         self._node_id = node_id
         self._options = options
         self._period_ns = period_ns
-        self.period_s = period_ns / NS_PER_S
         self.rng = rng
         self._rule = FusionRule(options, rng)
         self._origins = Origins()
@@ -146,7 +146,7 @@ class InformationEstimator:
         self._contradicted = 0
         self._prior_shares: list[float] = []  # of the frames of this period
         self._used_shares: list[float] = []  # of their increments
-        self._prior = as_sent(self.own.prior)
+        self._prior = as_sent(self.own.prior.numbers)
         self._increment: Five = _NOTHING
         self._largest_increment = 0.0
         self._code = int(self.name, 16)
@@ -196,13 +196,14 @@ class InformationEstimator:
             return
         dt_s, self._now_ns = (own.time_ns - self._now_ns) / NS_PER_S, own.time_ns
         fix = Observation(own.position_m, own.covariance_m2, own.heading_rad) if usable(own) else None
-        increment = as_sent(self.own.step(dt_s, fix))
+        said = self._lanes.step(dt_s, fix) if self._lanes else self.own.step(dt_s, fix).numbers
+        increment = as_sent(said)
         largest = max(map(abs, increment))
         if largest > INCREMENT_LIMIT:
             a, b, d, x, y = (value * (INCREMENT_LIMIT / largest) for value in increment)
             increment = a, b, d, x, y
         self._increment = increment
-        self._prior = as_sent(self.own.prior)
+        self._prior = as_sent(self.own.prior.numbers)
 
     def filter(self, own: Fix) -> None:
         """Take the vehicle's own fix, if that has not been done to compose a frame."""
@@ -212,6 +213,8 @@ class InformationEstimator:
         """Do a round of consensus, and fuse, with the frames of this period."""
         own = plain_moments(*self._prior)
         frames = self._current_frames()
+        if self._lanes:
+            self._lanes.join([frame.increment for frame in frames.values()])
         self._compare(list(frames.values()), own)
         if self._begins_again([frame.prior for frame in frames.values()]):
             own, frames = plain_moments(*self._prior), {}  # the new belief is what they know
@@ -231,9 +234,44 @@ class InformationEstimator:
         passed = self._passed_on(heard, weights[1:])
         self.imported = len(heard) + len(passed)
         self._passing.use([passed_record(self._code, self._increment), *[frame.record for frame in heard]])
-        if self.imported:
-            self.own.absorb(_pooled(weights, limited, [*increments, *passed]))
+        self._absorb(weights, limited, increments, passed)
         self.fused_m = self.own.estimate_m
+
+    def _absorb(
+        self, weights: Sequence[float], priors: Sequence[Five], now: Sequence[Five], before: Sequence[Five]
+    ) -> None:
+        """Replace what is known of c by pooled `priors`, and increments of this period and the one before."""
+        about_c = [increment for increment in (*now, *before) if not is_of_lane(increment)]
+        if not (self._lanes and self._lanes.has_joined):
+            if self.imported:
+                self.own.absorb(_pooled(weights, priors, about_c))
+            return
+        if not self.imported and not is_of_lane(self._increment):
+            self._lanes.follow_own()
+            return
+        pooled = _pooled(weights, priors, about_c)
+        now, before = [each for each in now if is_of_lane(each)], [each for each in before if is_of_lane(each)]
+        others = (1 - weights[0]) / (1 - SELF_SHARE)
+        self.own.absorb(self._lanes.fuse(pooled, now, before, len(weights) - 1, others))
+
+    def _used_share(
+        self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, is_before: bool
+    ) -> list[float]:
+        """Return the share (n,) of each increment (n,) of `codes` that is used; `belief` is the one about c."""
+        now_s, said = self._now_ns / NS_PER_S, [information_of(each) for each in increments]
+        if not (self._lanes and self._lanes.has_joined):
+            return self._origins.shares(codes, said, belief, now_s)
+        used = [0.0 if any(each) else 1.0 for each in said]
+        by_kind: dict[int, list[int]] = {}
+        for row, increment in enumerate(increments):
+            if self._lanes.follow(increment):
+                by_kind.setdefault(kind_of_increment(increment), []).append(row)
+        for kind, rows in by_kind.items():
+            about = self._lanes.news(kind, is_before) if kind else belief
+            shares = self._origins.shares([codes[row] for row in rows], [said[row] for row in rows], about, now_s)
+            for row, share in zip(rows, shares, strict=True):
+                used[row] = share
+        return used
 
     def _current_frames(self) -> dict[str, InformationFrame]:
         """Take the frames of this period, by sender: what one says is of one instant, fused then or never."""
@@ -261,7 +299,7 @@ class InformationEstimator:
         self._prior_shares = prior_shares([frame.moments for frame in heard], own)
         codes, increments = [frame.code for frame in heard], [frame.increment for frame in heard]
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
-        used = self._origins.shares(codes, increments, belief, self._now_ns / NS_PER_S)
+        used = self._used_share(codes, increments, belief, False)
         self._used_shares = unless_most_disagree(used)
         if min(self._prior_shares) < 1 or min(self._used_shares) < 1:
             self._reject("prior", sum(share < COUNTED_SHARE for share in self._prior_shares))
@@ -286,10 +324,16 @@ class InformationEstimator:
             return False
         self._contradicted = 0
         self._origins = Origins()
-        self.own.restart(median_belief(priors))
-        self._prior, self._increment = as_sent(self.own.prior), _NOTHING
+        self.restart(median_belief(priors))
+        self._prior, self._increment = as_sent(self.own.prior.numbers), _NOTHING
         self._prior_shares = self._used_shares = []
         return True
+
+    def restart(self, belief: Information) -> None:
+        """Begin again with this belief about c."""
+        self.own.restart(belief)
+        if self._lanes and self._lanes.has_joined:
+            self._lanes.restart()
 
     def _moderated(
         self, frames: Sequence[InformationFrame], own: Five
@@ -329,8 +373,8 @@ class InformationEstimator:
         if frames and min(self._used_shares) < 1:
             each = zip(increments[1:], self._used_shares, strict=True)
             increments[1:] = [scaled_by(increment, share) for increment, share in each]
-        own, largest = _trace(self._increment), PRIOR_FACTOR * _trace(self._prior)
-        traces = sorted(map(_trace, increments))
+        own, largest = trace_of(self._increment), PRIOR_FACTOR * trace_of(self._prior)
+        traces = sorted(map(trace_of, increments))
         usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
         self._largest_increment = max(usual, self.own.largest_increment)
         if traces[-1] > self._largest_increment:
@@ -373,12 +417,15 @@ class InformationEstimator:
         for record, share in shares.items():
             if share < 1:
                 code, increment = passed_increment(record)
+                if self._lanes and self._lanes.has_joined and not is_of_lane(increment):
+                    continue  # c has moved since, which precise receivers see
+                part = 1.0 if is_of_lane(increment) else PASSED_SHARE
                 origins.append(code)
-                increments.append(scaled_by(increment, PASSED_SHARE * (1 - share)))
+                increments.append(scaled_by(increment, part * (1 - share)))
         if not origins or not self._options.defence:
             return increments
         x, y, p, q, r = self.own.plain_moments
-        used = self._origins.shares(origins, increments, ((x, y), (p, q, r)), self._now_ns / NS_PER_S)
+        used = self._used_share(origins, increments, ((x, y), (p, q, r)), True)
         if min(used) < 1:
             self._reject("passed", sum(share < COUNTED_SHARE for share in used))
             increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]

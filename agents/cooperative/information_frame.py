@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from agents.cooperative.cmm.consensus import Share
 from agents.cooperative.cmm.information import Five, plain_moments
+from agents.cooperative.cmm.lane_memory import KINDS, MAX_AGE, information_of, kind_of_increment
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
 from agents.cooperative.vehicle_cache import VehicleCache
 from vnet.types import Array
@@ -42,7 +43,7 @@ _HEADER = struct.Struct("<BBBBIq5f5fI3d")
 _CHECKSUM = struct.Struct("<I")
 _FINGERPRINT = struct.Struct("<5f")
 PASSED = np.dtype([("name", "<u4"), ("information", "<f2", (5,))])
-"""An increment that is passed on: its origin, and (δΛ_xx, δΛ_xy, δΛ_yy, δη_x, δη_y) with half precision."""
+"""An increment that is passed on: its origin, and its five numbers with half precision."""
 _RECORD = struct.Struct("<I5e")
 _AS_BYTES = struct.Struct(f"{_RECORD.size}s")
 
@@ -55,7 +56,8 @@ def _nothing_passed() -> NDArray[np.void]:
 class InformationFrame:
     """The contents of a frame; names are `short_name`s.
 
-    prior, increment: (5,), the matrix (xx, xy, yy) in 1/m² and the vector (x, y) in 1/m.
+    prior, increment: (5,), the matrix (xx, xy, yy) in 1/m² and the vector (x, y) in 1/m; the increment of a vehicle
+    on a lane as in `lane_memory`.
     heard: the names of the vehicles received lately; true for out-neighbours, which are given a share.
     passed: (n,) records of `PASSED`, increments of the period before the frame's.
     largest_degree: the largest number of neighbours of any vehicle, as far as this one knows.
@@ -99,6 +101,16 @@ class InformationFrame:
         return plain_moments(*self.prior)
 
     @cached_property
+    def kind(self) -> int:
+        """The increment's kind."""
+        return kind_of_increment(self.increment)
+
+    @cached_property
+    def said(self) -> Five:
+        """The increment as information."""
+        return information_of(self.increment)
+
+    @cached_property
     def record(self) -> bytes:
         """The increment as a record of `PASSED`."""
         return passed_record(self.code, self.increment)
@@ -124,7 +136,7 @@ def _fingerprint(name: str, increment: Five) -> bytes:
 
     An increment of 0, of an outlier, has no noise; to send it again under another name does no harm.
     """
-    return _FINGERPRINT.pack(*increment) if any(increment) else name.encode()
+    return _FINGERPRINT.pack(*increment) if any(information_of(increment)) else name.encode()
 
 
 def passed_record(code: int, increment: Five) -> bytes:
@@ -222,6 +234,8 @@ def decode(payload: bytes) -> InformationFrame:
         out_neighbours=out_neighbours,
         names_heard=names_heard,
         share=Share(epoch, running_sum, out_neighbours, names_heard),
+        kind=kind_of_increment(frame.increment),
+        said=information_of(frame.increment),
         record=passed_record(name, frame.increment),
         passed_records=records,
         fingerprint=_fingerprint(frame.name, frame.increment),
@@ -239,8 +253,7 @@ def _check(prior: Five, increment: list[float], running_sum: tuple[float, float,
     determinant = a * d - b * b
     if not (a > 0 and d > 0 and determinant > 1e-6 * a * d):
         raise FrameError("covariance")
-    if not _is_semidefinite(*increment[:3]):
-        raise FrameError("covariance")
+    _check_increment(increment)
     if max(map(abs, increment)) > INCREMENT_LIMIT:
         raise FrameError("absurd")
     mean_m = abs(d * x - b * y) / determinant, abs(a * y - b * x) / determinant
@@ -257,9 +270,18 @@ def passed_increment(record: bytes) -> tuple[int, Five]:
     code, a, b, d, x, y = _RECORD.unpack(record)
     if not math.isfinite(a + b + d + x + y):
         raise FrameError("not_finite")
-    if not _is_semidefinite(a, b, d):
-        raise FrameError("covariance")
+    _check_increment((a, b, d, x, y))
     return code, _semidefinite(a, b, d, x, y)
+
+
+def _check_increment(increment: Sequence[float]) -> None:
+    """Raise FrameError for an increment that cannot be: about c `covariance`, of a lane `absurd`."""
+    a, b, d, _, age = increment
+    if d >= 0:
+        if not _is_semidefinite(a, b, d):
+            raise FrameError("covariance")
+    elif not (d == round(d) >= -KINDS and -1 <= age <= MAX_AGE and a * a + b * b <= INCREMENT_LIMIT):
+        raise FrameError("absurd")
 
 
 def _is_semidefinite(a: float, b: float, d: float) -> bool:
@@ -270,4 +292,6 @@ def _is_semidefinite(a: float, b: float, d: float) -> bool:
 
 def _semidefinite(a: float, b: float, d: float, x: float, y: float) -> Five:
     """Return an increment without what rounding leaves: with a negative eigenvalue it would pass all gates."""
-    return (a, b, d, x, y) if b * b <= a * d else (a, math.copysign(math.sqrt(a * d), b), d, x, y)
+    if d < 0 or b * b <= a * d:
+        return a, b, d, x, y
+    return a, math.copysign(math.sqrt(a * d), b), d, x, y

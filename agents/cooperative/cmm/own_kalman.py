@@ -47,11 +47,14 @@ class OwnKalman:
     """The filter of a vehicle on the lane through `point_m` (2,) with direction `heading_rad`.
 
     Beginning with the mean (5,) and the covariance (5, 5) of (c, l, s, v), c in east and north.
+
+    point_m, heading_rad: those of the lane.
     """
 
     def __init__(self, point_m: Array, heading_rad: float, model: LaneModel, moments: tuple[Array, Array]) -> None:
-        self._model = model
+        self.model = model
         self._steps = _Steps.of(model, 0.0)
+        self.point_m, self.heading_rad = point_m, heading_rad
         self._point_x, self._point_y = point_m.tolist()
         # To the right is (sine, −cosine), along is (cosine, sine).
         self._sine, self._cosine = math.sin(heading_rad), math.cos(heading_rad)
@@ -151,10 +154,15 @@ class OwnKalman:
 
     # A period.
 
+    def noise_across(self, noise_m2: Array) -> float:
+        """Return the variance of a fix with noise covariance (2, 2) across the lane."""
+        (xx, xy), (_, yy) = noise_m2.tolist()
+        return self._turned_into_lane(xx, xy, yy)[0]
+
     def predict(self, dt_s: float) -> None:
         """Advance by `dt_s`."""
         if dt_s != self._steps.dt_s:
-            self._steps = _Steps.of(self._model, dt_s)
+            self._steps = _Steps.of(self.model, dt_s)
         step = self._steps
         keep, stays = step.common_keep, step.lateral_keep
         (right, along), (offset, s, v) = self._common, self._own

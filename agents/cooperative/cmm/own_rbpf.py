@@ -27,6 +27,9 @@ DECIDED = 1e-4
 """Probability below which a lane is out of question."""
 COMPETING_FACTOR = 4
 """So many times the particles of the options: as lanes compete they are weighed, and not moved."""
+LEAST_NOISE_M2 = 0.25
+"""Variance (m²) of a fix at least, as long as lanes compete: with less the particles are too few, and the lanes of
+a map are metres apart."""
 SIZE_STEP = 1.5
 """Ratio by which the number of particles that is wanted must differ before it changes: each change resamples."""
 _IDENTITY = np.eye(2)
@@ -68,6 +71,7 @@ class OwnRbpf:
         self._log_weight = np.zeros(most)
         self._normalize()
         self._collapse()
+        self._said, self._is_precise = self.belief, False
 
     @property
     def _wanted(self) -> int:
@@ -145,6 +149,7 @@ class OwnRbpf:
         self._own = _product(moves, self._own)
         self._own_covariance = _product(_product(moves, self._own_covariance), moves.T) + noise
         self._collapse()
+        self._said = self.belief
 
     def take(self, fix_m: Array, noise_m2: Array, gate: float = math.inf) -> Information | None:
         """Take the vehicle's own fix (2,) with noise covariance (2, 2); return what it says about c: the increment.
@@ -152,11 +157,16 @@ class OwnRbpf:
         A fix whose squared Mahalanobis distance from what is expected is above `gate` is not taken: None.
         """
         place_m, slope, given_m2 = self._place
+        less_m2 = LEAST_NOISE_M2 - float(noise_m2.diagonal().min())
+        self._is_precise = less_m2 > 0
+        if self._is_precise:
+            noise_m2 = noise_m2 + less_m2 * _IDENTITY
         off = fix_m - self.estimate_m - place_m
         belief = self.estimate_m, self.estimate_covariance_m2
         distance, increment = _innovation(off, slope + _IDENTITY, given_m2 + noise_m2, belief)
         if distance > gate:
             return None
+        self._said = self._said.plus(increment)
         self._update(fix_m, noise_m2)
         return increment
 
@@ -180,9 +190,11 @@ class OwnRbpf:
     def absorb(self, pooled: Information) -> None:
         """Weigh the cloud by `pooled`, which is to replace the belief about c.
 
-        A cloud of several humps, one a lane, would be squeezed together if it were moved.
+        A cloud of several humps, one a lane, would be squeezed together if it were moved. With a precise receiver
+        humps are narrow, and the moments say much more after a fix than its increment does: then what is new is
+        what `pooled` says beyond the belief before the fix and the increment.
         """
-        a, b, d, x, y = pooled.minus(self.belief).numbers
+        a, b, d, x, y = pooled.minus(self._said if self._is_precise else self.belief).numbers
         c_x, c_y = self.common_m
         self._log_weight = self._log_weight + c_x * (x - 0.5 * (a * c_x) - b * c_y) + c_y * (y - 0.5 * (d * c_y))
         self._settle()

@@ -55,6 +55,7 @@ class OwnVehicle:
     """The filter of one vehicle on straight lanes.
 
     prior: what was known of c before the latest fix. largest_increment: 0, since all vehicles say alike much.
+    model: constants of the filter on a lane. took_fix: false if the latest step was without a fix that fits.
     """
 
     largest_increment = 0.0
@@ -63,7 +64,7 @@ class OwnVehicle:
         self._lanes = lanes
         self._rng = rng
         self._particles, self._least = config.rbpf.particles, config.least_particles
-        self._model = LaneModel(
+        self.model = LaneModel(
             common_sigma_m=config.rbpf.common_sigma_m,
             common_tau_s=config.rbpf.common_tau_s,
             common_walk_m=config.rbpf.common_walk_m,
@@ -75,12 +76,19 @@ class OwnVehicle:
         start = np.array(config.rbpf.start_m), sigma_m**2 * np.eye(2)
         # On no road a vehicle keeps its place: a renewed offset would be anywhere after seconds without a fix.
         tau_s = 2 * (UNKNOWN_ALONG_M / OFF_ROAD_WALK_M) ** 2
-        unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=tau_s)
+        unknown = replace(self.model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=tau_s)
         self._unknown = unknown
         self._filter: OwnKalman | OwnRbpf = OwnKalman.start(np.zeros(2), 0.0, unknown, start)
         self._is_placed = False
         self._outliers_s = 0.0
         self.prior = self._filter.belief
+        self.took_fix = False
+
+    @property
+    def lane(self) -> OwnKalman | None:
+        """The filter on the lane that is left, None while lanes compete, or where there is none."""
+        own = self._filter
+        return own if self._is_placed and isinstance(own, OwnKalman) and own.model is self.model else None
 
     @property
     def estimate_m(self) -> Array:
@@ -114,6 +122,7 @@ class OwnVehicle:
         """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
         self._filter.predict(dt_s)
         self.prior = self._filter.belief
+        self.took_fix = False
         if fix is None:
             return NOTHING
         was_placed = self._is_placed
@@ -129,6 +138,7 @@ class OwnVehicle:
             increment = self._filter.take(fix.position_m, fix.covariance_m2)
             assert increment is not None, "without a gate each fix is taken"
         self._outliers_s = 0.0
+        self.took_fix = True
         self._go_on()
         return increment
 
@@ -160,10 +170,10 @@ class OwnVehicle:
             return
         point_m, heading_rad = self._different(lanes, expected_m)
         if len(heading_rad) == 1:
-            self._filter = OwnKalman.start(point_m[0], float(heading_rad[0]), self._model, belief)
+            self._filter = OwnKalman.start(point_m[0], float(heading_rad[0]), self.model, belief)
         else:
             found = point_m, heading_rad
-            self._filter = OwnRbpf(found, self._model, self._particles, self._rng, belief, self._least)
+            self._filter = OwnRbpf(found, self.model, self._particles, self._rng, belief, self._least)
 
     def _different(self, lanes: NDArray[np.intp], expected_m: Array) -> tuple[Array, Array]:
         """Return point and direction of those lanes that differ, the nearest first: a map may have a lane often."""

@@ -54,6 +54,7 @@ _TINY = 1e-300
 """Least squared deviation: that of an increment which says nothing is 0."""
 _NO_SUMS: Ten = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
+# An increment may be that of a lane (`lane_memory`), with a negative third number.
 # For the few dozens of a period plain numbers take less time than arrays, and are the same on each processor.
 
 
@@ -61,7 +62,7 @@ def scaled_down(information: Sequence[Five], largest_trace: float) -> list[Five]
     """Return pieces of information with traces of at most `largest_trace`; means stay."""
     scaled = []
     for numbers in information:
-        trace = numbers[0] + numbers[2]
+        trace = trace_of(numbers)
         scaled.append(numbers if trace <= largest_trace else scaled_by(numbers, largest_trace / trace))
     return scaled
 
@@ -69,12 +70,23 @@ def scaled_down(information: Sequence[Five], largest_trace: float) -> list[Five]
 def scaled_by(information: Five, factor: float) -> Five:
     """Return what says `factor` times as much."""
     a, b, d, x, y = information
+    if d < 0:
+        root = math.sqrt(factor)
+        return root * a, root * b, d, root * x, y
     return factor * a, factor * b, factor * d, factor * x, factor * y
 
 
+def trace_of(information: Five) -> float:
+    """Return the trace of the matrix."""
+    a, b, d, *_ = information
+    return a + d if d >= 0 else a * a + b * b
+
+
 def moved(information: Five, x_m: float, y_m: float) -> Five:
-    """Return a belief whose mean is off by (`x_m`, `y_m`)."""
+    """Return a belief or an increment whose mean is off by (`x_m`, `y_m`)."""
     a, b, d, x, y = information
+    if d < 0:
+        return a, b, d, x + a * x_m + b * y_m, y
     return a, b, d, x + a * x_m + b * y_m, y + b * x_m + d * y_m
 
 

@@ -1,0 +1,372 @@
+"""Increments of precise receivers on lanes, and the memory that makes them independent (MODEL 10).
+
+What a fix says about the common error c rests on what the vehicle has learned of its offset in the lane from
+earlier fixes, and so on c at that time. Since then c has moved, for all vehicles alike: said about the present c
+alone, their increments err together, and their sum claims too much (Bar-Shalom 1981).
+
+So the offset is filtered with a gain K that depends on age alone. The filter is linear in fixes, and what it makes
+of c is the same for all vehicles of that gain: its *memory* u of c, with u ← keep (u + K (c − u)). Given the way of
+c, a vehicle's innovation across its lane is c − u and white noise of its own: increments about c − u are
+independent, and add up exactly. `CommonMemory` is a Gaussian over c, its value one period before, and u of each
+*kind* of gain.
+
+An increment of a lane is written as (a_x, a_y, −kind, w, age): Λ = a aᵀ and η = a w about c − u.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+
+import numpy as np
+
+from agents.cooperative.cmm.information import Five, Information, Three, inverted, plain_moments
+from agents.cooperative.cmm.kalman_bound import LaneModel
+from vnet.types import Array
+
+FIRST_LOG_ODDS, LOG_ODDS_STEP = -14.0, 0.625
+"""Base-2 logarithm of K / (1 − K) of the first kind, and its step from kind to kind: receivers of 0.01 to 100 m."""
+SAME_NOISE = 0.7
+"""Change of the logarithm of a fix's variance up to which the filter keeps its gain."""
+KINDS = 31
+"""Number of gains: those of neighbouring kinds differ by a factor of 1.5, and either is nearly the best."""
+MAX_KINDS = 6
+"""Number of kinds that are followed at a time."""
+UNHEARD_PERIODS = 100
+"""Periods after which a kind that nobody uses is forgotten."""
+MAX_AGE = 255
+"""Age in periods from which on a memory counts as old: the beginning has been forgotten."""
+Moments = tuple[tuple[float, float], Three]
+
+
+@lru_cache(maxsize=256)
+def gains_of(kind: int, keep: float, spread_m2: float) -> tuple[float, ...]:
+    """Return the gains K of a kind at each age up to `MAX_AGE`, the last that of its steady state.
+
+    They are those of a Kalman filter of an offset with variance `spread_m2`, of which `keep` is left after a
+    period: whoever begins when memories do has the best gain from the first fix on.
+    """
+    odds = 2.0 ** (FIRST_LOG_ODDS + LOG_ODDS_STEP * (kind - 1))
+    last = odds / (1 + odds)
+    process_m2 = spread_m2 * (1 - keep * keep)
+    noise_m2 = process_m2 / (1 - keep * keep * (1 - last)) * (1 - last) / last
+    gains, variance_m2 = [], spread_m2
+    for _ in range(MAX_AGE):
+        gains.append(variance_m2 / (variance_m2 + noise_m2))
+        variance_m2 = keep * keep * (1 - gains[-1]) * variance_m2 + process_m2
+    return *gains, last
+
+
+def kind_of(gain: float) -> int:
+    """Return the kind with the nearest gain, 1 … `KINDS`."""
+    log_odds = math.log2(gain / (1 - gain))
+    return min(max(1 + round((log_odds - FIRST_LOG_ODDS) / LOG_ODDS_STEP), 1), KINDS)
+
+
+def is_of_lane(increment: Five) -> bool:
+    """Tell whether an increment is one of a lane, about c − u, and not about c."""
+    return increment[2] < 0
+
+
+def kind_of_increment(increment: Five) -> int:
+    """Return the kind of an increment, 0 if it is about c."""
+    return round(-increment[2]) if increment[2] < 0 else 0
+
+
+def information_of(increment: Five) -> Five:
+    """Return Λ (xx, xy, yy) and η (x, y) of an increment."""
+    if increment[2] >= 0:
+        return increment
+    a_x, a_y, _, w, _ = increment
+    return a_x * a_x, a_x * a_y, a_y * a_y, a_x * w, a_y * w
+
+
+class LaneFilter:
+    """The filter of the offset in one lane with a constant gain, and of what it makes of c.
+
+    kind: that of its gain. increment: what the latest fix says, as it is sent.
+    """
+
+    def __init__(
+        self, heading_rad: float, point_m: Array, model: LaneModel, noise_m2: Array, period_s: float
+    ) -> None:
+        self._normal = math.sin(heading_rad), -math.cos(heading_rad)
+        self._at_m = self._across(point_m)
+        moves, noise = float(model.transition(period_s)[0, 0]), float(model.process_noise(period_s)[0, 0])
+        self._keep, self._process_m2, self._spread_m2 = moves, noise, model.lateral_sigma_m**2
+        self._noise_m2 = self.noise_across(noise_m2)
+        self.kind = kind_of(_best_gain(moves, noise, self._noise_m2))
+        self._gains = gains_of(self.kind, moves, self._spread_m2)
+        self._offset_m, self._variance_m2 = 0.0, math.inf
+
+    def differs(self, noise_m2: Array) -> bool:
+        """Tell whether fixes are now so much noisier, or less noisy, that another gain is better."""
+        return abs(math.log(self.noise_across(noise_m2) / self._noise_m2)) > SAME_NOISE
+
+    def _across(self, point_m: Array) -> float:
+        x, y = point_m.tolist()
+        return float(self._normal[0] * x + self._normal[1] * y)
+
+    def noise_across(self, noise_m2: Array) -> float:
+        """Return the variance of a fix across the lane."""
+        (xx, xy), (_, yy) = noise_m2.tolist()
+        return self._squared((xx, xy, yy))
+
+    def _squared(self, matrix: Three) -> float:
+        (x, y), (xx, xy, yy) = self._normal, matrix
+        return max(x * x * xx + 2 * x * y * xy + y * y * yy, 1e-8)
+
+    def begin(self, memory: Moments) -> None:
+        """Begin with an unknown offset, if that is more than the filter knows.
+
+        `memory` is the mean and the covariance of u: the filter's own begins there, whenever others' began.
+        """
+        (x, y), covariance_m2 = memory
+        variance_m2 = self._spread_m2 + self._squared(covariance_m2)
+        if variance_m2 < self._variance_m2:
+            self._offset_m = self._normal[0] * x + self._normal[1] * y
+            self._variance_m2 = variance_m2
+
+    def take(self, fix_m: Array, age: int) -> Five:
+        """Take a fix (2,); return its increment.
+
+        As long as the filter knows less than in its steady state its errors last: they count once, in parts.
+        """
+        off_m, gain = self._across(fix_m) - self._at_m - self._offset_m, self._gains[age]
+        # With this gain a filter of so many periods would know as much.
+        expected_m2 = gain / (1 - gain) * self._noise_m2
+        share = min(1.0, expected_m2 / self._variance_m2)
+        root = math.sqrt(share / (self._variance_m2 + self._noise_m2))
+        self._offset_m += gain * off_m
+        self._variance_m2 = (1 - gain) ** 2 * self._variance_m2 + gain * gain * self._noise_m2
+        x, y = self._normal
+        return x * root, y * root, -float(self.kind), off_m * root, float(age)
+
+    def miss(self, news: Moments, age: int) -> None:
+        """Go on without a fix: `news` are the mean and the covariance of c − u, which all others have taken."""
+        (x, y), covariance_m2 = news
+        gain = self._gains[age]
+        self._offset_m += gain * (self._normal[0] * x + self._normal[1] * y)
+        self._variance_m2 += gain * gain * self._squared(covariance_m2)
+
+    def predict(self) -> None:
+        """Advance by a period."""
+        self._offset_m *= self._keep
+        self._variance_m2 = self._keep**2 * self._variance_m2 + self._process_m2
+
+
+@lru_cache(maxsize=256)
+def _best_gain(keep: float, process_m2: float, noise_m2: float) -> float:
+    """Return the gain of the stationary Kalman filter of a Gauss-Markov process: P = keep² P R / (P + R) + Q."""
+    b = noise_m2 * (1 - keep * keep) - process_m2
+    p = (math.sqrt(b * b + 4 * process_m2 * noise_m2) - b) / 2
+    return min(max(p / (p + noise_m2), 1e-9), 1 - 1e-9)
+
+
+class CommonMemory:
+    """A Gaussian over c, c one period before, and the memories u of c of some kinds (east and north of each).
+
+    age: number of periods since the memories began, `MAX_AGE` at most.
+    """
+
+    def __init__(self, model: LaneModel, period_s: float, age: int = 0) -> None:
+        self._keep_c, self._more_m2 = model.common_step(period_s)
+        self._keep = float(model.transition(period_s)[0, 0])
+        self._start_m2 = model.common_sigma_m**2
+        self._spread_m2 = model.lateral_sigma_m**2
+        self.age = age
+        self._kinds: dict[int, int] = {}  # each kind's first row
+        self._unheard: dict[int, int] = {}
+        self._mean = np.zeros(4)
+        self._covariance = self._start_m2 * np.array(
+            [[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]]
+        )
+
+    # Kinds.
+
+    def follow(self, kind: int, is_own: bool = False) -> bool:
+        """Follow a kind from now on; returns false if there are too many, unless it is the vehicle's own."""
+        if kind in self._kinds:
+            self._unheard[kind] = 0
+            return True
+        if len(self._kinds) >= MAX_KINDS and not is_own:
+            return False
+        self._unheard[kind] = 0
+        common = self._keep_c, self._more_m2, self._start_m2
+        by_c, by_before, own_m2 = _memory_given_c(self._gains(kind)[: self.age], self._keep, common)
+        mean, covariance = self._mean, self._covariance
+        count = len(mean)
+        rows = by_c * covariance[:2] + by_before * covariance[2:4]
+        larger = np.empty((count + 2, count + 2))
+        larger[:count, :count] = covariance
+        larger[count:, :count], larger[:count, count:] = rows, rows.T
+        larger[count:, count:] = by_c * rows[:, :2] + by_before * rows[:, 2:4] + own_m2 * np.eye(2)
+        self._mean = np.concatenate([mean, by_c * mean[:2] + by_before * mean[2:4]])
+        self._covariance = larger
+        self._kinds[kind] = count
+        return True
+
+    def _gains(self, kind: int) -> tuple[float, ...]:
+        return gains_of(kind, self._keep, self._spread_m2)
+
+    def _forget(self) -> None:
+        old = [kind for kind, periods in self._unheard.items() if periods > UNHEARD_PERIODS]
+        if not old:
+            return
+        kept = [0, 1, 2, 3]
+        rows, self._kinds = self._kinds, {}
+        for kind, row in rows.items():
+            if kind in old:
+                del self._unheard[kind]
+            else:
+                self._kinds[kind] = len(kept)
+                kept += [row, row + 1]
+        self._mean, self._covariance = self._mean[kept], self._covariance[np.ix_(kept, kept)]
+
+    # Time.
+
+    def predict(self) -> None:
+        """Advance by a period."""
+        for kind in self._unheard:
+            self._unheard[kind] += 1
+        self._forget()
+        mean, covariance, keep, kinds = self._mean, self._covariance, self._keep_c, len(self._kinds)
+        if kinds:
+            gains = np.array([self._gains(kind)[self.age] for kind in self._kinds]).repeat(2)
+            stays, takes = self._keep * (1 - gains), self._keep * gains
+            mean[4:] = stays * mean[4:] + takes * np.tile(mean[:2], kinds)
+            stays, takes = stays[:, None], takes[:, None]
+            covariance[4:] = stays * covariance[4:] + takes * np.tile(covariance[:2], (kinds, 1))
+            columns = stays.T * covariance[:, 4:] + takes.T * np.tile(covariance[:, :2], (1, kinds))
+            covariance[:, 4:] = columns
+        mean[2:4] = mean[:2]
+        covariance[2:4] = covariance[:2]
+        covariance[:, 2:4] = covariance[:, :2]
+        mean[:2] *= keep
+        covariance[:2] *= keep
+        covariance[:, :2] *= keep
+        covariance[0, 0] += self._more_m2
+        covariance[1, 1] += self._more_m2
+        self.age = min(self.age + 1, MAX_AGE)
+
+    # What is known.
+
+    @property
+    def common(self) -> Moments:
+        """Mean and covariance of c."""
+        (xx, xy), (_, yy) = self._covariance[:2, :2].tolist()
+        x, y = self._mean[:2].tolist()
+        return (x, y), (xx, xy, yy)
+
+    def memory(self, kind: int) -> Moments:
+        """Return the mean and the covariance of u of a kind that is followed."""
+        row = self._kinds[kind]
+        (xx, xy), (_, yy) = self._covariance[row : row + 2, row : row + 2].tolist()
+        x, y = self._mean[row : row + 2].tolist()
+        return (x, y), (xx, xy, yy)
+
+    def _of_news(self, kind: int, is_before: bool) -> tuple[int, float, int, float]:
+        """Return rows and factors that make c − u of a kind, of this period or of the one before."""
+        row = self._kinds[kind]
+        if not is_before:
+            return 0, 1.0, row, -1.0
+        stays = 1 - self._gains(kind)[max(self.age - 1, 0)]
+        return 2, 1 / stays, row, -1 / (stays * self._keep)
+
+    def news(self, kind: int, is_before: bool = False) -> Moments:
+        """Return the mean and the covariance of c − u of a kind that is followed, before the period's fix."""
+        i, f, j, g = self._of_news(kind, is_before)
+        mean, covariance = self._mean, self._covariance
+        (m_x, m_y), (u_x, u_y) = mean[i : i + 2].tolist(), mean[j : j + 2].tolist()
+        (cxx, cxy), (_, cyy) = covariance[i : i + 2, i : i + 2].tolist()
+        (dxx, dxy), (dyx, dyy) = covariance[i : i + 2, j : j + 2].tolist()
+        (uxx, uxy), (_, uyy) = covariance[j : j + 2, j : j + 2].tolist()
+        return (f * m_x + g * u_x, f * m_y + g * u_y), (
+            f * f * cxx + 2 * f * g * dxx + g * g * uxx,
+            f * f * cxy + f * g * (dxy + dyx) + g * g * uxy,
+            f * f * cyy + 2 * f * g * dyy + g * g * uyy,
+        )
+
+    def take(self, kind: int, information: Five, is_before: bool = False) -> None:
+        """Take information about c − u of a kind that is followed."""
+        i, f, j, g = self._of_news(kind, is_before)
+        (d_x, d_y), (s_xx, s_xy, s_yy) = self.news(kind, is_before)
+        a, b, d, x, y = information
+        # With T = Λ: G = (I + T S)⁻¹ T, and the mean moves by P Hᵀ (I + T S)⁻¹ (η − T d).
+        m_xx, m_xy = 1 + a * s_xx + b * s_xy, a * s_xy + b * s_yy
+        m_yx, m_yy = b * s_xx + d * s_xy, 1 + b * s_xy + d * s_yy
+        determinant = m_xx * m_yy - m_xy * m_yx
+        x, y = x - a * d_x - b * d_y, y - b * d_x - d * d_y
+        x, y = (m_yy * x - m_xy * y) / determinant, (m_xx * y - m_yx * x) / determinant
+        g_xx, g_xy, g_yy = (
+            (m_yy * a - m_xy * b) / determinant,
+            (m_yy * b - m_xy * d) / determinant,
+            (m_xx * d - m_yx * b) / determinant,
+        )
+        covariance = self._covariance
+        p = f * covariance[i : i + 2] + g * covariance[j : j + 2]
+        self._mean += x * p[0] + y * p[1]
+        self._covariance = covariance - _quadratic(p, g_xx, g_xy, g_yy)
+
+    def absorb(self, belief: Information) -> None:
+        """Replace what is known of c: what is known of all else given c stays."""
+        x, y, p_xx, p_xy, p_yy = plain_moments(*belief.numbers)
+        (c_x, c_y), (s_xx, s_xy, s_yy) = self.common
+        a, b, d = inverted(s_xx, s_xy, s_yy)
+        covariance = self._covariance
+        slope_x = a * covariance[0] + b * covariance[1]
+        slope_y = b * covariance[0] + d * covariance[1]
+        self._mean += (x - c_x) * slope_x + (y - c_y) * slope_y
+        slopes = np.stack([slope_x, slope_y])
+        self._covariance = covariance + _quadratic(slopes, p_xx - s_xx, p_xy - s_xy, p_yy - s_yy)
+
+    def fuse(self, pooled: Information, before: Mapping[int, Five], now: Mapping[int, Five]) -> Information:
+        """Replace what is known of c by `pooled`, and take information of the last period and of this, by kind."""
+        self.absorb(pooled)
+        for is_before, each in ((True, before), (False, now)):
+            for kind, information in each.items():
+                self.take(kind, information, is_before)
+        (x, y), covariance_m2 = self.common
+        a, b, d = inverted(*covariance_m2)
+        return Information((a, b, d, a * x + b * y, b * x + d * y))
+
+
+def _quadratic(rows: Array, xx: float, xy: float, yy: float) -> Array:
+    """Return Rᵀ M R of rows (2, n) and a symmetric matrix (xx, xy, yy), without BLAS."""
+    first, second = rows
+    left, right = xx * first + xy * second, xy * first + yy * second
+    whole = first[:, None] * left + second[:, None] * right
+    return np.asarray((whole + whole.T) / 2)
+
+
+@lru_cache(maxsize=1024)
+def _memory_given_c(
+    gains: tuple[float, ...], keep: float, common: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Return u's regression on c and on c one period before, and its variance given both, after periods of `gains`.
+
+    `common` has the factor of c in a period, the variance that it adds, and that of c at the beginning.
+    """
+    keep_c, more_m2, start_m2 = common
+    cc, cu, uu, bb, bc, ub = start_m2, 0.0, 0.0, start_m2, start_m2, 0.0
+    for gain in gains:
+        stays, takes = keep * (1 - gain), keep * gain
+        bb, bc, ub = cc, keep_c * cc, stays * cu + takes * cc
+        uu = stays * stays * uu + 2 * stays * takes * cu + takes * takes * cc
+        cu = keep_c * (stays * cu + takes * cc)
+        cc = keep_c * keep_c * cc + more_m2
+    determinant = cc * bb - bc * bc
+    if determinant <= 1e-12 * cc * bb:
+        return 0.0, 0.0, 0.0
+    by_c, by_b = (bb * cu - bc * ub) / determinant, (cc * ub - bc * cu) / determinant
+    return by_c, by_b, max(uu - by_c * cu - by_b * ub, 0.0)
+
+
+def summed(increments: Iterable[tuple[int, Five]]) -> dict[int, Five]:
+    """Return the sums of information by kind."""
+    sums: dict[int, Five] = {}
+    for kind, (a, b, d, x, y) in increments:
+        s_a, s_b, s_d, s_x, s_y = sums.get(kind, (0.0, 0.0, 0.0, 0.0, 0.0))
+        sums[kind] = s_a + a, s_b + b, s_d + d, s_x + x, s_y + y
+    return sums
