@@ -254,7 +254,7 @@ class InformationEstimator:
         others = (1 - weights[0]) / (1 - SELF_SHARE)
         self.own.absorb(self._lanes.fuse(pooled, now, before, len(weights) - 1, others))
 
-    def _used_share(
+    def _shares_used(
         self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, is_before: bool
     ) -> list[float]:
         """Return the share (n,) of each increment (n,) of `codes` that is used; `belief` is the one about c."""
@@ -299,7 +299,7 @@ class InformationEstimator:
         self._prior_shares = prior_shares([frame.moments for frame in heard], own)
         codes, increments = [frame.code for frame in heard], [frame.increment for frame in heard]
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
-        used = self._used_share(codes, increments, belief, False)
+        used = self._shares_used(codes, increments, belief, False)
         self._used_shares = unless_most_disagree(used)
         if min(self._prior_shares) < 1 or min(self._used_shares) < 1:
             self._reject("prior", sum(share < COUNTED_SHARE for share in self._prior_shares))
@@ -425,7 +425,7 @@ class InformationEstimator:
         if not origins or not self._options.defence:
             return increments
         x, y, p, q, r = self.own.plain_moments
-        used = self._used_share(origins, increments, ((x, y), (p, q, r)), True)
+        used = self._shares_used(origins, increments, ((x, y), (p, q, r)), True)
         if min(used) < 1:
             self._reject("passed", sum(share < COUNTED_SHARE for share in used))
             increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]

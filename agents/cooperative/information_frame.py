@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from agents.cooperative.cmm.consensus import Share
 from agents.cooperative.cmm.information import Five, plain_moments
-from agents.cooperative.cmm.lane_memory import KINDS, MAX_AGE, information_of, kind_of_increment
+from agents.cooperative.cmm.lane_memory import KINDS, MAX_AGE, information_of
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
 from agents.cooperative.vehicle_cache import VehicleCache
 from vnet.types import Array
@@ -99,16 +99,6 @@ class InformationFrame:
     def moments(self) -> Five:
         """The prior's mean (x, y) in m and its covariance (xx, xy, yy) in m²."""
         return plain_moments(*self.prior)
-
-    @cached_property
-    def kind(self) -> int:
-        """The increment's kind."""
-        return kind_of_increment(self.increment)
-
-    @cached_property
-    def said(self) -> Five:
-        """The increment as information."""
-        return information_of(self.increment)
 
     @cached_property
     def record(self) -> bytes:
@@ -234,8 +224,6 @@ def decode(payload: bytes) -> InformationFrame:
         out_neighbours=out_neighbours,
         names_heard=names_heard,
         share=Share(epoch, running_sum, out_neighbours, names_heard),
-        kind=kind_of_increment(frame.increment),
-        said=information_of(frame.increment),
         record=passed_record(name, frame.increment),
         passed_records=records,
         fingerprint=_fingerprint(frame.name, frame.increment),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from benchmarks.cv2x.highway import (
     published,
     together,
 )
+from emulator.scenario.scenario import Radio
 
 LIMITS = {"lte": 2.5, "nr": 3.0, "80211p": 5.0}
 """Largest deviations, in percentage points."""
@@ -53,8 +55,7 @@ def main() -> int:
     return int(broken)
 
 
-def _runs(options: argparse.Namespace, radio_of: object, setting: Setting) -> Measured:
-    assert callable(radio_of)
+def _runs(options: argparse.Namespace, radio_of: Callable[[Setting], Radio], setting: Setting) -> Measured:
     seeds = range(1, options.seeds + 1)
     return together([drive(radio_of(setting), setting, options.seconds, seed) for seed in seeds])
 

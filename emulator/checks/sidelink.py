@@ -30,16 +30,16 @@ def broken_rules(recorded: RecordedRun, mac: Sidelink) -> dict[str, NDArray[np.i
     earliest_ns = (recorded.sent_ns[rows] // mac.slot_ns + mac.t1_slots) * mac.slot_ns
     frames = rows[np.unique(recorded.emission[rows], return_index=True)[1]]
     node, slot = _occupied(recorded, mac, frames)
-    key, times = np.unique(slot * len(recorded.node_ids) + node, return_counts=True)
-    mine = [each * len(recorded.node_ids) + recorded.sender[rows] for each in _slots(recorded, mac, rows)]
-    theirs = [each * len(recorded.node_ids) + recorded.receiver[rows] for each in _slots(recorded, mac, rows)]
-    deaf = np.logical_and.reduce([np.isin(each, key) for each in theirs])
+    count, slots = len(recorded.node_ids), _slots(recorded, mac, rows)
+    key, times = np.unique(slot * count + node, return_counts=True)
+    deaf = np.logical_and.reduce([np.isin(each * count + recorded.receiver[rows], key) for each in slots])
+    twice = [np.isin(each * count + recorded.sender[rows], key[times > 1]) for each in slots]
     outcome_deaf = recorded.outcome_is("half_duplex")[rows]
     judged = recorded.outcome_is(*ON_AIR)[rows]
     return {
         "unaligned": rows[unaligned],
         "too_soon": rows[begin_ns < earliest_ns],
-        "twice": rows[np.logical_or.reduce([np.isin(each, key[times > 1]) for each in mine])],
+        "twice": rows[np.logical_or.reduce(twice)],
         "heard_while_sending": rows[judged & deaf & ~outcome_deaf],
         "deaf_without_sending": rows[outcome_deaf & ~deaf],
         "wrongly_detected": _wrongly_detected(recorded, mac, rows[judged & ~outcome_deaf]),

@@ -29,27 +29,9 @@ if TYPE_CHECKING:  # an extra, and slow to import: those who draw nothing do wit
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-(
-    INK,
-    QUIET,
-    LINE,
-    GRID,
-    PAPER,
-    BLUE,
-    ORANGE,
-    GREEN,
-    RED,
-    PURPLE,
-    SKY,
-    YELLOW,
-    GREY,
-    SAND,
-    RUST,
-    NAVY,
-    PLUM,
-    TEAL,
-    SLATE,
-) = (colour.light for colour in PALETTE.values())
+INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GREY, SAND, RUST, NAVY, *_ = (
+    colour.light for colour in PALETTE.values()
+)
 _VARIABLE = {colour.light: f"var(--{name})" for name, colour in PALETTE.items()}
 
 WIDTH_PX, PLOT_PX = 400, 190

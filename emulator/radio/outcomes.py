@@ -35,7 +35,7 @@ def _always(scenario: Scenario, vehicles: int) -> bool:
     return True
 
 
-def _has_grid(scenario: Scenario) -> bool:
+def _has_grid(scenario: Scenario, vehicles: int) -> bool:
     return scenario.radio.sidelink is not None
 
 
@@ -173,7 +173,7 @@ class Outcome(IntEnum):
             stage=Stage.RECEPTION,
             colour="yellow",
             sign="▩",
-            is_possible=lambda scenario, vehicles: scenario.radio.mac is not None and not _has_grid(scenario),
+            is_possible=lambda scenario, vehicles: bool(scenario.radio.mac and not scenario.radio.sidelink),
         ),
     )
     half_duplex = (
@@ -183,7 +183,7 @@ class Outcome(IntEnum):
             stage=Stage.RECEPTION,
             colour="plum",
             sign="▘",
-            is_possible=lambda scenario, vehicles: _has_grid(scenario),
+            is_possible=_has_grid,
         ),
     )
     below_sensing = (
@@ -193,7 +193,7 @@ class Outcome(IntEnum):
             stage=Stage.RECEPTION,
             colour="teal",
             sign="▝",
-            is_possible=lambda scenario, vehicles: _has_grid(scenario),
+            is_possible=_has_grid,
         ),
     )
     no_grant = (
@@ -203,7 +203,7 @@ class Outcome(IntEnum):
             stage=Stage.SENDER,
             colour="slate",
             sign="▖",
-            is_possible=lambda scenario, vehicles: _has_grid(scenario),
+            is_possible=_has_grid,
         ),
     )
 

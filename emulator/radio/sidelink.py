@@ -214,7 +214,7 @@ class Sidelink(Mac):
         frame, slot = sent.frame, self._now_ns // self._slot_ns
         station.coming -= 1
         station.sent_ns.append(frame.sent_ns)
-        length = -(-max(frame.size_bytes, 1) // self._mac.subchannel_bytes)
+        length = self._link.length(frame.size_bytes)
         told = frame.period_ms * NS_PER_MS // self._slot_ns
         grant = station.grant
         if grant is not None and (grant.length < length or (told and told != grant.period)):
@@ -259,8 +259,7 @@ class Sidelink(Mac):
     def _reserve(self, station: _Station, slot: int) -> None:
         """Select a resource in `slot` for the frames that wait, and for those to come."""
         frame = station.queue[0][1].frame
-        largest = max(sent.frame.size_bytes for _, sent in station.queue)
-        length = -(-max(largest, 1) // self._mac.subchannel_bytes)
+        length = self._link.length(max(sent.frame.size_bytes for _, sent in station.queue))
         period = self._period(station, frame)
         counter = self._counter(frame, period)
         last = slot + max(self._mac.t1_slots, min(self._t2_slots, period))

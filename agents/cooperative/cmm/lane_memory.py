@@ -83,9 +83,9 @@ def information_of(increment: Five) -> Five:
 
 
 class LaneFilter:
-    """The filter of the offset in one lane with a constant gain, and of what it makes of c.
+    """The filter of the offset in one lane with gains that depend on age alone, and of what it makes of c.
 
-    kind: that of its gain. increment: what the latest fix says, as it is sent.
+    kind: that of its gains.
     """
 
     def __init__(

@@ -28,7 +28,7 @@ from emulator.drivers.launch import Exit, Launcher
 from emulator.drivers.live.gateway import Gateway, session_environment
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
-from emulator.scenario.program import PYTHON
+from emulator.scenario.program import FILLED_IN, PYTHON
 from vnet.errors import ProgramError, VnetError, first_names, shown
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
 from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY
@@ -333,7 +333,7 @@ class Gateways:
         environment |= {STARTED_BY_VNET: "1", "PYTHONUNBUFFERED": "1"}
         if self._ros2 is not None:
             environment["ROS_DOMAIN_ID"] = str(self._ros2.domain)
-        filled = {"{id}": node, "{endpoint}": endpoint, "{port}": endpoint.rpartition(":")[2]}
+        filled = dict(zip(FILLED_IN, (node, endpoint, endpoint.rpartition(":")[2]), strict=True))
         try:
             for number, words in enumerate(commands, start=1):
                 name = node if number == 1 else f"{node}~{number}"
