@@ -43,7 +43,8 @@ class Network:
 
     def __init__(self) -> None:
         patient = {"drop": {"wait_before_drop": 10_000_000}}  # in µs: a slow machine loses nothing
-        transport = {"link": {"tx": {"queue": {"congestion_control": patient}}}}
+        transport: dict[str, Any] = {"link": {"tx": {"queue": {"congestion_control": patient}}}}
+        transport["shared_memory"] = {"enabled": False}  # its descriptors outlive sessions
         config = {
             "mode": "router",
             "transport": transport,

@@ -121,8 +121,9 @@ def _closed_at_end(session: zenoh.Session) -> Iterator[zenoh.Session]:
 
 
 def open_local_router(listen: str, settings: dict[str, Any]) -> zenoh.Session:
-    """Open a router that listens at `listen`, and seeks nobody; `settings` are added to its configuration.
+    """Open a router that listens at `listen`, and seeks nobody; `settings` are added to those of its transport.
 
+    It offers no shared memory: Zenoh keeps the segments of each connection for longer than the connection.
     The caller closes it. Raise TransportError if it cannot listen there.
     """
     config = {
@@ -130,7 +131,7 @@ def open_local_router(listen: str, settings: dict[str, Any]) -> zenoh.Session:
         "listen": {"endpoints": [listen]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
         "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
-        **settings,
+        "transport": {"shared_memory": {"enabled": False}, **settings},
     }
     return _open(config, f"cannot listen at {listen}")
 

@@ -98,6 +98,7 @@ class Gateway:
         return endpoint
 
     def _router_settings(self) -> dict[str, Any]:
+        """Return what the router's transport needs for certificates and users."""
         link: dict[str, Any] = {}
         settings = self._settings
         if settings.certificate is not None:
@@ -106,7 +107,7 @@ class Gateway:
                 "listen_private_key": str(settings.private_key),
             }
         auth = {} if settings.users is None else {"auth": {"usrpwd": {"dictionary_file": str(settings.users)}}}
-        return {"transport": {**({"link": link} if link else {}), **auth}}
+        return {**({"link": link} if link else {}), **auth}
 
     # Threads of Zenoh's.
 

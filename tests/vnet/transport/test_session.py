@@ -1,11 +1,13 @@
 """An embedded router and a client of it, on a port that the system chooses."""
 
+import gc
 import os
 import queue
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, suppress
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -14,7 +16,7 @@ from tests.support.paths import ROOT
 from vnet.errors import TransportError
 from vnet.transport import keys, session, wire
 from vnet.transport.access import Access, node_user
-from vnet.transport.session import open_client, open_router, router_endpoint
+from vnet.transport.session import open_client, open_local_router, open_router, router_endpoint
 
 LEASE_MS = 10_000
 
@@ -150,3 +152,27 @@ def test_a_client_says_how_long_it_has_waited_for_a_router() -> None:
         open_client("tcp/127.0.0.1:1", None, LEASE_MS, timeout_s=0.05),
     ):
         pass
+
+
+def segments() -> set[Path]:
+    """The segments of shared memory that this process has open."""
+    found = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):
+            found.add(descriptor.readlink())
+    return {path for path in found if path.is_relative_to("/dev/shm")}
+
+
+def test_a_local_router_keeps_no_shared_memory_of_its_programs() -> None:
+    """Those of connections that are closed added up: a process that makes many runs came to a thousand descriptors."""
+    before = segments()
+    for _ in range(3):
+        with closing(open_local_router("tcp/127.0.0.1:0", {})) as router:
+            config = zenoh.Config()
+            config.insert_json5("mode", '"client"')
+            config.insert_json5("connect/endpoints", f'["{router_endpoint(router)}"]')
+            with closing(zenoh.open(config)) as client:
+                assert list(client.info.routers_zid()) == [router.zid()]
+        del client, router
+        gc.collect()
+    assert segments() == before

@@ -65,6 +65,7 @@ def connected(endpoint: str) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    config.insert_json5("transport/shared_memory/enabled", "false")
     session = zenoh.open(config)
     try:
         yield session
