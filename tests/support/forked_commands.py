@@ -1,7 +1,7 @@
 """Commands of vnet without the second that each takes to import vnet: forks of one process that has done so.
 
-`Command([*VNET, …], …)` and `run([*VNET, …], …)` are `subprocess.Popen` and `subprocess.run` of the command. In CI
-they are nothing else, and a command is a process of its own from its first instruction on, as users start it.
+`Command([*VNET, …], …)` and `run([*VNET, …], …)` are `subprocess.Popen` and `subprocess.run` of the command. That
+one works from the first instruction of its process on is for tests/emulator/cli and tests/system/test_wheel.py.
 """
 
 import atexit
@@ -26,7 +26,7 @@ _LENGTH = 2**20
 _NUMBER = "%-20d"
 
 
-class _Forked(subprocess.Popen[str]):
+class Command(subprocess.Popen[str]):
     """A command that is forked. Its status comes over a socket: the process that waits for it is its parent."""
 
     def _execute_child(self, args: Sequence[str], *more: Any) -> None:
@@ -61,9 +61,6 @@ class _Forked(subprocess.Popen[str]):
             if pid:
                 self.returncode = os.waitstatus_to_exitcode(status)
         return self.returncode
-
-
-Command: type[subprocess.Popen[str]] = subprocess.Popen if os.environ.get("CI") else _Forked
 
 
 def run(

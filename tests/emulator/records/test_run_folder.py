@@ -127,7 +127,7 @@ event_list = st.lists(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(event_list, st.data())
 def test_events_up_to_the_cut_survive_a_cut_anywhere(
     tmp_path_factory: pytest.TempPathFactory, events: list[tuple[Any, ...]], data: st.DataObject

@@ -164,7 +164,7 @@ def segments() -> set[Path]:
 
 
 def test_a_local_router_keeps_no_shared_memory_of_its_programs() -> None:
-    """Those of connections that are closed added up: a process that makes many runs came to a thousand descriptors."""
+    """Those of closed connections added up: a process that makes many runs came to a thousand descriptors."""
     before = segments()
     for _ in range(3):
         with closing(open_local_router("tcp/127.0.0.1:0", {})) as router:
