@@ -1,8 +1,10 @@
 """Fixtures for tests of all packages."""
 
 import gc
+import re
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,10 +22,38 @@ settings.load_profile("same")
 settings.register_profile("first", settings.get_profile("same"), phases=[Phase.explicit, Phase.generate])
 
 
+SLOW_FILE = re.compile(r"^pytestmark = \[?\s*pytest\.mark\.slow\b", re.MULTILINE)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files whose tests are all slow where slow tests are not run: importing them takes half a minute."""
+    if config.option.markexpr != "not slow" or not collection_path.match("test_*.py"):
+        return None
+    return True if SLOW_FILE.search(collection_path.read_text(encoding="utf-8")) else None
+
+
 def pytest_collection_finish() -> None:
     """Keep garbage collection from looking through all tests and modules again at the end of each simulation."""
     gc.collect()
     gc.freeze()
+
+
+MOST_LEFT_OPEN = 100
+"""Descriptors that a file of tests may leave open: Zenoh and Rerun keep some until they are needed again."""
+
+
+def _open_descriptors() -> int:
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _descriptors_are_closed() -> Iterator[None]:
+    """Name the file of tests that leaves many descriptors open, of which a later one would have too many."""
+    most = _open_descriptors() + MOST_LEFT_OPEN
+    yield
+    if _open_descriptors() > most:
+        gc.collect()
+        assert _open_descriptors() <= most, f"more than {MOST_LEFT_OPEN} descriptors are left open"
 
 
 @pytest.fixture

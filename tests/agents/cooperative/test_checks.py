@@ -14,6 +14,8 @@ from emulator.records.run import Run
 from tests.emulator.checks.test_faults import simulated
 from vnet.node import Node
 
+pytestmark = pytest.mark.slow
+
 DECLARES = "agents.cooperative.declared"
 
 BLOCK = {"kind": "block", "at_s": 2.0, "duration_s": 1.0}

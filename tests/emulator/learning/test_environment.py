@@ -17,6 +17,8 @@ from emulator import Moment
 from vnet import Fix, Node, Packet
 from vnet.errors import VnetError
 
+pytestmark = pytest.mark.slow
+
 ROAD = {"road": "ring", "length_m": 1000.0, "gap_m": 40.0, "speed_mps": 10.0}
 
 
