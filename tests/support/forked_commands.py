@@ -141,10 +141,14 @@ def _become(request: dict[str, Any], standard: list[int]) -> None:
 
 if __name__ == "__main__":
     use_same_arithmetic()
+    import pyarrow
+
     import emulator.cli
     import emulator.cli.commands
     import emulator.cli.execution
     import emulator.drivers.live.processes
+
+    pyarrow.array([0])  # the first array imports pandas where it is installed, which takes as long as vnet does
 
     gc.collect()
     gc.freeze()

@@ -51,7 +51,7 @@ def frames(draw: st.DrawFn) -> CooperativeFrame:
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(frames())
 def test_a_frame_comes_back_within_its_steps(frame: CooperativeFrame) -> None:
     again = decode(encode(frame))
@@ -68,7 +68,7 @@ def test_a_frame_comes_back_within_its_steps(frame: CooperativeFrame) -> None:
         assert again.heading_rad == pytest.approx(frame.heading_rad, abs=1e-4)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.binary(max_size=300))
 def test_arbitrary_bytes_are_refused_with_a_reason(payload: bytes) -> None:
     try:
@@ -77,7 +77,7 @@ def test_arbitrary_bytes_are_refused_with_a_reason(payload: bytes) -> None:
         assert str(error) in {"length", "version", "checksum"}
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(frames(), st.data())
 def test_damaged_frames_are_refused_or_still_sane(frame: CooperativeFrame, data: st.DataObject) -> None:
     payload = bytearray(encode(frame))

@@ -76,7 +76,7 @@ def test_a_disc_holds_those_within_its_radius(seed: int, x: float, y: float, rad
 
 
 @pytest.mark.slow
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(
     seeds,
     st.lists(st.floats(0, 2 * math.pi), min_size=3, max_size=8, unique=True),

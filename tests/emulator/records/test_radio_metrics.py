@@ -163,7 +163,7 @@ def close(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(traces())
 def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.ndarray, bool]) -> None:
     rows, position_m, moves = trace

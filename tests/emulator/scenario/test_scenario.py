@@ -136,7 +136,7 @@ OPTIONS = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 2**63 - 1),
     loss=st.floats(0, 1),

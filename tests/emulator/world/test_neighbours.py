@@ -25,7 +25,7 @@ def by_brute_force(position_m: Array, range_m: float) -> tuple[list[int], list[i
     return sender.tolist(), receiver.tolist(), distance_m[near].tolist()
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.one_of(places(lattice), places(anywhere), places(far_apart)),
     st.sampled_from([1.0, 2.0, 5.0, 1e-3, 300.0, 1e5, 5e7]),

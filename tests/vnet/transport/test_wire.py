@@ -131,19 +131,19 @@ emulator_messages = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(agent_messages)
 def test_what_agents_say_comes_back(message: wire.AgentMessage) -> None:
     assert wire.decode_tx(wire.encode(message)) == message
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(emulator_messages)
 def test_what_the_emulator_says_comes_back(message: wire.EmulatorMessage) -> None:
     assert wire.decode_rx(wire.encode(message)) == message
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=200))
 def test_arbitrary_bytes_never_do_harm(data: bytes) -> None:
     for decode in (wire.decode_tx, wire.decode_rx, wire.decode_report, wire.decode_observation):
@@ -154,7 +154,7 @@ def test_arbitrary_bytes_never_do_harm(data: bytes) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(agent_messages, st.data())
 def test_damaged_messages_never_do_harm(message: wire.AgentMessage, data: st.DataObject) -> None:
     encoded = bytearray(wire.encode(message))
@@ -213,7 +213,7 @@ def test_lateness_bins_have_an_edge_at_the_limit() -> None:
     assert wire.lateness_bin(2**62) == wire.LATENESS_BINS - 1
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(emulator_messages)
 def test_batches_are_told_from_their_first_bytes(message: wire.EmulatorMessage) -> None:
     assert wire.is_batch(wire.encode(message)) == isinstance(message, wire.Batch)

@@ -20,7 +20,7 @@ def reference(offset_m: float, sigma_m: float) -> float:
     return float(log_upper + np.log1p(-np.exp(log_lower - log_upper)))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.floats(-500, 500), st.floats(0.01, 10))
 def test_it_is_the_closed_form_near_and_far(offset_m: float, sigma_m: float) -> None:
     value = log_on_lane(np.array([[offset_m]]), np.array([[sigma_m]]), HALF_WIDTH_M)[0, 0]
@@ -29,7 +29,7 @@ def test_it_is_the_closed_form_near_and_far(offset_m: float, sigma_m: float) -> 
     assert value == pytest.approx(reference(offset_m, sigma_m), rel=1e-12 if far else 0.0, abs=0.0 if far else 2e-6)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.floats(-60, 60), st.integers(-REACH * STEPS, REACH * STEPS))
 def test_the_table_is_the_normal_distribution(anywhere: float, node: int) -> None:
     """Also at the seams of the table's steps, and right before and after them."""

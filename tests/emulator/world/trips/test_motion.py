@@ -192,7 +192,7 @@ def test_real_driving_is_not_taken_for_jumps() -> None:
         assert len(rows) > 100
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(0.05, 3.0), st.floats(-300, 300)), min_size=2, max_size=40),
     st.floats(5, 100),
