@@ -23,7 +23,6 @@ DEATHS = [
     ("exits_3", "status 3", "realtime"),
     ("exits_0", "status 71", "lockstep"),
     ("exits_at_exit", "status", "realtime"),
-    ("exits_at_exit", "status", "lockstep"),
 ]
 
 

@@ -121,24 +121,6 @@ def test_a_port_in_use_is_one_line(vnet: Vnet) -> None:
     assert done.stderr.splitlines()[-1] == f"vnet: cannot listen on {endpoint}: the address is already in use"
 
 
-def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("not a folder")
-    command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(tmp_path / "file" / "run")]
-    done = run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 2  # what is going to run, and why it is not
-    assert "cannot write" in done.stderr.splitlines()[1]
-
-
-def test_another_runs_folder_is_never_written_into(vnet: Vnet, tmp_path: Path) -> None:
-    (tmp_path / "run0").mkdir()
-    (tmp_path / "run0" / "precious").write_text("data")
-    done = vnet("simulate", "scenarios/beacon.toml")
-    assert done.status == 2
-    assert "is not an empty folder" in done.stderr
-    assert [path.name for path in (tmp_path / "run0").iterdir()] == ["precious"]
-
-
 def test_a_file_that_the_disk_refuses_is_one_line_and_no_process_stays(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(folder), "--duration", "20"]
@@ -156,23 +138,6 @@ def test_a_file_that_the_disk_refuses_is_one_line_and_no_process_stays(tmp_path:
     )
     assert (folder / "metrics.parquet").is_file() and (folder / "verdict.json").is_file()
     assert running_agents(folder) == []
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("radio.los=0.1", "radio.los: unknown key"),
-        ("radio.loss=2", "radio.loss = 2"),
-        ("network.path=nowhere.csv", "network"),
-    ],
-)
-def test_a_wrong_scenario_starts_nothing(vnet: Vnet, override: str, message: str) -> None:
-    done = vnet("run", "scenarios/beacon.toml", "--set", override)
-    assert done.status == 2
-    assert done.stderr.count("\n") == 1
-    assert done.stderr.startswith("vnet: --set: "), "the option that is wrong, and not the file"
-    assert message in done.stderr
-    assert not done.folder.exists()
 
 
 def test_nodes_that_never_join_are_named(vnet: Vnet) -> None:

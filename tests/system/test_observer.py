@@ -158,22 +158,3 @@ def test_a_finished_run_is_served_until_it_is_enough(tmp_path: Path, ending: sig
         process.send_signal(ending)
         assert process.wait(TIMEOUT_S) == 0
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
-
-
-def test_there_is_nothing_to_view(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-
-    def view() -> str:
-        command = [*VNET, "view", str(folder)]
-        done = run(command, cwd=ROOT, capture_output=True, text=True)
-        assert done.returncode == 2
-        assert done.stderr.count("\n") == 1
-        return done.stderr
-
-    assert "not a run's folder" in view()
-    folder.mkdir()
-    assert "not a run's folder" in view()
-    (folder / "scenario.toml").write_text("")
-    assert "not the folder of a finished run" in view()
-    (folder / "recording.rrd").write_bytes(b"")
-    assert "not the folder of a finished run" in view()

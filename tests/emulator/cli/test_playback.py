@@ -110,6 +110,7 @@ def test_what_was_there_stays_until_the_new_one_is_whole(watched: Watched, tmp_p
         (["play", "RUN", "--from", "1", "--to", "1"], "--to 1: must come after --from 1"),
         (["play", "NOWHERE"], "not a run's folder"),
         (["render", "NOWHERE"], "not a run's folder"),
+        (["view", "NOWHERE"], "not a run's folder"),
         (["render", "RUN", "--out", "NOWHERE.rrd", "--rerun-vehicle", "v77"], "no such vehicle: v77"),
         (["render", "RUN", "--out", "NOWHERE/x.rrd"], "there is no folder"),
     ],

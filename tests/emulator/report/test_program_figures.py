@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from emulator.pages.canvas import BLUE, canvas
-from emulator.report.drawing import Line, draw_charts, time_figure
+from emulator.pages.canvas import canvas
+from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import _draw_names, classes, map_charts
 from emulator.report.program_figures import points, program_charts, text_shares, usual_periods
 from emulator.report.source import Source
@@ -120,12 +120,3 @@ def test_shares_of_texts_are_those_of_the_vehicles_that_report(source: Source) -
     shares, texts = text_shares(source, "state")
     assert texts == ["idle", "busy"]
     assert shares.tolist() == [[1.0, 0.0]] * 6 + [[0.0, 1.0]] * 4
-
-
-def test_a_legend_of_many_lines_has_a_row_for_each_three() -> None:
-    time_s = np.arange(3.0)
-    few, many = (
-        time_figure([Line(f"v{number}", time_s, time_s, BLUE) for number in range(lines)], "speed (m/s)", 2.0)
-        for lines in (3, 8)
-    )
-    assert many.figure.get_size_inches()[1] > few.figure.get_size_inches()[1]

@@ -141,15 +141,6 @@ def test_checks_that_failed_come_first(beacon: Path) -> None:
     assert first.split("Reported by the program")[0].count("valid") == 2, "the checks that are valid come later"
 
 
-def test_outcomes_over_time_say_how_many_they_are(beacon: Path) -> None:
-    attempted = RecordedRun.open(beacon).record.in_range
-    found = re.search(
-        rf"Outcomes of the {attempted:,} attempted receptions .*?: (\d+) to (\d+) a second", page_of(beacon).text
-    )
-    assert found is not None
-    assert int(found[1]) <= attempted / 2 <= int(found[2])
-
-
 def test_what_a_run_cost_is_a_table_of_its_vehicles(beacon: Path) -> None:
     page = page_of(beacon)
     cost = json.loads((beacon / "verdict.json").read_text())["cost"]
@@ -219,23 +210,11 @@ def test_a_run_that_lost_a_file_has_a_report_that_says_so(beacon: Path, lost: st
         assert "no verdict" in page.text and "No check was judged" in page.text
 
 
-def test_figures_that_need_no_metrics_are_drawn_without_them(beacon: Path) -> None:
-    (beacon / "metrics.parquet").write_bytes(b"no table")
-    page = page_of(beacon)
-    assert {"outcomes", "totals", "links", "latency", "ages", "degrees"} <= set(page.ids)
-    assert "metrics.parquet: cannot be read" in page.text
-
-
 def test_a_verdict_that_cannot_be_read_is_not_taken_for_a_run_that_goes_on(beacon: Path) -> None:
     (beacon / "verdict.json").write_text("{")
     page = page_of(beacon)
     assert "The verdict of this run cannot be read." in page.text and "still going on" not in page.text
     assert "verdict.json: not JSON" in page.text
-
-
-def test_a_folder_that_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
-    done = vnet(["report", str(tmp_path)])
-    assert done.exit_code == 2 and "not a run's folder" in done.output and done.output.count("\n") == 1
 
 
 def test_what_a_program_reports_is_a_column_of_the_index(beacon: Path) -> None:

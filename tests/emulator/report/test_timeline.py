@@ -11,7 +11,6 @@ import pytest
 from emulator.api import simulate_into
 from emulator.pages.page import render
 from emulator.records.events import Event
-from emulator.report import timeline as module
 from emulator.report.source import Source
 from emulator.report.timeline import (
     Bar,
@@ -143,14 +142,6 @@ def test_all_frames_of_one_instant_are_more_than_there_is_room_for() -> None:
     assert 0 < 10 * kept.sum() <= 200
 
 
-def test_the_first_view_is_at_the_first_failure_then_the_parting_then_the_first_fault() -> None:
-    marks, bars = [Mark(8_000_000, 1, "failure", "")], [Bar("loss-0", 4_000_000, 5_000_000, (1,))]
-    assert module._first_point(marks, bars, 6_000_000) == 8_000_000
-    assert module._first_point([], bars, 6_000_000) == 6_000_000
-    assert module._first_point([], bars, None) == 4_000_000
-    assert module._first_point([], [], None) is None
-
-
 def test_the_first_view_shows_the_slope_of_arrows_and_lies_in_the_run() -> None:
     assert first_view(8_000_000, 20_000_000, 3000) == [7_892_000, 8_072_000]
     assert first_view(None, 20_000_000, 3000) == [0, 1_000_000]
@@ -169,15 +160,6 @@ def test_a_fault_that_does_not_end_lasts_until_the_end_and_unknown_nodes_are_lef
     crash, interrupted = marks_of(events, {"v01": 0})
     assert (crash.node, crash.text) == (-1, "crashed: <b>\\x1b")
     assert (interrupted.node, interrupted.kind, interrupted.text) == (-1, "warning", "interrupted")
-
-
-def test_of_many_vehicles_those_with_failures_marks_and_faults_have_lanes_first(
-    run: Source, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bars, failure, event = [Bar("loss-0", 0, 1, (0,))], Mark(1, 2, "failure", ""), Mark(1, 3, "event", "")
-    for most, lanes in ((1, [2]), (2, [2, 3]), (3, [0, 2, 3]), (4, [0, 1, 2, 3])):
-        monkeypatch.setattr(module, "MOST_LANES", most)
-        assert module._first_lanes(run, [event, failure], bars) == lanes
 
 
 def test_the_page_holds_all_of_the_data_as_text(run: Source) -> None:

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rerun as rr
 from rerun.chunk import RrdReader
 
 from agents.cooperative.declared import paper_rmse
@@ -15,9 +14,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
-    Canvas,
     PeriodArrays,
-    drawable,
     ellipses,
     in_length,
     link_states,
@@ -92,11 +89,6 @@ def periods(told: Told) -> list[PeriodArrays]:
 def test_the_file_is_whole_and_says_so(path: Path) -> None:
     assert is_closed(path)
     assert rrd("verify", str(path)).returncode == 0
-
-
-def test_there_is_one_recording(path: Path) -> None:
-    reader = RrdReader(str(path))
-    assert [store.application_id for store in reader.recordings()] == ["vnet"]
 
 
 def views(path: Path) -> tuple[list[str], list[str]]:
@@ -176,13 +168,6 @@ def test_lines_have_the_figures_of_the_messages(
         seen += int(np.isfinite(wanted).sum())
     assert seen > 20
     assert len(entities[entity].static["SeriesLines:names"]) == len(drawn)
-
-
-def test_the_limit_is_drawn_and_beats_raw_fixes_by_far(told: Told, entities: dict[str, Entity]) -> None:
-    common = entities["/figures/common-error"]
-    assert common.static["SeriesLines:names"][2] == "bound: a Kalman filter that hears every fix of its component"
-    late = [common.array("Scalars:scalars", period.time_s)[2] for period in periods(told)][-5:]
-    assert 0 < np.mean(late) < np.mean([period.figure("fix_rmse_m") for period in periods(told)])
 
 
 def test_layers_of_the_stack_are_as_thick_as_there_were_frames(told: Told, entities: dict[str, Entity]) -> None:
@@ -380,13 +365,6 @@ def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path)
         assert max(last) == pytest.approx(1.5) and len(last[max(last)]) == 0, name
 
 
-def test_the_heading_says_what_run_it_is(entities: dict[str, Entity]) -> None:
-    text = entities["/about"].static["TextDocument:text"][0]
-    assert text.startswith("### told\n")
-    for part in ("6 vehicles in 1 component", "loss 20%", "at most 3 peers", "lockstep, 3 s, seed 1"):
-        assert part in text
-
-
 def test_missing_periods_are_counted_and_told(told: Told, tmp_path: Path) -> None:
     recorder = write([*told[:5], *told[9:]], tmp_path / "gap.rrd")
     assert recorder.missed == 4
@@ -398,11 +376,6 @@ def test_what_comes_before_the_scene_and_what_is_unknown_is_left_out(told: Told,
     write([*told[1:3], ("weather", {}), told[0], told[0], *told[3:]], tmp_path / "late.rrd")
     times = read_back(tmp_path / "late.rrd")["/map/true"].at["Points2D:positions"]
     assert min(times) == pytest.approx(0.2)
-
-
-def test_a_vehicle_that_is_not_there_is_refused(told: Told, tmp_path: Path) -> None:
-    with pytest.raises(VnetError, match="no such vehicle: v99; there are v01, v02"):
-        write(told, tmp_path / "x.rrd", "v99")
 
 
 def test_a_file_that_cannot_be_written_is_one_line(told: Told, tmp_path: Path) -> None:
@@ -419,11 +392,6 @@ def test_ellipses_hold_95_percent() -> None:
     sample = rng.multivariate_normal([0, 0], covariance, 20_000)
     assert np.mean(np.einsum("ki,ij,kj->k", sample, inverse, sample) < 5.991) == pytest.approx(0.95, abs=0.005)
     assert len(ellipses([[np.nan, 0.0]], [covariance])) == 0
-
-
-def test_what_the_font_cannot_draw_is_not_drawn() -> None:
-    assert drawable("müde – 3 ≤ 4\n\tja") == "müde – 3 ≤ 4 ja"
-    assert drawable("a🟩b\x00c漢") == "a?b?c?"
 
 
 def test_lengths() -> None:
@@ -468,14 +436,6 @@ def test_the_papers_value_only_where_it_applies(
     scene = {"scenario": scenario, "node_ids": ["v"] * 24, "range_m": 3000.0}
     assert paper_rmse(scene).get("common_error_rmse_m") == found
     assert paper_rmse({**scene, "range_m": 500.0}) == {}
-
-
-def test_nothing_plotted_sends_nothing(tmp_path: Path) -> None:
-    recording = rr.RecordingStream("empty")
-    recording.set_sinks(rr.FileSink(str(tmp_path / "x.rrd")))
-    Canvas(recording).send()
-    recording.disconnect()
-    assert [name for name in read_back(tmp_path / "x.rrd") if not name.startswith("/__")] == []
 
 
 def _numbers(tensor: dict[str, Any]) -> np.ndarray:

@@ -14,9 +14,7 @@ from typing import Any
 
 import pytest
 import rerun as rr
-from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.viewer import sinks as sinks_module
 from emulator.viewer import watch
 from emulator.viewer.recorder import Recorder
@@ -125,31 +123,6 @@ def test_a_port_that_another_program_took_in_between_is_said_in_one_line() -> No
         open_recording(Sinks(serve=place), "late"),
     ):
         raise AssertionError("it was opened")
-
-
-@pytest.mark.parametrize("command", ["run", "emulator"])
-def test_spawn_without_a_display_is_said_before_anything_has_started(
-    no_display: None, tmp_path: Path, command: str
-) -> None:
-    scenario = tmp_path / "scenario.toml"
-    scenario.write_text("")
-    out = tmp_path / "run"
-    result = CliRunner().invoke(app, [command, str(scenario), "--out", str(out), "--rerun", "spawn"])
-    assert result.exit_code == 2
-    assert "there is no display here" in result.output
-    assert "--rerun serve" in result.output
-    assert result.output.count("\n") == 1
-    assert not out.exists()
-
-
-def test_a_vehicle_that_is_not_there_is_said_before_anything_has_started(tmp_path: Path) -> None:
-    scenario = tmp_path / "scenario.toml"
-    scenario.write_text("")
-    arguments = ["--out", str(tmp_path / "run"), "--rerun", "save", "--rerun-vehicle", "v99"]
-    result = CliRunner().invoke(app, ["run", str(scenario), *arguments])
-    assert result.exit_code == 2
-    assert result.output.splitlines()[1:] == ["vnet: --rerun-vehicle v99: no such vehicle"], "after the run's name"
-    assert not (tmp_path / "run").exists()
 
 
 def test_addresses_as_they_are_told() -> None:
