@@ -409,7 +409,9 @@ class Lockstep:
     def _grant_one(self, process: LockstepProcess, time_ns: int) -> wire.Grant:
         self._woken.discard(process.id)
         process.granted_ns = time_ns
-        fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
+        fixes: list[tuple[str, Fix]] = []
+        if min(process.next_fix.values()) <= self.now_ns // self._emulation.world.period_ns:
+            fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
         packets, clocks = process.take_packets(), process.take_clocks()
         busy = self._emulation.busy.of(process.nodes, time_ns, self._end_ns)
         results, messages = self._news.take(process.running)

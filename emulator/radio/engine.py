@@ -22,7 +22,6 @@ from operator import attrgetter
 from typing import overload
 
 import numpy as np
-from msgspec import structs
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
@@ -133,16 +132,13 @@ class Deliveries(Sequence[Delivery]):
         """Return the packets of these columns (4, n) of the table, as they stand."""
         arrivals_ns, receivers, _, numbers = table.tolist()
         transmissions = [self._frames[number] for number in numbers]
-        packets = [
-            Packet(sent.frame.name, sent.frame.sent_ns, arrival_ns, sent.altered.get(receiver, sent.frame.payload))
-            if sent.altered
-            else Packet((frame := sent.frame).name, frame.sent_ns, arrival_ns, frame.payload)
-            for sent, arrival_ns, receiver in zip(transmissions, arrivals_ns, receivers, strict=True)
+        payloads = [
+            sent.altered.get(receiver, sent.frame.payload) if sent.altered else sent.frame.payload
+            for sent, receiver in zip(transmissions, receivers, strict=True)
         ]
-        if not self._trace.knows_power:
-            return packets
-        powers = zip(packets, *self._trace.powers(table[_ROW]), strict=True)
-        return [structs.replace(packet, rssi_dbm=rssi_dbm, snr_db=snr_db) for packet, rssi_dbm, snr_db in powers]
+        names, sent_ns = [sent.frame.name for sent in transmissions], [sent.frame.sent_ns for sent in transmissions]
+        powers = self._trace.powers(table[_ROW]) if self._trace.knows_power else ()
+        return [*map(Packet, names, sent_ns, arrivals_ns, payloads, *powers)]
 
     def _order(self) -> NDArray[np.intp]:
         order: NDArray[np.intp] = self._table[_ARRIVAL].argsort(kind="stable")

@@ -136,14 +136,15 @@ class SensedGrid:
         for (first, length), period, own_mw, decoded in zip(
             heard.places, heard.periods, heard.power_mw, heard.decoded, strict=True
         ):
-            listener = np.flatnonzero(decoded) if period else ()
-            if not len(listener):
+            if not period:
                 continue
-            dbm = (10 * np.log10(own_mw[listener])).astype(np.float16)
-            for each in range(first, first + length):
-                stronger = dbm > self._reserved_dbm[listener, row, each]
-                self._reserved_dbm[listener[stronger], row, each] = dbm[stronger]
-                self._period[listener[stronger], row, each] = period
+            dbm = np.full(len(own_mw), NOT_RESERVED_DBM)
+            np.log10(own_mw, out=dbm, where=decoded)
+            dbm = (10 * dbm).astype(np.float16)[:, None]
+            reserved_dbm = self._reserved_dbm[:, row, first : first + length]
+            stronger = dbm > reserved_dbm
+            np.copyto(reserved_dbm, dbm, where=stronger)
+            np.copyto(self._period[:, row, first : first + length], period, where=stronger)
 
     def candidates(self, now: int, wanted: Wanted) -> Candidates:
         """Return the candidates among the resources that a vehicle looks for in slot `now`.

@@ -28,7 +28,7 @@ from msgspec.structs import replace
 
 from vnet.driving import Action
 from vnet.errors import DeadlockError
-from vnet.mailbox import Mailbox
+from vnet.mailbox import Mailbox, Waits
 from vnet.node import Fix, Node
 from vnet.radio import RadioAbilities, SentFrame
 from vnet.reports import NoteDetail, Report
@@ -85,6 +85,7 @@ class Host:
         """Held here: of a program in a deadlock nothing else refers to them, and they would be collected."""
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
         self._thread: int | None = None  # of the loop, in lockstep
+        self._waits = {"radio": Waits(), "gnss": Waits(), "backbone": Waits()}
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
         self._active = {welcome.node: welcome.runs for welcome in welcomes}
         self._clocks = NodeClocks(clock)
@@ -128,6 +129,7 @@ class Host:
             inboxes["backbone"] = node.backbone.inbox
         for name, inbox in inboxes.items():
             inbox.guard = partial(self._check_thread, node.id, f"{name}.drain() or receive()")
+            inbox.waits = self._waits[name]
         return node
 
     def _check_thread(self, node: str, call: str) -> None:
@@ -364,7 +366,7 @@ class Host:
         (window := self._window).end_instant(self._clock(), self.take_traffic())
         next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
         next_ns = self.news.first_ns(self._paused, next_ns)
-        if window.has_packets:
+        if self._waits["radio"].count and window.has_packets:
             next_ns = min(next_ns, window.first_packet_ns(self._awaits_packet))
         if next_ns >= window.end_ns:
             return None
@@ -383,8 +385,9 @@ class Host:
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""
-        radio = [node.id for node in self.nodes.values() if node.radio.inbox.waiting]
-        gnss = [node.id for node in self.nodes.values() if node.gnss.inbox.waiting]
+        nodes = self.nodes.values()
+        radio = [node.id for node in nodes if node.radio.inbox.waiting] if self._waits["radio"].count else []
+        gnss = [node.id for node in nodes if node.gnss.inbox.waiting] if self._waits["gnss"].count else []
         return wire.Yield(nonce, seq, next_timer_ns, radio, gnss, *self._window.take_steps())
 
     def end(self, node: str, kind: str, error: str = "", details: str = "", place: str = "") -> None:
