@@ -10,12 +10,12 @@ import asyncio
 import json
 import secrets
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import zenoh
@@ -44,6 +44,8 @@ ECHO_S = 2.0
 """Seconds after a token was taken back in which Zenoh's echoes of it are not taken for a program's own."""
 REMOTE = zenoh.Locality.REMOTE
 
+T = TypeVar("T")
+
 _sources: OrderedDict[int, zenoh.SourceInfo] = OrderedDict()
 _source_numbers = count()
 
@@ -53,6 +55,7 @@ class Gateway:
 
     `keys` cross the radio. `hear` takes on any thread "gateway", what programs do ("message", "query", "token",
     "session", "report"), and the gateway with what belongs to it: `take` then takes that on the run's loop.
+    It is told of a "bug", too, an exception on a thread of Zenoh's, which would only print it.
     """
 
     def __init__(
@@ -84,17 +87,18 @@ class Gateway:
         self._session = session
         endpoint = router_endpoint(session)
         for key in self._keys:
-            session.declare_subscriber(key, self._put, allowed_origin=REMOTE)
+            session.declare_subscriber(key, self._telling(self._put), allowed_origin=REMOTE)
             # Clients of ROS 2's services ask none but complete queryables.
-            session.declare_queryable(key, self._asked, complete=self._ros2 is not None, allowed_origin=REMOTE)
-            watch = session.liveliness().declare_subscriber(key, self._token, history=True)
+            is_complete, asked = self._ros2 is not None, self._telling(self._asked)
+            session.declare_queryable(key, asked, complete=is_complete, allowed_origin=REMOTE)
+            watch = session.liveliness().declare_subscriber(key, self._telling(self._token), history=True)
             self._watches.append(watch)
-        session.declare_subscriber(REPORT_KEY, self._reported, allowed_origin=REMOTE)
+        session.declare_subscriber(REPORT_KEY, self._telling(self._reported), allowed_origin=REMOTE)
         if self._ros2 is not None:
             own = map(session.liveliness().declare_token, self._ros2.tokens(str(session.zid())))
             self._watches.extend(own)
         info = session.info
-        self._watches.append(info.declare_transport_events_listener(self._connected, history=True))
+        self._watches.append(info.declare_transport_events_listener(self._telling(self._connected), history=True))
         return endpoint
 
     def _router_settings(self) -> dict[str, Any]:
@@ -113,6 +117,17 @@ class Gateway:
 
     def _tell(self, what: str, item: Any) -> None:
         self._hear("gateway", what, (self, item))
+
+    def _telling(self, take: Callable[[T], None]) -> Callable[[T], None]:
+        """Return a callback for Zenoh that tells of its own exceptions."""
+
+        def told(item: T) -> None:
+            try:
+                take(item)
+            except Exception as error:
+                self._tell("bug", error)
+
+        return told
 
     def _crosses(self, key: str) -> bool:
         return not key.startswith(OWN_KEYS) and (self._ros2 is None or self._ros2.crosses(key))
@@ -259,7 +274,7 @@ class Gateway:
 
         self._session.get(
             query.selector,
-            answered,
+            self._telling(answered),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=self._settings.query_s,

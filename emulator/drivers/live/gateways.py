@@ -408,6 +408,8 @@ class Gateways:
     def take(self, what: str, item: tuple[Gateway, Any]) -> None:
         """Take what a gateway has told, on the loop."""
         gateway, told = item
+        if what == "bug":
+            raise told
         vehicle = self._vehicles.get(gateway.node)
         if vehicle is None or vehicle.gateway is not gateway:  # it is gone
             return

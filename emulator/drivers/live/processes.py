@@ -145,6 +145,8 @@ class LiveProcesses(Processes):
         self._reasons: dict[str, str] = {}
         """Reasons of the last refused messages, of nodes whose next yield has not come."""
         self._failure: VnetError | None = None
+        self._bug: Exception | None = None
+        self._loop.set_exception_handler(self._fail)
         self.attachment.open()
 
     def _make_fleet(self) -> Fleet:
@@ -177,6 +179,16 @@ class LiveProcesses(Processes):
     def close(self) -> None:
         """Take nothing any more."""
         self._closed = True
+        self._loop.set_exception_handler(None)
+
+    def _fail(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Have the run end with the exception of a callback: asyncio would only print it."""
+        error = context.get("exception")
+        if isinstance(error, Exception) and "future" not in context:
+            self._bug = self._bug or error
+            self.changes.set()
+        else:
+            loop.default_exception_handler(context)
 
     def _drain(self) -> None:
         self._wake_pending = False
@@ -292,7 +304,7 @@ class LiveProcesses(Processes):
             if missing != self.members.missing:
                 missing = self.members.missing
                 on_missing(missing)
-            if failure := self._failure or self.supervisor.failure:
+            if failure := self._bug or self._failure or self.supervisor.failure:
                 raise failure
             if time.monotonic() > deadline:
                 absent, total = self.members.missing or ["the recorder"], len(self._emulation.world.node_ids)
@@ -392,6 +404,8 @@ class LiveProcesses(Processes):
                 await self.changes.wait(timeout_s)
             else:
                 await self._await_yields()
+        if self._bug is not None:
+            raise self._bug
         return self._heard.popleft() if self._heard else None
 
     async def _await_yields(self) -> None:

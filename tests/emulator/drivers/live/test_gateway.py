@@ -376,3 +376,24 @@ def test_sessions_are_counted_by_who_they_are() -> None:
 def test_keys_that_cannot_be_are_named(keys: tuple[str, ...], named: str) -> None:
     with pytest.raises(ProgramError, match=named):
         check_keys(keys)
+
+
+def test_an_exception_on_a_thread_of_zenohs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def first_bug() -> Exception:
+        told: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+        loop = asyncio.get_running_loop()
+
+        def hear(kind: str, what: str, item: tuple[Gateway, Any]) -> None:
+            loop.call_soon_threadsafe(told.put_nowait, (what, item[1]))
+
+        gateway = Gateway("v01", RADIO_KEYS, QUIET, hear)
+        with connected(await asyncio.to_thread(gateway.open, QUIET.listen)) as session:
+            session.put("car/v01/pose", b"")
+            while (heard := await asyncio.wait_for(told.get(), PATIENCE_S))[0] != "bug":
+                pass
+        await gateway.close()
+        bug: Exception = heard[1]
+        return bug
+
+    monkeypatch.setattr("emulator.drivers.live.gateway.crossing_of", lambda *_: 1 / 0)
+    assert isinstance(asyncio.run(first_bug()), ZeroDivisionError)

@@ -144,3 +144,13 @@ async def test_once_closed_nothing_is_handled_any_more() -> None:
     post.hear("v02", yield_of(0))
     await post.settle()
     assert await post.came() == []
+
+
+@on_a_loop
+async def test_an_exception_of_a_callback_ends_the_run() -> None:
+    stage = Stage(pacing="realtime")
+    stage.join()
+    stage.live.begin(stage.members.processes(), lambda: 0)
+    stage.live.hear("message", "v01", None)  # which no transport gives
+    with pytest.raises(TypeError):
+        await stage.live.receive(60.0)
