@@ -195,8 +195,9 @@ def test_a_fault_that_was_healed_before_it_began_leaves_nothing_to_see() -> None
     assert result(recorded, "effect:kill-0") == NotExercised("effect:kill-0", "it was healed before it began")
 
 
-@pytest.mark.parametrize("kind", ["DoS", "Sybil", "DataReplay", "StaleMessages"])
-@pytest.mark.parametrize("holding", ["kill", "pause"])
+@pytest.mark.parametrize(
+    ("kind", "holding"), [("DoS", "kill"), ("Sybil", "pause"), ("DataReplay", "pause"), ("StaleMessages", "kill")]
+)
 def test_a_vehicle_that_other_faults_keep_down_need_not_be_seen_to_misbehave(kind: str, holding: str) -> None:
     whom = {"nodes": {"ids": ["v01"]}}
     held = simulated(fault(kind, **whom), fault(holding, at_s=1.5, duration_s=1.0, **whom), fault(holding, **whom))
