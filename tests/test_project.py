@@ -14,6 +14,7 @@ from packaging.specifiers import SpecifierSet
 from emulator.cli.table import REGISTRY
 from tests.docs import commands
 from tests.docs.pages import check_workflow
+from tests.hunt.mutants import MUTANTS, Mutant, mutated
 from tests.support.paths import ROOT
 
 WORKFLOW = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text())
@@ -130,6 +131,12 @@ def test_make_test_all_tests_each_python_that_is_installed(installed: list[str],
 def stand_in(path: Path, does: str) -> None:
     path.write_text(f"#!/bin/sh\n{does}\n")
     path.chmod(0o755)
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
+def test_a_mutant_can_be_put_into_its_file(mutant: Mutant) -> None:
+    """Or nobody knows any more whether the tests would find it."""
+    assert mutant.new in mutated(mutant)
 
 
 def test_make_setup_installs_the_studies_that_register_their_command() -> None:

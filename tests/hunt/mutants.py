@@ -56,7 +56,7 @@ shadowing | propagation | np.exp(-2 * distance_m / self._dec | np.exp(-distance_
 capture | reception | enough = power_mw * (1 + self._ratio) >= | enough = power_mw >=
 interference | reception | others_mw = np.maximum(total_mw - own_mw, 0.0) | others_mw = total_mw
 tail bits | dot11p | (SERVICE_AND_TAIL_BITS + 8 * size_bytes) | (8 * size_bytes)
-smoothing | congestion | + 0.25 * both_ratios | + 0.5 * self._meter.busy_ratio[over]
+smoothing | csma | + 0.25 * both_ratios | + 0.5 * self._meter.busy_ratio[over]
 window | csma | (self.window + 1 << attempts) - 1, self | self.window + 1 << attempts, self
 tick | stages | -(-arrival_ns // self._tick_ns) | (arrival_ns // self._tick_ns)
 peer cap | topology | candidate & (rank < self._max_peers) | candidate & (rank <= self._max_peers)
@@ -83,7 +83,7 @@ walk | rbpf | config.common_sigma_m * np.sqrt(1 - keep**2) | config.common_sigma
 acceleration | tracks | half = elapsed_s**2 / 2 | half = elapsed_s**2
 metropolis | weights | weights[0] = 1 - (count - 1) / (1 + max_degree) | weights[0] = 1 / (1 + max_degree)
 offset | own_kalman | (stays * offset, s + dt_s * v, v) | (offset, s + dt_s * v, v)
-evidence | map_evidence | np.maximum(0.0, 1 - since_s / self._lateral_tau_s) | 1 - 0 * since_s
+evidence | map_matching | np.maximum(0.0, 1 - since_s / self._lateral_tau_s) | 1 - 0 * since_s
 """
 """The mutants of each folder: name, file, the text that stands in it, and the one in its place."""
 
