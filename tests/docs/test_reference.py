@@ -8,7 +8,6 @@ import pytest
 
 from docs.generate import PAGES, REFERENCE, faults, files
 from docs.generate.keys import key_table
-from docs.generate.markdown import attribute_docstrings
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import ACKNOWLEDGED, CHOSEN, LATE
 from emulator.records.tables import BUSY, METRICS, STATES, TABLES, TRACE, Column
@@ -48,21 +47,6 @@ def test_a_key_without_a_docstring_is_refused() -> None:
 
     with pytest.raises(LookupError, match="silent_s"):
         key_table(Silent)
-
-
-def test_docstrings_of_attributes_are_found() -> None:
-    assert attribute_docstrings(Example) == {"first": "Text of\nthe first."}
-
-
-class Example:
-    """A class."""
-
-    first: int = 1
-    """Text of
-    the first."""
-    second: int = 2
-    third = 3
-    """Text without an annotation."""
 
 
 def test_a_column_without_a_text_is_refused() -> None:

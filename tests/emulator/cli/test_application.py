@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -72,15 +71,6 @@ def test_what_runs_programs_starts_again_before_it_imports_anything(name: str, t
     assert modules & {*SLOW_TO_IMPORT, "typer"} == set()
 
 
-def test_the_commands_that_run_programs_are_those() -> None:
-    assert {command.name for command in COMMANDS if command.runs_programs} == {
-        "campaign",
-        "experiment",
-        "simulate",
-        "sweep",
-    }
-
-
 def test_a_command_line_names_its_command() -> None:
     named = find(["run", "simulate"])
     assert named is not None and named.name == "run"
@@ -92,11 +82,6 @@ def test_a_command_line_names_its_command() -> None:
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(build_app([]), ["--version"]) == 0
     assert capsys.readouterr().out.split()[0] == "vnet"
-
-
-def test_the_package_has_a_script_of_its_own_name() -> None:
-    scripts = {script.name: script.value for script in entry_points(group="console_scripts")}
-    assert scripts["vnet"] == "vnet.console_scripts:emulator"
 
 
 def test_help_lists_every_command_on_a_line_of_eighty_columns(
@@ -183,17 +168,6 @@ def test_an_interrupt_that_an_import_hides_is_one(capsys: pytest.CaptureFixture[
     hidden.__cause__ = KeyboardInterrupt()
     assert run_app(failing(hidden), []) == 130
     assert capsys.readouterr().err == ""
-
-
-def test_the_agent_says_its_name_and_version() -> None:
-    helped, version = (
-        subprocess.run(
-            [sys.executable, "-P", "-m", "agents.cli", option], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout
-        for option in ("--help", "--version")
-    )
-    assert helped.startswith("Usage: vnet-agent [OPTIONS]")
-    assert version.startswith("vnet-agent ")
 
 
 def test_what_may_change_or_go_in_any_version_is_marked_in_help_and_reference() -> None:

@@ -5,7 +5,6 @@ import pytest
 
 from emulator.faults.plan import stream as fault_stream
 from emulator.scenario.random_streams import Draws, stream
-from emulator.world.networks import generate_network
 
 
 def test_streams_keep_their_values() -> None:
@@ -20,12 +19,6 @@ def test_draws_of_frames_keep_their_values() -> None:
     assert draws.uniform(3, 11, 2, copy=1).tolist() == [0.1219891147397213, 0.6608384290770568]
     assert Draws(7, "fault 2").words(1, 2, 2, 5).tolist() == [7680943530765392713, 8967108516191108010]
     assert Draws(2**63 - 1, "loss").uniform(0, 0, 2).tolist() == [0.3704361984961626, 0.45181856238437623]
-
-
-def test_generated_networks_keep_their_values() -> None:
-    network = generate_network("dense", 3, 9)
-    assert network.position_m[0].tolist() == [2770.269442094685, 2354.821504396214]
-    assert network.heading_rad[0] == 1.8561576627988532
 
 
 @pytest.mark.parametrize("other", [stream(2, "gnss", 3), stream(1, "heading", 3), stream(1, "gnss", 4)])
