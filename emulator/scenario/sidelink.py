@@ -44,9 +44,12 @@ class Sidelink(Section):
     keep_probability: float = Field(0.0, ge=0, le=0.8)
     """Probability of keeping a resource as its counter ends."""
     reservation_ms: int = 100
-    """Reservation interval until a sender's period is told, or learned from its frames."""
+    """Reservation interval until a sender's period is told, or learned from its frames.
+
+    The standards have 100, 200, … 1000 ms; mode 4 also 20 and 50 ms, mode 2 also 1 to 99 ms.
+    """
     t1_slots: int = Field(4, ge=1)
-    """Slots from a frame to the beginning of its selection window: the time of processing."""
+    """Slots from a frame to its selection window, the time of processing: in mode 4 at most 4, in mode 2 at most 9."""
     t2_ms: int = Field(100, ge=10, le=100)
     """End of the selection window, and the delay beyond which a frame gets a resource of its own."""
     retransmit: bool = False
