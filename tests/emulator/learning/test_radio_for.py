@@ -200,6 +200,17 @@ def test_vehicles_share_the_medium_of_80211p() -> None:
     assert apart.outcomes == {"delivered": 12}
 
 
+@pytest.mark.parametrize("kind", ["lte-mode4", "nr-mode2"])
+def test_vehicles_share_the_grid_of_cv2x(kind: str) -> None:
+    grid = {"path_loss": {"kind": "free_space"}, "mac": {"kind": kind}}
+    radio = cars({"radio": grid})
+    radio.reset(seed=1)
+    for _ in range(5):
+        radio.step(dict.fromkeys(radio.agents, 1))
+    assert sum(radio.outcomes.values()) >= 4 * 12 and radio.outcomes["delivered"] >= 3 * 12
+    assert set(radio.outcomes) <= {"delivered", "half_duplex", "collided"}
+
+
 def test_a_message_that_is_late_arrives_in_a_later_step() -> None:
     late = particles(simple_speaker_listener_v4, {"radio": {"latency_ms": 150.0, "jitter_ms": 0.0}})
     late.reset(seed=1)
