@@ -238,8 +238,8 @@ class Radio:
 
         The medium is busy while the vehicle transmits, or senses `radio.mac.carrier_sense_dbm` or more; of a
         sidelink it is the share of subchannels with `radio.mac.busy_dbm` or more. The 100 ms end at the last
-        multiple of 10 ms that is at least `radio.latency_ms` past (of a sidelink, and `radio.mac.t1_slots`). In real
-        time the value is as old as the last message of the emulator. None where the scenario has no `[radio.mac]`.
+        multiple of 10 ms that is at least `radio.latency_ms` past (of a sidelink, and `radio.mac.t1_slots`). In
+        real time the value is as old as the emulator's last message. None where the scenario has no `[radio.mac]`.
         """
         self.inbox.refill()
         return self._transport.busy_ratio(self._node_id)

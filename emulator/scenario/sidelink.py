@@ -49,7 +49,7 @@ class Sidelink(Section):
     The standards have 100, 200, … 1000 ms; mode 4 also 20 and 50 ms, mode 2 also 1 to 99 ms.
     """
     t1_slots: int = Field(4, ge=1)
-    """Slots from a frame to its selection window, the time of processing: in mode 4 at most 4, in mode 2 at most 9."""
+    """Slots from a frame to its selection window, to process it: in mode 4 at most 4, in mode 2 at most 9."""
     t2_ms: int = Field(100, ge=10, le=100)
     """End of the selection window, and the delay beyond which a frame gets a resource of its own."""
     retransmit: bool = False
