@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 from markdown_it import MarkdownIt
@@ -43,6 +44,7 @@ def links(text: str) -> Iterator[str]:
             yield str(target)
 
 
+@cache
 def anchors(text: str) -> set[str]:
     """The names that GitHub gives the headings of a page."""
     tokens = _parser.parse(text)

@@ -23,6 +23,8 @@ from emulator.scenario.program import Program
 from tests.emulator.checks.test_judge import run as simulate_in
 from vnet.errors import VnetError
 
+pytestmark = pytest.mark.slow
+
 CHECKS = """
 from emulator import Result, Run
 

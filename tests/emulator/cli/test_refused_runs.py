@@ -11,6 +11,8 @@ from emulator.cli.commands import app
 from emulator.terminal.console import run_app
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 BEACON = str(ROOT / "scenarios" / "beacon.toml")
 SHORT = ["--duration", "0.5", "--set", "network.vehicles=2", "--quiet", "--no-report"]
 UNKNOWN = 3

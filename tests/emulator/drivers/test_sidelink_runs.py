@@ -10,6 +10,8 @@ from tests.support.multi_loop_driver import run_apart, run_forked, run_together,
 from vnet import Node
 from vnet.units import NS_PER_MS
 
+pytestmark = pytest.mark.slow
+
 FAULTS: list[dict[str, Any]] = [
     {"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"ids": ["v02"]}},
     {"kind": "pause", "at_s": 0.9, "duration_s": 0.2, "nodes": {"ids": ["v03"]}},

@@ -193,6 +193,7 @@ def test_a_closed_road_goes_on(tmp_path: Path) -> None:
     assert np.isnan(world.vehicles.gaps(1000.0)[0]).all(), "nobody is ahead of itself"
 
 
+@pytest.mark.slow
 def test_drawn_routes_lead_through_a_city_without_jumps() -> None:
     keys = {"speed_mps": 12.0, "max_speed_mps": 15.0}
     world = world_on(None, 40, keys)

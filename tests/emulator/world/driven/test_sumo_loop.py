@@ -40,6 +40,8 @@ from tests.support.sumo import install_fake, write_scenario
 from vnet import Node
 from vnet.errors import ScenarioError, VnetError
 
+pytestmark = pytest.mark.slow
+
 BRAKES = "tests.support.driving_programs:brakes_and_releases"
 
 
@@ -117,7 +119,6 @@ def test_sumo_writes_its_files_in_a_run_in_several_processes(tmp_path: Path) -> 
     assert (tmp_path / "closed").read_text() == "closed"
 
 
-@pytest.mark.slow
 def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> None:
     """`behind` and `late` have none; `late` comes after a second."""
     scenario = Scenario.model_validate(write_scenario(tmp_path, network={"sumo": {"nodes": ["lead#1"]}}))
@@ -158,7 +159,6 @@ def fingerprint(emulation: Emulation) -> tuple[Any, ...]:
     return emulation.engine.trace.sha256(), emulation.metrics.sha256(), repr(table.to_pydict()), kept
 
 
-@pytest.mark.slow
 def test_a_run_is_the_same_in_every_division_and_again(tmp_path: Path) -> None:
     run = {"control_hz": 20.0}
     data = write_scenario(tmp_path, network={"max_vehicles": 3}, run=run, program={"entry": BRAKES})
