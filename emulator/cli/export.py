@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from functools import partial
@@ -64,6 +65,12 @@ class Payloads(StrEnum):
 def radio(
     run: RunArgument = LATEST,
     bin_m: Annotated[float, typer.Option("--bin", min=0.1, help="Width of the bins of distance in m.")] = BIN_M,
+    within_m: Annotated[
+        float, typer.Option("--within", min=0, help="Receivers farther than this, in m, count as out of range.")
+    ] = math.inf,
+    from_s: Annotated[
+        float, typer.Option("--from", min=0, help="Only frames that were enqueued from this time on, in s.")
+    ] = 0.0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for links.parquet, vehicles.parquet and distances.parquet.")
     ] = None,
@@ -71,7 +78,7 @@ def radio(
     """A run's radio in figures: delivery by distance, latency, time between receptions, age of information."""
     with one_line_errors():
         recorded = RecordedRun.open(run)
-        metrics = radio_metrics(recorded, bin_m)
+        metrics = radio_metrics(recorded, bin_m, within_m=within_m, from_s=from_s)
         if out is not None:
             tables = {"links": metrics.links, "vehicles": metrics.vehicles, "distances": metrics.distances}
             with disk_errors(out):

@@ -21,6 +21,7 @@ from emulator.scenario.program import Program
 from emulator.world.world import Instant
 from vnet.errors import ScenarioError
 from vnet.types import Array
+from vnet.units import unit_of
 
 VECTORS = {"estimate_m": 2, "covariance_m2": 4}
 """Columns of the states of which vnet's own figures are made, and the numbers that each entry has."""
@@ -56,7 +57,10 @@ class PeriodFigures:
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """A figure of the periods, in metres, whose mean after the first fifth of a run is shown by `title`."""
+    """A figure of the periods, whose mean after the first fifth of a run is shown by `title`.
+
+    Its unit is that in which its name ends (`common_error_rmse_m`), if there is one.
+    """
 
     name: str
     title: str
@@ -72,6 +76,16 @@ class KeyFigure:
     """True for the deviation of vehicles' estimates from their mean, which `vnet analyze` explains."""
     live: tuple[str, str] | None = None
     """Label and remark of its line in the picture of a run that is on."""
+
+    @property
+    def heading(self) -> str:
+        """The title with the unit, as in the heading of a column."""
+        unit = unit_of(self.name)
+        return f"{self.title} ({unit})" if unit else self.title
+
+    def text(self, value: float) -> str:
+        """Return a value with its unit, for people."""
+        return f"{value:.3f} {unit_of(self.name)}".rstrip()
 
 
 POSITION_FIGURES = (
@@ -185,11 +199,11 @@ def _of_entry(entry: str) -> ProgramFigures:
         raise ScenarioError(f"{CONSTANT}: {entry!r} declares no figures of periods: {error}") from None
 
 
-def shown_figures(key: Sequence[KeyFigure], figures: Mapping[str, float | None]) -> dict[str, float]:
-    """Return the key figures that a run has, by title: errors of positions only where programs estimate them."""
+def shown_figures(key: Sequence[KeyFigure], figures: Mapping[str, float | None]) -> list[tuple[KeyFigure, float]]:
+    """Return the key figures that a run has: errors of positions only where programs estimate them."""
     own = estimates_differ(figures.get("position_rmse_m"), figures.get("fix_rmse_m"))
-    values = {each.title: figures.get(each.name) for each in key if own or not each.of_positions}
-    return {title: value for title, value in values.items() if value is not None}
+    values = [(each, figures.get(each.name)) for each in key if own or not each.of_positions]
+    return [(each, value) for each, value in values if value is not None]
 
 
 def estimates_differ(estimate_m: float | None, fix_m: float | None) -> bool:

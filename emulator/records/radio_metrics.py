@@ -9,6 +9,7 @@ are those within contacts.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +17,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from emulator.radio.medium import WINDOW_NS
 from emulator.records.recorded_run import RecordedRun
 from vnet.types import Array, IntArray, Mask
+from vnet.units import NS_PER_S
 
 NS_PER_MS = 1e6
 BIN_M = 50.0
@@ -106,17 +109,25 @@ class _Pairs:
     contact: IntArray
 
 
-def radio_metrics(recorded: RecordedRun, bin_m: float = BIN_M, has_busy: bool = True) -> RadioMetrics:
+def radio_metrics(
+    recorded: RecordedRun,
+    bin_m: float = BIN_M,
+    has_busy: bool = True,
+    within_m: float = math.inf,
+    from_s: float = 0.0,
+) -> RadioMetrics:
     """The radio's figures of a run; distances in bins of `bin_m`. Raises VnetError if its files do not fit.
 
+    Receivers farther than `within_m` count as out of range, and frames enqueued before `from_s` are left out.
     Without `has_busy` the channel busy ratio is left empty, whatever there is.
     """
     count = len(recorded.node_ids)
-    pairs = _pairs(recorded, count)
+    pairs = _pairs(recorded, count, within_m, round(from_s * NS_PER_S))
     codes, place = np.unique(pairs.link, return_inverse=True)
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(recorded.node_ids, codes, count, figures)
-    busy = recorded.busy_ratio if has_busy else np.zeros((0, count))
+    first = math.ceil(round(from_s * NS_PER_S) / WINDOW_NS)
+    busy = recorded.busy_ratio[first:] if has_busy else np.zeros((0, count))
     vehicles = _vehicles_table(recorded, codes, count, figures, busy)
     totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(busy)}
     return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
@@ -133,8 +144,12 @@ def rows_of_pairs(recorded: RecordedRun) -> NDArray[np.intp]:
     return np.flatnonzero(original & ~recorded.outcome_is("receiver_down"))
 
 
-def _pairs(recorded: RecordedRun, count: int) -> _Pairs:
+def _pairs(recorded: RecordedRun, count: int, within_m: float, from_ns: int) -> _Pairs:
     rows = rows_of_pairs(recorded)
+    if from_ns > 0:
+        rows = rows[recorded.sent_ns[rows] >= from_ns]
+    if within_m < math.inf:
+        rows = rows[_distances_m(recorded, rows) <= within_m]
     link = recorded.sender[rows] * count + recorded.receiver[rows]
     if (np.diff(recorded.sent_ns[rows]) >= 0).all():  # as runs write it; few links are sorted by their bits
         order = np.argsort(link.astype(np.uint16) if count <= 256 else link, kind="stable")
@@ -147,9 +162,15 @@ def _pairs(recorded: RecordedRun, count: int) -> _Pairs:
         breaks |= _was_away(recorded, recorded.sender[rows], sent_ns)
         breaks |= _was_away(recorded, recorded.receiver[rows], sent_ns)
     contact = np.concatenate([[0], np.cumsum(breaks)]) if len(rows) else np.zeros(0, np.int64)
-    distance_m = recorded.places.pair_distances_m(recorded.sender[rows], recorded.receiver[rows], sent_ns)
     delivered = recorded.outcome_is("delivered")[rows]
+    distance_m = _distances_m(recorded, rows)
     return _Pairs(link, seq, sent_ns, recorded.arrival_ns[rows], delivered, distance_m, contact)
+
+
+def _distances_m(recorded: RecordedRun, rows: NDArray[np.intp]) -> Array:
+    """Return the distance (n,) between sender and receiver of rows of the trace, at the time of sending."""
+    ends = recorded.sender[rows], recorded.receiver[rows]
+    return np.asarray(recorded.places.pair_distances_m(*ends, recorded.sent_ns[rows]))
 
 
 def _unicasts_before(recorded: RecordedRun, sender: NDArray[np.intp], seq: IntArray) -> IntArray:
@@ -316,7 +337,7 @@ def _totals(pairs: _Pairs, figures: dict[str, Array]) -> dict[str, float | None]
         "delivery_ratio": _mean(pairs.delivered.astype(float)),
         "latency_mean_ms": _mean(latency_ms),
     }
-    for name in ("inter_reception_mean_ms", "age_mean_ms"):
+    for name in ("inter_reception_mean_ms", "inter_reception_p95_ms", "age_mean_ms", "age_peak_ms"):
         totals[name] = _mean(figures[name][np.isfinite(figures[name])])
     return totals
 

@@ -6,6 +6,7 @@ user's own get one, and so does whoever reads a run from Python.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -15,6 +16,7 @@ import pyarrow as pa
 
 from emulator.faults.plan import PlannedFault
 from emulator.records.events import Event
+from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import BACKBONE, BACKGROUND, DRIVEN
 from emulator.records.verdicts import CheckResult, NotExercised, Record, Verdict
@@ -277,6 +279,15 @@ class Run:
     def reported(self, name: str) -> Array:
         """Return a value of `node.report(…, name=value)` (periods, N); NaN where there is none."""
         return self._recorded.value(name)
+
+    def radio_figures(self, within_m: float = math.inf, from_s: float = 0.0) -> dict[str, float | None]:
+        """Return the figures of `vnet radio` over all attempted receptions: docs/export.md.
+
+        `delivery_ratio`, `latency_mean_ms`, `inter_reception_mean_ms`, `age_mean_ms`, `busy_ratio_mean` and
+        others; None where there is none. Receivers farther than `within_m` metres count as out of range, and frames
+        enqueued before `from_s` seconds are left out. Raises VnetError if the run's files do not fit.
+        """
+        return radio_metrics(self._recorded, within_m=within_m, from_s=from_s).totals
 
     def _period(self, time_s: float) -> int:
         """Index of the period that holds an instant."""

@@ -174,8 +174,8 @@ class Record:
         return Judgement(self.checks, self.not_exercised, self.trace_sha256)
 
     @property
-    def shown_figures(self) -> dict[str, float]:
-        """The key figures that the run has, by title."""
+    def shown_figures(self) -> list[tuple[KeyFigure, float]]:
+        """The key figures that the run has."""
         return shown_figures(self.key_figures, self.figures)
 
     @property

@@ -86,10 +86,10 @@ class Comparison:
 
     @cached_property
     def figures(self) -> list[Row]:
-        """Key figures with B − A; lengths in metres, ratios in percent."""
-        ours, theirs = (record.shown_figures for record in self.records)
-        titles = dict.fromkeys([*ours, *theirs])
-        rows = [_difference(f"{title} (m)", ours.get(title), theirs.get(title), ".3f") for title in titles]
+        """Key figures with B − A; ratios in percent."""
+        ours, theirs = ({each.heading: value for each, value in record.shown_figures} for record in self.records)
+        headings = dict.fromkeys([*ours, *theirs])
+        rows = [_difference(heading, ours.get(heading), theirs.get(heading), ".3f") for heading in headings]
         ratios = [record.packet_delivery_ratio for record in self.records]
         if any(ratio is not None for ratio in ratios):
             percent = [None if ratio is None else 100 * ratio for ratio in ratios]

@@ -185,7 +185,7 @@ def _one_line(value: Any) -> Any:
 
 def key_figures(record: Record) -> dict[str, str]:
     """Return the figures that sum up a run, by title."""
-    found = {title: f"{value:.3f} m" for title, value in record.shown_figures.items()}
+    found = {each.title: each.text(value) for each, value in record.shown_figures}
     if (delivered := record.packet_delivery_ratio) is not None:
         found["packet delivery ratio"] = f"{delivered:.2%}"
     if record.in_range:

@@ -19,6 +19,7 @@ from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN
 from vnet.errors import printable
+from vnet.units import unit_of
 
 Words = tuple[str, Style]
 
@@ -185,7 +186,7 @@ class _Rows:
     def _figure(self, label: str, name: str, about: str) -> Text:
         value = self._shot.figures[name]
         line = Text(sparkline(self._shot.over_time[name], self._axis), SKY)
-        shown = () if value is None else ((f"{_short(value):>5} m", BOLD), (f"  {about}", DIM))
+        shown = () if value is None else ((f"{_short(value):>5} {unit_of(name)}", BOLD), (f"  {about}", DIM))
         return self._row(label, line, *shown)
 
     def frames(self) -> Text:

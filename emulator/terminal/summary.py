@@ -222,8 +222,8 @@ def _figures(verdict: dict[str, Any]) -> Table:
     if verdict.get("backbone"):
         table.add_row("messages on the backbone", on_backbone(verdict["backbone"]))
     key = [KeyFigure(**each) for each in verdict["key_figures"]]
-    for title, value in shown_figures(key, verdict["figures"]).items():
-        table.add_row(f"{title} (mean after the first fifth)", f"{value:.3f} m")
+    for each, value in shown_figures(key, verdict["figures"]):
+        table.add_row(f"{each.title} (mean after the first fifth)", each.text(value))
     return table
 
 

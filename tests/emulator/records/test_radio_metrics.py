@@ -176,6 +176,19 @@ def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.n
 
 
 @settings(max_examples=60, deadline=None)
+@given(traces(), st.floats(5, 300), st.floats(0, 0.9))
+def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(
+    trace: tuple[list[Row], np.ndarray, bool], within_m: float, from_s: float
+) -> None:
+    rows, position_m, moves = trace
+    plain = Plain(rows, position_m, moves)
+    some = [row for row in rows if row["sent_ns"] >= round(from_s * 1e9) and plain.distance_m(row) <= within_m]
+    told = radio_metrics(evidence_of(*trace), within_m=within_m, from_s=from_s)
+    expected = radio_metrics(evidence_of(some, position_m, moves))
+    assert told.links.equals(expected.links) and told.totals == expected.totals
+
+
+@settings(max_examples=60, deadline=None)
 @given(traces(), st.floats(5, 200))
 def test_vehicles_distances_and_totals_add_up(trace: tuple[list[Row], np.ndarray, bool], bin_m: float) -> None:
     rows, position_m, moves = trace
