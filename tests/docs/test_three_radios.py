@@ -1,6 +1,7 @@
 """The study of three radios: its scenario, and what its check says of runs."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,7 +10,7 @@ from docs.examples.three_radios import figure, figures
 from tests.support.paths import ROOT
 
 EXAMPLE = ROOT / "docs" / "examples" / "three_radios"
-RADIOS = [
+RADIOS: list[dict[str, Any]] = [
     {"kind": "80211p"},
     {"kind": "lte-mode4", "subchannels": 5},
     {"kind": "nr-mode2", "subchannels": 5, "scs_khz": 15},
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 def test_a_sweep_has_the_figures_of_near_receptions_of_each_radio(tmp_path: Path) -> None:
     changes = {"radio.shadowing.sigma_db": 0.0, "radio.path_loss.tx_power_dbm": 30.0}
-    vary = {
+    vary: dict[str, list[Any]] = {
         "radio.mac": RADIOS,
         "network.path": [str(EXAMPLE / "50.csv")],
         "program.options": [{"rate_hz": 10, "size_bytes": 190}],
