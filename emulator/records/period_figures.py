@@ -59,7 +59,7 @@ class PeriodFigures:
 class KeyFigure:
     """A figure of the periods, whose mean after the first fifth of a run is shown by `title`.
 
-    Its unit is that in which its name ends (`common_error_rmse_m`), if there is one.
+    Its unit is that in which its name ends (`age_ms`), if there is one.
     """
 
     name: str
