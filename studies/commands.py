@@ -245,6 +245,57 @@ def city(
             _show(study.report(results, duration), folder / "city.md")
 
 
+@app.command()
+def roads(
+    trips: Annotated[Path | None, typer.Option(metavar="FILE", help="Recorded trips beside the cities.")] = None,
+    roads: Annotated[Path | None, typer.Option("--map", metavar="FILE", help="The roads of the trips.")] = None,
+    map_sigma: Annotated[float, typer.Option(min=0, metavar="METRES", help="As of city, for the trips.")] = 0.0,
+    map_aside: Annotated[float, typer.Option(metavar="METRES", help="As of city, for the trips.")] = 0.0,
+    map_datum: Annotated[str | None, typer.Option(metavar="EAST,NORTH", help="As of city, for the trips.")] = None,
+    rate: Annotated[float, typer.Option(min=0.1, max=100, metavar="HZ", help="Fixes a second.")] = 10.0,
+    seeds: SeedsOption = 3,
+    duration: DurationOption = 300.0,
+    out: OutOption = None,
+    only: OnlyOption = None,
+) -> None:
+    """Roads that nobody tuned on: generated cities 101 to 103, and trips, each beside one filter that hears all."""
+    from studies import city as driving
+    from studies import roads as study
+
+    with one_line_errors():
+        folder = _folder(out, "roads")
+        places = study.cities(study.CITIES)
+        if trips is not None or roads is not None:
+            section: dict[str, Any] = {"sigma_m": map_sigma, "aside_m": map_aside}
+            if map_datum is not None:
+                section["datum_m"] = pair("--map-datum", map_datum)
+            places["trips"] = driving.place(trips, roads, section)
+        cells = study.roads_cells(places, range(1, seeds + 1), duration, rate)
+        results = _run(cells, folder, "roads", only)
+        _show(study.report(results, duration, rate), folder / "roads.md")
+
+
+@app.command()
+def decomposition(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 5,
+    duration: DurationOption = 100.0,
+    out: OutOption = None,
+) -> None:
+    """Decomposition: what loss, hops, caps and shares each cost, by oracles that give them back one at a time."""
+    from studies import decomposition as study
+
+    with one_line_errors():
+        folder = _folder(out, "decomposition")
+        results = [
+            {"network": name, **row}
+            for name, section in paper.network_sections(networks).items()
+            for row in study.decompose(section, range(1, seeds + 1), duration)
+        ]
+        write_results(results, folder, "decomposition")
+        _show(study.report(results, duration), folder / "decomposition.md")
+
+
 @app.command("figures")
 def draw_figures(
     networks: NetworksOption = None,

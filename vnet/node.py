@@ -44,7 +44,9 @@ MOMENTS_OF_FAULTS = ("fault_started", "fault_ended")
 class Fix:
     """One GNSS fix: position (2,) in m east-north, covariance (2, 2) in m², heading in radians or None.
 
-    The covariance is that of the receiver's own noise, without the common error of all receivers. A receiver has no
+    The covariance is that of the receiver's own errors, without the common error of all receivers. Where the
+    scenario says `world.gnss.covariance = "total"` it includes multipath, an error in each axis with the deviation
+    `multipath_sigma_m` that lasts for about `multipath_tau_s`; 0 where nothing is stated. A receiver has no
     heading where the scenario says so, for example while the vehicle stands. `speed_m_s` is the vehicle's own speed
     as its receiver measures it, with noise; None if the emulator does not tell it. Where `[world.ranging]` says
     so, driven vehicles measure at the same instant `gap_m`, the clear distance to the vehicle ahead in their lane,
@@ -61,6 +63,8 @@ class Fix:
     gap_m: float | None = None
     gap_rate_m_s: float | None = None
     sensors: Mapping[str, Reading] = field(default_factory=lambda: NOTHING_SENSED)
+    multipath_sigma_m: float = 0.0
+    multipath_tau_s: float = 0.0
 
 
 class NodeTransport(RadioTransport, BackboneTransport, Protocol):

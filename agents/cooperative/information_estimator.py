@@ -195,7 +195,9 @@ class InformationEstimator:
         if own.time_ns <= self._now_ns:
             return
         dt_s, self._now_ns = (own.time_ns - self._now_ns) / NS_PER_S, own.time_ns
-        fix = Observation(own.position_m, own.covariance_m2, own.heading_rad) if usable(own) else None
+        multipath = own.multipath_sigma_m, own.multipath_tau_s
+        seen = Observation(own.position_m, own.covariance_m2, own.heading_rad, multipath=multipath)
+        fix = seen if usable(own) else None
         said = self._lanes.step(dt_s, fix) if self._lanes else self.own.step(dt_s, fix).numbers
         increment = as_sent(said)
         largest = max(map(abs, increment))
@@ -252,7 +254,7 @@ class InformationEstimator:
         pooled = _pooled(weights, priors, about_c)
         now, before = [each for each in now if is_of_lane(each)], [each for each in before if is_of_lane(each)]
         others = (1 - weights[0]) / (1 - SELF_SHARE)
-        self.own.absorb(self._lanes.fuse(pooled, now, before, len(weights) - 1, others))
+        self._lanes.absorb(pooled, now, before, len(weights) - 1, others)
 
     def _shares_used(
         self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, is_before: bool

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from agents.cooperative.cmm.consensus import Share
 from agents.cooperative.cmm.information import Five, plain_moments
-from agents.cooperative.cmm.lane_memory import KINDS, MAX_AGE, information_of
+from agents.cooperative.cmm.lane_memory import ALL_KINDS, MAX_AGE, information_of
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
 from agents.cooperative.vehicle_cache import VehicleCache
 from vnet.types import Array
@@ -268,7 +268,7 @@ def _check_increment(increment: Sequence[float]) -> None:
     if d >= 0:
         if not _is_semidefinite(a, b, d):
             raise FrameError("covariance")
-    elif not (d == round(d) >= -KINDS and -1 <= age <= MAX_AGE and a * a + b * b <= INCREMENT_LIMIT):
+    elif not (d == round(d) >= -ALL_KINDS and -1 <= age <= MAX_AGE and a * a + b * b <= INCREMENT_LIMIT):
         raise FrameError("absurd")
 
 

@@ -59,7 +59,8 @@ class Gnss(Section):
     outlier_m: float = Field(30.0, ge=0, le=WILD_M)
     """Distance by which an outlier is displaced, in any direction."""
     covariance: Literal["noise", "total"] = "noise"
-    """Covariance that fixes state: that of the receiver's `noise` alone, or in `total` with its multipath."""
+    """Covariance that fixes state: that of the receiver's `noise` alone, or in `total` with its multipath, of which
+    they then state deviation and correlation time, too."""
     heading: bool = True
     """True if fixes have a heading."""
     heading_sigma_rad: float = Field(0.01, ge=0, le=1)

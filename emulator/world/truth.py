@@ -107,7 +107,8 @@ class World:
         _check_exceptions(scenario, motion.node_ids)
         if not present.all():
             refuse_shared_processes(scenario, "where vehicles enter or leave")
-        self._covariance_m2 = np.eye(2) * _stated_variance_m2(scenario.world.gnss)
+        self._multipath = _stated_multipath(scenario.world.gnss)
+        self._covariance_m2 = np.eye(2) * (scenario.world.gnss.sigma_m**2 + self._multipath[0] ** 2)
         self._covariance_m2.flags.writeable = False  # one for all fixes
         common = common_errors(scenario, self.periods)
         self._common_m, self.receiver_m = common.common_m, common.receiver_m
@@ -179,6 +180,8 @@ class World:
             None if math.isnan(heading_rad) else heading_rad,
             self._fix_speed_mps[period, node].item(),
             sensors=self.sensed(period, node) if self.own_sensors else NOTHING_SENSED,
+            multipath_sigma_m=self._multipath[0],
+            multipath_tau_s=self._multipath[1],
         )
 
     def fix_m(self, period: int, node: int) -> Array:
@@ -209,10 +212,11 @@ def _place_of(scenario: Scenario) -> str:
     return "the coordinates of its corners" if in_metres else "its origin_deg"
 
 
-def _stated_variance_m2(gnss: Gnss) -> float:
-    """Return the variance (m²) in each axis that fixes state of their own error."""
-    told_m = gnss.multipath_sigma_m if gnss.covariance == "total" else 0.0
-    return gnss.sigma_m**2 + told_m**2
+def _stated_multipath(gnss: Gnss) -> tuple[float, float]:
+    """Return deviation (m) and correlation time (s) of the multipath that fixes state; 0, 0 if none."""
+    if gnss.covariance != "total" or not gnss.multipath_sigma_m:
+        return 0.0, 0.0
+    return gnss.multipath_sigma_m, gnss.multipath_tau_s
 
 
 def periods_of(scenario: Scenario) -> int:

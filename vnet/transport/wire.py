@@ -169,7 +169,7 @@ class WirePacket(msgspec.Struct, frozen=True, array_like=True):
 
 
 class WireFix(msgspec.Struct, frozen=True, array_like=True):
-    """A `Fix` for `node`; the covariance is in row-major order."""
+    """A `Fix` for `node`; the covariance is in row-major order, `multipath` has its deviation and time."""
 
     node: str
     time_ns: TimeNs
@@ -180,6 +180,7 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
     gap_m: float | None = None
     gap_rate_m_s: float | None = None
     sensors: dict[str, Reading] | None = None
+    multipath: tuple[float, float] | None = None
 
     @classmethod
     def of(cls, node: str, fix: Fix) -> WireFix:
@@ -187,13 +188,14 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
         x, y = fix.position_m.tolist()
         a, b, c, d = fix.covariance_m2.ravel().tolist()
         seen = fix.heading_rad, fix.speed_m_s, fix.gap_m, fix.gap_rate_m_s, dict(fix.sensors) or None
-        return cls(node, fix.time_ns, (x, y), (a, b, c, d), *seen)
+        multipath = (fix.multipath_sigma_m, fix.multipath_tau_s) if fix.multipath_sigma_m else None
+        return cls(node, fix.time_ns, (x, y), (a, b, c, d), *seen, multipath)
 
     def fix(self) -> Fix:
         """Return the fix as the program sees it."""
         position_m, covariance_m2 = np.array(self.position_m), np.array(self.covariance_m2).reshape(2, 2)
         seen = self.heading_rad, self.speed_m_s, self.gap_m, self.gap_rate_m_s, self.sensors or NOTHING_SENSED
-        return Fix(self.time_ns, position_m, covariance_m2, *seen)
+        return Fix(self.time_ns, position_m, covariance_m2, *seen, *(self.multipath or ()))
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True):

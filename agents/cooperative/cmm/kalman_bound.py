@@ -8,7 +8,8 @@ same can have a smaller error in the mean, so this filter is the bound of every 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 
 import numpy as np
 import scipy  # its parts are imported when they are first used: `linalg` takes longer than many a run
@@ -45,6 +46,14 @@ class LaneModel:
         """Indices in a vehicle's own state of what adds up to a fix, each for across and along the lane."""
         return [[0, 1]]
 
+    @property
+    def hidden(self) -> tuple[float, float, float] | None:
+        """Share of l that is the vehicle's own offset, and variances (m²) that this and s have beyond: of the rest.
+
+        None if all of it is.
+        """
+        return None
+
     def transition(self, dt_s: float) -> Array:
         """Return F (3, 3) of a vehicle's own state (l, s, v) over `dt_s`."""
         keep = np.exp(-dt_s / self.lateral_tau_s)
@@ -66,6 +75,47 @@ class LaneModel:
     def common_step(self, dt_s: float) -> tuple[float, float]:
         """Return the factor of c over `dt_s`, and the variance (m²) that is added an axis."""
         return common_step(self.common_sigma_m, self.common_tau_s, self.common_walk_m, dt_s)
+
+
+@dataclass(frozen=True)
+class OffsetAndMultipath(LaneModel):
+    """The model with multipath in l and s: what a fix shows of a vehicle's offset and of its place is their sum.
+
+    l is one Gauss-Markov process with the variance of the sum and its power at low frequencies, which decides what
+    a road says of c in the long run. s is known from fixes alone, and so up to the multipath.
+
+    multipath_sigma_m, multipath_tau_s: its deviation an axis in metres and its correlation time in seconds.
+    offset_sigma_m: deviation of the vehicle's own offset.
+    """
+
+    multipath_sigma_m: float = 0.0
+    multipath_tau_s: float = 60.0
+    offset_sigma_m: float = LATERAL_SIGMA_M
+
+    @classmethod
+    def of(cls, lane: LaneModel, sigma_m: float, tau_s: float) -> OffsetAndMultipath:
+        """Return the model of a receiver with this multipath on a lane."""
+        offset_m2, multipath_m2 = lane.lateral_sigma_m**2, sigma_m**2
+        total_m2 = offset_m2 + multipath_m2
+        together = {
+            "lateral_sigma_m": math.sqrt(total_m2),
+            "lateral_tau_s": (offset_m2 * lane.lateral_tau_s + multipath_m2 * tau_s) / total_m2,
+        }
+        laws = {each.name: getattr(lane, each.name) for each in fields(LaneModel)} | together
+        return cls(**laws, multipath_sigma_m=sigma_m, multipath_tau_s=tau_s, offset_sigma_m=lane.lateral_sigma_m)
+
+    @property
+    def hidden(self) -> tuple[float, float, float]:
+        """Share of l that is the vehicle's own offset, and variances (m²) that this and s have beyond."""
+        offset_m2, multipath_m2 = self.offset_sigma_m**2, self.multipath_sigma_m**2
+        share = offset_m2 / (offset_m2 + multipath_m2)
+        return share, share * multipath_m2, multipath_m2
+
+    def process_noise(self, dt_s: float) -> Array:
+        """Return Q (3, 3) of a vehicle's own state over `dt_s`."""
+        noise = super().process_noise(dt_s)
+        noise[1, 1] += self.multipath_sigma_m**2 * (1 - math.exp(-2 * dt_s / self.multipath_tau_s))
+        return noise
 
 
 @dataclass(frozen=True)

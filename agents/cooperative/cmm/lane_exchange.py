@@ -28,7 +28,8 @@ averages hold those of all. Without it the ANEES of c is 0.55 to 0.9 on N1, N2 a
 LEAST_NOISE_M2 = 0.64
 """Variance (m²) of fixes across the lane below which the movement of c between fixes shows in increments about c
 (0.8 m). Where nobody has so precise a receiver increments are about c: they also hold what fixes say along the lane
-(4 % of the error of c), and what the vehicle has learned of c from others."""
+(4 % of the error of c), and what the vehicle has learned of c from others. A receiver that states multipath is
+always taken for a precise one."""
 SMOOTHING = 0.05
 """Weight of the latest period in the share of increments that come from out of range."""
 
@@ -42,7 +43,8 @@ class LaneExchange:
     def __init__(self, own: OwnVehicle, period_s: float) -> None:
         self._own = own
         self._period_s = period_s
-        self._memory = CommonMemory(own.model, period_s)
+        self._model = own.model  # without multipath, of which no fix has told yet
+        self._memory = CommonMemory(self._model, period_s)
         self.has_joined = False
         self._waits = False
         self._waited = 0
@@ -71,7 +73,9 @@ class LaneExchange:
         return self._filter_on(lane, fix).take(fix.position_m, self._memory.age)
 
     def _is_precise(self, lane: OwnKalman, fix: Observation | None) -> bool:
-        return fix is not None and lane.noise_across(fix.covariance_m2) < LEAST_NOISE_M2
+        if fix is None:
+            return False
+        return self._own.model is not self._model or lane.noise_across(fix.white_covariance_m2) < LEAST_NOISE_M2
 
     def _advance(self, periods: int) -> None:
         if self._begins:
@@ -96,19 +100,24 @@ class LaneExchange:
 
     def _filter_on(self, lane: OwnKalman, fix: Observation) -> LaneFilter:
         """Return the filter on this lane, which begins if it is another lane, or another receiver."""
-        kept = self._lane
-        if kept is None or lane is not self._lane_of or kept.differs(fix.covariance_m2):
-            kept = LaneFilter(lane.heading_rad, lane.point_m, self._own.model, fix.covariance_m2, self._period_s)
+        kept, noise_m2, multipath = self._lane, fix.white_covariance_m2, self._multipath()
+        if kept is None or lane is not self._lane_of or kept.differs(noise_m2) or kept.multipath != multipath:
+            kept = LaneFilter((lane.point_m, lane.heading_rad), self._model, noise_m2, self._period_s, multipath)
             self._lane, self._lane_of = kept, lane
         self._memory.follow(kept.kind, is_own=True)
         kept.begin(self._memory.memory(kept.kind))
         return kept
 
+    def _multipath(self) -> tuple[float, float]:
+        """Variance and correlation time of the offset, relative to those without multipath."""
+        own, lane = self._own.model, self._model
+        return (own.lateral_sigma_m / lane.lateral_sigma_m) ** 2, own.lateral_tau_s / lane.lateral_tau_s
+
     # What others say.
 
     def _begin(self, age: int) -> None:
         """Begin again with memories of this age; what is known of c stays."""
-        self._memory = CommonMemory(self._own.model, self._period_s, age)
+        self._memory = CommonMemory(self._model, self._period_s, age)
         self.follow_own()
         self._lane = self._lane_of = None
 
@@ -141,18 +150,18 @@ class LaneExchange:
         """Know of c what the vehicle's filter knows."""
         self._memory.absorb(Information.of(*self._own.belief))
 
-    def fuse(
+    def absorb(
         self, pooled: Information, now: Iterable[Five], before: Sequence[Five], heard: int, weight: float
-    ) -> Information:
-        """Return the belief about c after increments of lanes, of this period and of the one before, in place of
-        `pooled`.
+    ) -> None:
+        """Replace what is known of c by `pooled`, and increments of lanes, of this period and of the one before.
 
         Those of this period came from `heard` vehicles; `weight` is the weight of other vehicles' priors.
         """
         beyond = min(1.0, len(before) / heard) if heard else 0.0
         self._beyond += SMOOTHING * (beyond - self._beyond)
         factor = 1 + UNDERSTATED * self._beyond * min(1.0, weight)
-        return self._memory.fuse(pooled, self._sums(before, factor), self._sums(now, factor))
+        belief = self._memory.fuse(pooled, self._sums(before, factor), self._sums(now, factor))
+        self._own.absorb(belief, is_of_lanes=True)
 
     def _sums(self, increments: Iterable[Five], factor: float) -> dict[int, Five]:
         known = [(kind_of_increment(each), information_of(each)) for each in increments if any(each[:2])]

@@ -10,6 +10,9 @@ c, a vehicle's innovation across its lane is c − u and white noise of its own:
 independent, and add up exactly. `CommonMemory` is a Gaussian over c, its value one period before, and u of each
 *kind* of gain.
 
+Multipath is part of the offset, and makes it larger and last longer. So there are *families* of kinds, by deviation
+and correlation time of the offset relative to those of a receiver without multipath, rounded up.
+
 An increment of a lane is written as (a_x, a_y, −kind, w, age): Λ = a aᵀ and η = a w about c − u.
 """
 
@@ -31,6 +34,12 @@ SAME_NOISE = 0.7
 """Change of the logarithm of a fix's variance up to which the filter keeps its gain."""
 KINDS = 31
 """Number of gains: those of neighbouring kinds differ by a factor of 1.5, and either is nearly the best."""
+SPREAD_STEP, SPREAD_STEPS = 2.0, 8
+"""Factor of the variance of the offset from family to family, and their number: multipath of up to 4 m."""
+TIME_STEP, TIME_STEPS = math.sqrt(2.0), 8
+"""Factor of the correlation time of the offset, and the number of times: up to 11 times that without multipath."""
+ALL_KINDS = KINDS * SPREAD_STEPS * TIME_STEPS
+"""Number of kinds of all families; half precision has integers up to 2048."""
 MAX_KINDS = 6
 """Number of kinds that are followed at a time."""
 UNHEARD_PERIODS = 100
@@ -40,14 +49,33 @@ MAX_AGE = 255
 Moments = tuple[tuple[float, float], Three]
 
 
+def law_of(kind: int, keep: float, spread_m2: float) -> tuple[float, float]:
+    """Return the share of an offset that is left after a period, and its variance, in the family of a kind.
+
+    `keep` and `spread_m2` are those without multipath.
+    """
+    times, spreads = divmod((kind - 1) // KINDS, SPREAD_STEPS)
+    return keep ** (TIME_STEP**-times), spread_m2 * SPREAD_STEP**spreads
+
+
+def first_kind(spread: float, time: float) -> int:
+    """Return the first kind of the family of an offset with these multiples of variance and correlation time."""
+    spreads, times = (
+        min(max(math.ceil(math.log(value) / math.log(step) - 1e-9), 0), count - 1)
+        for value, step, count in ((spread, SPREAD_STEP, SPREAD_STEPS), (time, TIME_STEP, TIME_STEPS))
+    )
+    return 1 + KINDS * (times * SPREAD_STEPS + spreads)
+
+
 @lru_cache(maxsize=256)
 def gains_of(kind: int, keep: float, spread_m2: float) -> tuple[float, ...]:
     """Return the gains K of a kind at each age up to `MAX_AGE`, the last that of its steady state.
 
     They are those of a Kalman filter of an offset with variance `spread_m2`, of which `keep` is left after a
-    period: whoever begins when memories do has the best gain from the first fix on.
+    period, both without multipath: whoever begins when memories do has the best gain from the first fix on.
     """
-    odds = 2.0 ** (FIRST_LOG_ODDS + LOG_ODDS_STEP * (kind - 1))
+    keep, spread_m2 = law_of(kind, keep, spread_m2)
+    odds = 2.0 ** (FIRST_LOG_ODDS + LOG_ODDS_STEP * ((kind - 1) % KINDS))
     last = odds / (1 + odds)
     process_m2 = spread_m2 * (1 - keep * keep)
     noise_m2 = process_m2 / (1 - keep * keep * (1 - last)) * (1 - last) / last
@@ -85,19 +113,30 @@ def information_of(increment: Five) -> Five:
 class LaneFilter:
     """The filter of the offset in one lane with gains that depend on age alone, and of what it makes of c.
 
-    kind: that of its gains.
+    kind: that of its gains. multipath: variance and correlation time of the offset, relative to those of `model`,
+    which is without multipath.
     """
 
     def __init__(
-        self, heading_rad: float, point_m: Array, model: LaneModel, noise_m2: Array, period_s: float
+        self,
+        lane: tuple[Array, float],
+        model: LaneModel,
+        noise_m2: Array,
+        period_s: float,
+        multipath: tuple[float, float] = (1.0, 1.0),
     ) -> None:
+        """Begin on the lane through a point (2,) with a direction, by fixes of this noise (2, 2)."""
+        point_m, heading_rad = lane
         self._normal = math.sin(heading_rad), -math.cos(heading_rad)
         self._at_m = self._across(point_m)
-        moves, noise = float(model.transition(period_s)[0, 0]), float(model.process_noise(period_s)[0, 0])
-        self._keep, self._process_m2, self._spread_m2 = moves, noise, model.lateral_sigma_m**2
+        self.multipath = multipath
+        base = float(model.transition(period_s)[0, 0]), model.lateral_sigma_m**2
+        first = first_kind(*multipath)
+        self._keep, self._spread_m2 = law_of(first, *base)
+        self._process_m2 = self._spread_m2 * (1 - self._keep**2)
         self._noise_m2 = self.noise_across(noise_m2)
-        self.kind = kind_of(_best_gain(moves, noise, self._noise_m2))
-        self._gains = gains_of(self.kind, moves, self._spread_m2)
+        self.kind = first - 1 + kind_of(_best_gain(self._keep, self._process_m2, self._noise_m2))
+        self._gains = gains_of(self.kind, *base)
         self._offset_m, self._variance_m2 = 0.0, math.inf
 
     def differs(self, noise_m2: Array) -> bool:
@@ -194,7 +233,7 @@ class CommonMemory:
             return False
         self._unheard[kind] = 0
         common = self._keep_c, self._more_m2, self._start_m2
-        by_c, by_before, own_m2 = _memory_given_c(self._gains(kind)[: self.age], self._keep, common)
+        by_c, by_before, own_m2 = _memory_given_c(self._gains(kind)[: self.age], self._keep_of(kind), common)
         mean, covariance = self._mean, self._covariance
         count = len(mean)
         rows = by_c * covariance[:2] + by_before * covariance[2:4]
@@ -209,6 +248,9 @@ class CommonMemory:
 
     def _gains(self, kind: int) -> tuple[float, ...]:
         return gains_of(kind, self._keep, self._spread_m2)
+
+    def _keep_of(self, kind: int) -> float:
+        return law_of(kind, self._keep, self._spread_m2)[0]
 
     def _forget(self) -> None:
         old = [kind for kind, periods in self._unheard.items() if periods > UNHEARD_PERIODS]
@@ -234,7 +276,8 @@ class CommonMemory:
         mean, covariance, keep, kinds = self._mean, self._covariance, self._keep_c, len(self._kinds)
         if kinds:
             gains = np.array([self._gains(kind)[self.age] for kind in self._kinds]).repeat(2)
-            stays, takes = self._keep * (1 - gains), self._keep * gains
+            left = np.array([self._keep_of(kind) for kind in self._kinds]).repeat(2)
+            stays, takes = left * (1 - gains), left * gains
             mean[4:] = stays * mean[4:] + takes * np.tile(mean[:2], kinds)
             stays, takes = stays[:, None], takes[:, None]
             covariance[4:] = stays * covariance[4:] + takes * np.tile(covariance[:2], (kinds, 1))
@@ -272,7 +315,7 @@ class CommonMemory:
         if not is_before:
             return 0, 1.0, row, -1.0
         stays = 1 - self._gains(kind)[max(self.age - 1, 0)]
-        return 2, 1 / stays, row, -1 / (stays * self._keep)
+        return 2, 1 / stays, row, -1 / (stays * self._keep_of(kind))
 
     def news(self, kind: int, is_before: bool = False) -> Moments:
         """Return the mean and the covariance of c − u of a kind that is followed, before the period's fix."""

@@ -133,8 +133,12 @@ class OwnKalman:
 
     def position_m(self) -> tuple[Array, Array]:
         """Return the position (2,) of the vehicle and its covariance (2, 2)."""
-        x, y = self._out_of_lane(self._own[0], self._own[1])
+        offset, s, _ = self._own
         ll, ls, _, ss, _, _ = self._o
+        if hidden := self.model.hidden:
+            share, offset_m2, along_m2 = hidden
+            offset, ll, ls, ss = share * offset, share * share * ll + offset_m2, share * ls, ss + along_m2
+        x, y = self._out_of_lane(offset, s)
         xx, xy, yy = self._turned_out_of_lane(ll, ls, ss)
         return np.array([self._point_x + x, self._point_y + y]), np.array([[xx, xy], [xy, yy]])
 
@@ -153,6 +157,16 @@ class OwnKalman:
             self._p = rr + LEAST_VARIANCE_M2, ra, aa + LEAST_VARIANCE_M2
 
     # A period.
+
+    def suit(self, model: LaneModel) -> None:
+        """Go on with another model: something is added to the offset, or only its share in what was is left."""
+        share = min(1.0, (model.lateral_sigma_m / self.model.lateral_sigma_m) ** 2)
+        more_m2 = model.lateral_sigma_m**2 - (share * self.model.lateral_sigma_m) ** 2
+        (offset, s, v), (l_r, l_a, s_r, s_a, v_r, v_a) = self._own, self._cross
+        ll, ls, lv, ss, sv, vv = self._o
+        self._own, self._cross = (share * offset, s, v), (share * l_r, share * l_a, s_r, s_a, v_r, v_a)
+        self._o = share * share * ll + more_m2, share * ls, share * lv, ss, sv, vv
+        self.model, self._steps = model, _Steps.of(model, self._steps.dt_s)
 
     def noise_across(self, noise_m2: Array) -> float:
         """Return the variance of a fix with noise covariance (2, 2) across the lane."""

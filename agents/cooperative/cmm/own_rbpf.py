@@ -121,7 +121,10 @@ class OwnRbpf:
     def position_m(self) -> tuple[Array, Array]:
         """Return the position (2,) of the vehicle and its covariance (2, 2)."""
         place_m, slope, given_m2 = self._place
-        return place_m, given_m2 + _product(_product(slope, self.estimate_covariance_m2), slope.T)
+        covariance_m2 = given_m2 + _product(_product(slope, self.estimate_covariance_m2), slope.T)
+        if hidden := self._model.hidden:
+            covariance_m2 = covariance_m2 + hidden[2] * _IDENTITY  # of the place that fixes show
+        return place_m, covariance_m2
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw `count` equally likely hypotheses (count, 2) of c."""
@@ -139,6 +142,12 @@ class OwnRbpf:
         return OwnKalman(self._point_m[0], float(self._heading_rad[0]), self._model, (mean, covariance))
 
     # A period.
+
+    def suit(self, model: LaneModel) -> None:
+        """Go on with another model: the offset may be further off by what is more there."""
+        more_m2 = model.lateral_sigma_m**2 - self._model.lateral_sigma_m**2
+        self._own_covariance[:, 0, 0] += max(more_m2, 0.0)
+        self._model = model
 
     def predict(self, dt_s: float) -> None:
         """Advance by `dt_s`."""
@@ -187,14 +196,15 @@ class OwnRbpf:
         self._sum_lanes()
         self._settle()
 
-    def absorb(self, pooled: Information) -> None:
+    def absorb(self, pooled: Information, is_of_lanes: bool = False) -> None:
         """Weigh the cloud by `pooled`, which is to replace the belief about c.
 
         A cloud of several humps, one a lane, would be squeezed together if it were moved. With a precise receiver
         humps are narrow, and the moments say much more after a fix than its increment does: then what is new is
-        what `pooled` says beyond the belief before the fix and the increment.
+        what `pooled` says beyond the belief before the fix and the increment. So it is where increments of others
+        are those of lanes (`is_of_lanes`): at the beginning there are none, and less than nothing would be new.
         """
-        a, b, d, x, y = pooled.minus(self._said if self._is_precise else self.belief).numbers
+        a, b, d, x, y = pooled.minus(self._said if self._is_precise or is_of_lanes else self.belief).numbers
         c_x, c_y = self.common_m
         self._log_weight = self._log_weight + c_x * (x - 0.5 * (a * c_x) - b * c_y) + c_y * (y - 0.5 * (d * c_y))
         self._settle()

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.cmm.information import NOTHING, Five, Information
-from agents.cooperative.cmm.kalman_bound import UNKNOWN_ALONG_M, LaneModel
+from agents.cooperative.cmm.kalman_bound import UNKNOWN_ALONG_M, LaneModel, OffsetAndMultipath
 from agents.cooperative.cmm.map_matching import candidate_lanes
 from agents.cooperative.cmm.own_kalman import OwnKalman
 from agents.cooperative.cmm.own_rbpf import OwnRbpf
@@ -36,6 +36,8 @@ SAME_LANE_RAD = 0.02
 """Distance (m) and angle (rad) within which two lanes of a map are taken for the same."""
 MAX_LANES = 8
 """Number of lanes that compete, the nearest."""
+SAME_MULTIPATH = 0.2
+"""Share by which what a receiver states of its multipath may change before the model does."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class OwnVehicle:
         tau_s = 2 * (UNKNOWN_ALONG_M / OFF_ROAD_WALK_M) ** 2
         unknown = replace(self.model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=tau_s)
         self._unknown = unknown
+        self._on_lane, self._multipath = self.model, (0.0, 0.0)
         self._filter: OwnKalman | OwnRbpf = OwnKalman.start(np.zeros(2), 0.0, unknown, start)
         self._is_placed = False
         self._outliers_s = 0.0
@@ -120,6 +123,8 @@ class OwnVehicle:
 
     def step(self, dt_s: float, fix: Observation | None) -> Information:
         """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
+        if fix is not None:
+            self._suit(fix.multipath)
         self._filter.predict(dt_s)
         self.prior = self._filter.belief
         self.took_fix = False
@@ -128,23 +133,37 @@ class OwnVehicle:
         was_placed = self._is_placed
         if not was_placed:
             self._place(fix)
-        increment = self._filter.take(fix.position_m, fix.covariance_m2, GATE_SIGMAS**2)
+        noise_m2 = fix.white_covariance_m2
+        increment = self._filter.take(fix.position_m, noise_m2, GATE_SIGMAS**2)
         if increment is None:
             self._is_placed = was_placed  # along a lane nothing is known before a fix has been taken
             self._outliers_s += dt_s
             if self._outliers_s < LOST_S:
                 return NOTHING
             self._place(fix)
-            increment = self._filter.take(fix.position_m, fix.covariance_m2)
+            increment = self._filter.take(fix.position_m, noise_m2)
             assert increment is not None, "without a gate each fix is taken"
         self._outliers_s = 0.0
         self.took_fix = True
         self._go_on()
         return increment
 
-    def absorb(self, pooled: Information) -> None:
-        """Replace what is known of c by `pooled`."""
-        self._filter.absorb(pooled)
+    def _suit(self, multipath: tuple[float, float]) -> None:
+        """Take the model of a receiver with this multipath, deviation (m) and correlation time (s)."""
+        before, now = self._multipath, multipath
+        if all(abs(b - a) <= SAME_MULTIPATH * a for a, b in zip(before, now, strict=True)):
+            return
+        self._multipath = multipath
+        was, self.model = self.model, OffsetAndMultipath.of(self._on_lane, *now) if now[0] else self._on_lane
+        if isinstance(self._filter, OwnRbpf) or self._filter.model is was:
+            self._filter.suit(self.model)
+
+    def absorb(self, pooled: Information, is_of_lanes: bool = False) -> None:
+        """Replace what is known of c by `pooled`, which has increments of lanes if so (`lane_memory`)."""
+        if isinstance(self._filter, OwnRbpf):
+            self._filter.absorb(pooled, is_of_lanes)
+        else:
+            self._filter.absorb(pooled)
         self._go_on()
 
     def _go_on(self) -> None:

@@ -12,6 +12,8 @@ So each hypothesis is a Gaussian over [c, p, v, l], the common error, position a
 - as long as it stands, l stays, and the map says nothing new.
 
 That the vehicle is on no road is the last hypothesis: anywhere within 15 m of one. From it lanes are found again.
+
+Multipath that a receiver states is part of p and of l: p is then what fixes show, up to c and white noise.
 """
 
 from __future__ import annotations
@@ -327,6 +329,7 @@ class OwnVehicleOnMap:
         self._anchor_m = np.full(2, np.nan)
         self._outliers_s = 0.0
         self._heading_rad: float | None = None
+        self._multipath = (0.0, 0.0)
         self.owed = NOTHING
         self._take_moments()
         self.prior = Information.of(*self.belief)
@@ -363,7 +366,9 @@ class OwnVehicleOnMap:
 
     def position_m(self) -> tuple[Array, Array] | None:
         """Return position (2,) and covariance (2, 2); None as long as no fix tells it."""
-        return (self._mean[2:4], self._covariance[2:4, 2:4]) if self._is_placed else None
+        if not self._is_placed:
+            return None
+        return self._mean[2:4], self._covariance[2:4, 2:4] + self._multipath[0] ** 2 * np.eye(2)
 
     def sample(self, count: int) -> Array:
         """Draw `count` hypotheses (count, 2) of the common error."""
@@ -371,6 +376,8 @@ class OwnVehicleOnMap:
 
     def step(self, dt_s: float, fix: Observation | None) -> Information:
         """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
+        if fix is not None:
+            self._multipath = fix.multipath
         self._predict(dt_s)
         self._take_moments()
         self.prior = Information.of(*self.belief)
@@ -386,7 +393,7 @@ class OwnVehicleOnMap:
                 return NOTHING
             self._place(fix)
         else:
-            self._hypotheses.update(fix.position_m, fix.covariance_m2)
+            self._hypotheses.update(fix.position_m, fix.white_covariance_m2)
         self._outliers_s = 0.0
         self._look(fix)
         self._take_moments()
@@ -401,12 +408,15 @@ class OwnVehicleOnMap:
         noise[:2, :2] = variance_m2 * np.eye(2)
         gain = np.vstack([dt_s**2 / 2 * np.eye(2), dt_s * np.eye(2)])
         noise[2:OFFSET, 2:OFFSET] = gain @ white_acceleration(self._heading_rad, config.driving_m2_s4) @ gain.T
+        sigma_m, tau_s = self._multipath
+        if sigma_m:
+            noise[2:4, 2:4] += sigma_m**2 * (1 - math.exp(-2 * dt_s / tau_s)) * np.eye(2)
         self._hypotheses.predict(move, noise)
 
     def _is_outlier(self, fix: Observation) -> bool:
         off_m = fix.position_m - self._mean[:2] - self._mean[2:4]
         rows = self._covariance[:2] + self._covariance[2:4]
-        seen = rows[:, :2] + rows[:, 2:4] + fix.covariance_m2
+        seen = rows[:, :2] + rows[:, 2:4] + fix.white_covariance_m2
         return bool(off_m @ np.linalg.solve(seen, off_m) > self._config.gate_sigmas**2)
 
     def _place(self, fix: Observation) -> None:
@@ -416,7 +426,7 @@ class OwnVehicleOnMap:
         mean[:2], mean[2:4] = mean_m, fix.position_m - mean_m
         covariance[:2, :2] = covariance_m2
         covariance[:2, 2:4] = covariance[2:4, :2] = -covariance_m2
-        covariance[2:4, 2:4] = covariance_m2 + fix.covariance_m2
+        covariance[2:4, 2:4] = covariance_m2 + fix.white_covariance_m2
         covariance[4:OFFSET, 4:OFFSET] = self._config.driving_m_s**2 * np.eye(2)
         self._hypotheses = RoadHypotheses(mean, covariance, self._config.off_road, self._config.lateral_m)
         self._anchor_m = np.full(2, np.nan)
@@ -457,7 +467,7 @@ class OwnVehicleOnMap:
             normal=roads.normal[found],
             offset_m=roads.offset_m[found],
             heading_rad=roads.heading_rad[found],
-            sigma_m=self._sigma_m[found],
+            sigma_m=np.hypot(self._sigma_m[found], self._multipath[0]),
         )
 
     def _gained(self) -> Information:

@@ -96,12 +96,25 @@ class RbpfConfig:
 
 @dataclass(frozen=True)
 class Observation:
-    """A fix of one vehicle: `position_m` (2,) by its receiver, noise covariance (2, 2), heading if known, age."""
+    """A fix of one vehicle: `position_m` (2,) by its receiver, covariance (2, 2), heading if known, age.
+
+    multipath: deviation (m) and correlation time (s) of the part of the covariance that lasts; 0, 0 for none.
+    """
 
     position_m: Array
     covariance_m2: Array
     heading_rad: float | None
     age_s: float = 0.0
+    multipath: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def white_covariance_m2(self) -> Array:
+        """The covariance (2, 2) of the noise, which is new in each fix."""
+        if not self.multipath[0]:
+            return self.covariance_m2
+        white_m2 = self.covariance_m2 - self.multipath[0] ** 2 * np.eye(2)
+        (a, b), (_, d) = white_m2.tolist()
+        return white_m2 if min(a, d) > 0 and a * d > b * b else LEAST_NOISE_M2 * np.eye(2)
 
     @property
     def inexact_covariance_m2(self) -> Array:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from agents.cooperative.cmm.information import Five, Information
 from agents.cooperative.cmm.kalman_bound import LaneModel
 from agents.cooperative.cmm.lane_memory import (
+    ALL_KINDS,
     KINDS,
     MAX_KINDS,
     CommonMemory,
@@ -20,6 +21,7 @@ from agents.cooperative.cmm.lane_memory import (
     information_of,
     kind_of,
     kind_of_increment,
+    law_of,
     summed,
 )
 from vnet.types import Array
@@ -33,7 +35,13 @@ SPREAD_M2 = MODEL.lateral_sigma_m**2
 def noise_m2(kind: int) -> float:
     """Return the variance of fixes for which the gains of `kind` are the best."""
     first = gains_of(kind, KEEP, SPREAD_M2)[0]
-    return SPREAD_M2 * (1 - first) / first
+    return law_of(kind, KEEP, SPREAD_M2)[1] * (1 - first) / first
+
+
+def multipath_of(kind: int) -> tuple[float, float]:
+    """Return variance and correlation time of the offset in the family of `kind`, relative to the first one."""
+    keep, spread_m2 = law_of(kind, KEEP, SPREAD_M2)
+    return spread_m2 / SPREAD_M2, math.log(KEEP) / math.log(keep)
 
 
 class AllStates:
@@ -42,16 +50,16 @@ class AllStates:
     def __init__(self, heading_rad: Array, kinds: list[int]) -> None:
         self._normal = np.column_stack([np.sin(heading_rad), -np.cos(heading_rad)])
         self._noise_m2 = np.diag([noise_m2(kind) for kind in kinds])
-        count = len(kinds)
-        self.mean = np.zeros(2 + count)
-        self.covariance = np.diag([MODEL.common_sigma_m**2] * 2 + [SPREAD_M2] * count)
+        laws = [law_of(kind, KEEP, SPREAD_M2) for kind in kinds]
+        self._keep, self._spread_m2 = [keep for keep, _ in laws], np.array([spread_m2 for _, spread_m2 in laws])
+        self.mean = np.zeros(2 + len(kinds))
+        self.covariance = np.diag([MODEL.common_sigma_m**2] * 2 + self._spread_m2.tolist())
 
     def predict(self) -> None:
         keep_c, more_m2 = MODEL.common_step(PERIOD_S)
-        count = len(self.mean) - 2
-        moves = np.array([keep_c] * 2 + [KEEP] * count)
+        moves = np.array([keep_c] * 2 + self._keep)
         self.mean = moves * self.mean
-        noise = np.diag([more_m2] * 2 + [SPREAD_M2 * (1 - KEEP**2)] * count)
+        noise = np.diag([more_m2] * 2 + (self._spread_m2 * (1 - moves[2:] ** 2)).tolist())
         self.covariance = self.covariance * np.outer(moves, moves) + noise
 
     def take(self, across_m: Array) -> None:
@@ -64,16 +72,18 @@ class AllStates:
 
 @st.composite
 def vehicles(draw: st.DrawFn) -> tuple[Array, list[int], int]:
-    """Draw headings, kinds of at most three receivers, and a seed."""
+    """Draw headings, kinds of at most three receivers with or without multipath, and a seed."""
     count = draw(st.integers(2, 6))
     heading_rad = np.array(draw(st.lists(st.floats(0, 6.28), min_size=count, max_size=count)))
     some = draw(st.lists(st.integers(4, 28), min_size=1, max_size=3, unique=True))
+    families = draw(st.lists(st.integers(0, ALL_KINDS // KINDS - 1) | st.just(0), min_size=3, max_size=3))
+    some = [kind + KINDS * family for kind, family in zip(some, families, strict=False)]
     return heading_rad, [some[k % len(some)] for k in range(count)], draw(st.integers(0, 2**32 - 1))
 
 
 def _filters(heading_rad: Array, kinds: list[int]) -> list[LaneFilter]:
     return [
-        LaneFilter(float(heading), np.zeros(2), MODEL, noise_m2(kind) * np.eye(2), PERIOD_S)
+        LaneFilter((np.zeros(2), float(heading)), MODEL, noise_m2(kind) * np.eye(2), PERIOD_S, multipath_of(kind))
         for heading, kind in zip(heading_rad, kinds, strict=True)
     ]
 
@@ -166,8 +176,8 @@ def test_kinds_that_nobody_uses_are_forgotten_and_no_more_than_a_few_are_followe
     assert all(memory.follow(kind) for kind in range(20, 20 + MAX_KINDS - 1))
 
 
-@pytest.mark.parametrize("kind", range(1, KINDS + 1))
+@pytest.mark.parametrize("kind", [*range(1, KINDS + 1), 20 + KINDS, 20 + KINDS * 63])
 def test_a_kind_has_its_own_gain(kind: int) -> None:
     gains = gains_of(kind, KEEP, SPREAD_M2)
-    assert kind_of(gains[-1]) == kind
+    assert kind_of(gains[-1]) == 1 + (kind - 1) % KINDS
     assert max(np.diff(gains)) < 1e-9, "the less is known, the more a fix says"

@@ -1,0 +1,144 @@
+"""Receivers of all kinds in one network: stated multipath, outliers, and headings that come and go."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents.cooperative.cmm.kalman_bound import LaneModel, OffsetAndMultipath
+from agents.cooperative.cmm.own_vehicle import OwnConfig, OwnVehicle
+from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
+from tests.agents.cooperative.test_information import PERIOD_NS, MovingNetwork
+from vnet import Fix
+from vnet.roads.lanes import LaneMap
+
+pytestmark = pytest.mark.slow
+PERIOD_S = PERIOD_NS / 1e9
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """A receiver: deviation of its noise, deviation and correlation time of multipath, shares of bad fixes."""
+
+    sigma_m: float = 1.0
+    multipath_m: float = 0.0
+    tau_s: float = 60.0
+    outliers: float = 0.0
+    headless: float = 0.0
+
+
+class MixedNetwork(MovingNetwork):
+    """Vehicles with any receivers; what they state of multipath is true."""
+
+    def __init__(self, receivers: list[Receiver], seed: int, reach: int | None = None) -> None:
+        super().__init__([each.sigma_m for each in receivers], seed, reach)
+        self._receivers = receivers
+        self._multipath_m = np.array([each.multipath_m for each in receivers])[:, None] * self._rng.standard_normal(
+            (len(receivers), 2)
+        )
+
+    def advance(self) -> None:
+        """Run a period, and move on."""
+        super().advance()
+        for row, each in zip(self._multipath_m, self._receivers, strict=True):
+            keep = math.exp(-PERIOD_S / each.tau_s)
+            row *= keep
+            row += each.multipath_m * math.sqrt(1 - keep**2) * self._rng.standard_normal(2)
+
+    def fix(self, k: int) -> Fix:
+        """Return a fix of vehicle k."""
+        fix, receiver = super().fix(k), self._receivers[k]
+        away_m = 30.0 if self._rng.random() < receiver.outliers else 0.0
+        direction = self._rng.standard_normal(2)
+        return replace(
+            fix,
+            position_m=fix.position_m + self._multipath_m[k] + away_m * direction / np.linalg.norm(direction),
+            covariance_m2=fix.covariance_m2 + receiver.multipath_m**2 * np.eye(2),
+            heading_rad=None if self._rng.random() < receiver.headless else fix.heading_rad,
+            multipath_sigma_m=receiver.multipath_m,
+            multipath_tau_s=receiver.tau_s if receiver.multipath_m else 0.0,
+        )
+
+
+def consistency(receivers: list[Receiver], seeds: int, reach: int, periods: int = 60) -> float:
+    """Return the mean of the normalized squared errors of c over some runs."""
+    found = []
+    for seed in range(seeds):
+        network = MixedNetwork(receivers, seed, reach)
+        for _ in range(periods):
+            network.advance()
+            found.append(network.normalized())
+    return float(np.mean(found))
+
+
+@pytest.mark.parametrize("reach", [1, 6])
+@pytest.mark.parametrize(
+    "receivers",
+    [
+        [Receiver(multipath_m=1.0)] * 6,
+        [Receiver(sigma_m=0.1, multipath_m=1.0)] * 6,
+        [Receiver(0.1), Receiver(1.0, 0.5), Receiver(3.0, 3.0)] * 2,
+    ],
+)
+def test_with_multipath_that_is_stated_vehicles_do_not_claim_too_much(
+    receivers: list[Receiver], reach: int
+) -> None:
+    assert consistency(receivers, 4, reach) < 1.8
+
+
+receivers = st.builds(
+    Receiver,
+    sigma_m=st.sampled_from([0.03, 0.1, 0.3, 1.0, 3.0, 10.0]),
+    multipath_m=st.sampled_from([0.0, 0.3, 1.0, 3.0]),
+    tau_s=st.floats(20, 200),
+    outliers=st.sampled_from([0.0, 0.02, 0.1]),
+    headless=st.sampled_from([0.0, 0.5, 1.0]),
+)
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(st.lists(receivers, min_size=3, max_size=6), st.integers(0, 2**16), st.integers(1, 3))
+def test_in_any_network_errors_are_as_stated(drawn: list[Receiver], seed: int, reach: int) -> None:
+    """A world is one sample: the normalized squared error of two coordinates is beyond 16 once in ten million."""
+    network = MixedNetwork(drawn, seed, reach)
+    for _ in range(40):
+        network.advance()
+    assert network.normalized() < 16
+    for estimator in network.estimators:
+        assert np.isfinite(estimator.common_error[0]).all()
+        assert (np.linalg.eigvalsh(estimator.common_error[1]) > 0).all()
+
+
+def test_offset_and_multipath_make_one_process() -> None:
+    lane = LaneModel()
+    both = OffsetAndMultipath.of(lane, 1.0, 60.0)
+    assert both.lateral_sigma_m**2 == pytest.approx(lane.lateral_sigma_m**2 + 1)
+    power = lane.lateral_sigma_m**2 * lane.lateral_tau_s + 60.0
+    assert both.lateral_sigma_m**2 * both.lateral_tau_s == pytest.approx(power)
+    share, across_m2, along_m2 = both.hidden
+    assert share**2 * both.lateral_sigma_m**2 + across_m2 == pytest.approx(lane.lateral_sigma_m**2)
+    assert along_m2 == 1.0
+
+
+def observed(sigma_m: float = 1.0, multipath_m: float = 0.0) -> Observation:
+    covariance_m2 = (sigma_m**2 + multipath_m**2) * np.eye(2)
+    return Observation(np.array([0.2, 0.1]), covariance_m2, 0.0, multipath=(multipath_m, 60.0))
+
+
+def test_positions_are_as_uncertain_as_the_multipath_that_nobody_can_tell_from_them() -> None:
+    lanes = LaneMap(np.zeros((1, 2)), np.zeros(1), 0.85)
+    own = OwnVehicle(OwnConfig(RbpfConfig()), lanes, np.random.default_rng(1))
+    for _ in range(20):
+        own.step(0.1, observed(0.1, 2.0))
+    position = own.position_m()
+    assert position is not None
+    across_m2, along_m2 = position[1][1, 1], position[1][0, 0]
+    assert along_m2 > 4 and 0.38**2 * 0.8 < across_m2 <= 0.38**2 * 1.01
+    own.step(0.1, observed(0.1))
+    position = own.position_m()
+    assert position is not None and position[1][1, 1] < 0.38**2
