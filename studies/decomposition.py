@@ -173,7 +173,7 @@ def _information(mean: Array, covariance: Array) -> Array:
 def _moments(information: Array) -> tuple[Array, Array]:
     a, b, d = information[..., 0], information[..., 1], information[..., 2]
     matrix = np.stack([np.stack([a, b], axis=-1), np.stack([b, d], axis=-1)], axis=-2)
-    covariance: Array = np.linalg.inv(matrix)
+    covariance = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     return (covariance @ information[..., 3:, None])[..., 0], covariance
 
 
