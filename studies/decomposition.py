@@ -1,4 +1,4 @@
-"""Where the error of c above its bound comes from: oracles that give back, one at a time, what the exchange loses.
+"""Decomposition of the error of c above its bound: oracles give back, one at a time, what the exchange loses.
 
 The vehicles of a network are Gaussian filters with the rules of `information_estimator`, without defence and
 particles, all seeds at once as arrays. The fixes are those of the emulator's world. An oracle changes one rule:
@@ -133,7 +133,7 @@ class Filters:
 
     @property
     def belief(self) -> Array:
-        """What is known of c (S, N, 5)."""
+        """The belief about c (S, N, 5)."""
         return _information(self.mean[..., :2], self.covariance[..., :2, :2])
 
     def predict(self) -> None:
