@@ -52,7 +52,7 @@ ONLY_PARSED = {
     r"^vnet (view|play) ": "opens a window, or serves until somebody has looked",
     r"^vnet(-agent| emulator| host).*tls/": "needs another host, or its address",
     r"dask://HOST": "needs other hosts",
-    r"^vnet sweep .*(three_radios/200|traffic|positioning)": "takes half an hour",
+    r"^vnet sweep .*(three_radios/[24]00|traffic|positioning)": "takes half an hour",
     r"^vnet experiment .*DIR/": "needs recorded trips that are not part of vnet",
 }
 if importlib.util.find_spec("libsumo") is None:
