@@ -1,6 +1,6 @@
-"""Print the table of docs/how-to/three-radios.md from the table of its sweep, and draw its figure.
+"""Print the table of docs/how-to/three-radios.md from the tables of its sweeps, and draw its figure.
 
-python docs/examples/three_radios/figure.py runs/sweep-three-radios/sweep.parquet three-radios.png
+python docs/examples/three_radios/figure.py runs/three/sweep.parquet [MORE.parquet ...] three-radios.png
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ Point = tuple[str, str, int]
 """A radio, a traffic, and vehicles a kilometre."""
 
 
-def samples(table_path: str) -> dict[Point, dict[str, list[float]]]:
+def samples(*table_paths: str) -> dict[Point, dict[str, list[float]]]:
     """Return the values of all seeds of each figure, by point."""
     found: dict[Point, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in pq.read_table(table_path).to_pylist():
+    for row in (row for path in table_paths for row in pq.read_table(path).to_pylist()):
         options = json.loads(row["program.options"])
         traffic = f"{options['rate_hz']} Hz, {options['size_bytes']} bytes"
         point = json.loads(row["radio.mac"])["kind"], traffic, int(Path(row["network.path"]).stem)
@@ -85,9 +85,10 @@ def draw(found: dict[Point, dict[str, list[float]]], picture_path: str) -> None:
     figure.savefig(picture_path, dpi=110, metadata={"Software": None})
 
 
-def main(table_path: str, picture_path: str) -> None:
-    """Print and draw."""
-    found = samples(table_path)
+def main(*paths: str) -> None:
+    """Print and draw; the last path is that of the picture."""
+    *table_paths, picture_path = paths
+    found = samples(*table_paths)
     print_table(found)
     draw(found, picture_path)
 
