@@ -257,12 +257,12 @@ class Topology:
         self._valid_ns = self._span(0)
         self._max_peers = max_peers
         self._nakagami = nakagami
-        self._position_m = position_m
+        self._position_m = position_m.copy()
         self._links: Links | None = None
         self._is_ranked = False
         self.up = np.ones(len(position_m), dtype=bool)
         self._now: TopologySnapshot
-        self.move(position_m)
+        self._link()
 
     @property
     def now(self) -> TopologySnapshot:
@@ -293,7 +293,7 @@ class Topology:
         if not first_ns <= time_ns < end_ns:
             self._connectivity = self._connectivity.at(time_ns)
             self._valid_ns = self._span(time_ns)
-            self.move(self._position_m)
+            self._link()
 
     def _span(self, time_ns: int) -> tuple[float, float]:
         """Return the times from which and until which links are as they are at a time."""
@@ -303,8 +303,14 @@ class Topology:
         return first_ns, end_ns
 
     def move(self, position_m: Array) -> None:
-        """Move the vehicles to `position_m` (N, 2)."""
-        self._position_m, self._links = position_m, None
+        """Move the vehicles to `position_m` (N, 2). Where all of them stand, nothing is computed again."""
+        if not np.array_equal(position_m, self._position_m, equal_nan=True):
+            self._position_m = position_m.copy()
+            self._link()
+
+    def _link(self) -> None:
+        """Compute the snapshot at the present positions."""
+        position_m, self._links = self._position_m, None
         if self._nakagami is None and len(position_m) > MOST_IN_MATRICES:
             self._links = self._connectivity.links(position_m)
             self._now = _snapshot_of(self._links, position_m)

@@ -12,7 +12,7 @@ from xml.parsers import expat
 from pydantic import Field, model_validator
 
 from emulator.scenario.program import Entry
-from emulator.scenario.sections import DAY_S, FAR_M, FAR_S, WILD_M, Section
+from emulator.scenario.sections import DAY_S, FAR_M, FAR_S, WILD_M, Section, Switch
 from vnet.bounded import read_bounded
 from vnet.errors import ScenarioError, shown
 from vnet.transport.keys import is_segment
@@ -256,7 +256,7 @@ class Network(Section):
     """Trips: a vehicle with many steps that no vehicle can make is left out, which one line says, or the run is
     refused. If most vehicles are so, units or ids are wrong, and the run is refused in any case."""
 
-    step: bool = False
+    step: Switch = False
     """`sumo`: SUMO is stepped with the run, and programs drive their vehicles among its others; else it has driven
     all of them before the run begins."""
 

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from emulator.scenario.network import OriginDeg
-from emulator.scenario.sections import Section
+from emulator.scenario.sections import Section, Switch
 from emulator.scenario.sidelink import CrLimit, LteMode4, NrMode2
 
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
@@ -162,7 +162,7 @@ class Edca(Section):
     """Access category of EDCA; it sets the interframe space and the contention window."""
     carrier_sense_dbm: float = Field(-85.0, ge=-300, le=100)
     """Total received power from which the medium is busy."""
-    eifs: bool = False
+    eifs: Switch = False
     """True if vehicles wait for EIFS also after broadcasts that they could not decode."""
 
 

@@ -25,7 +25,7 @@ from emulator.scenario.radio import (
     Receiver,
     Shadowing,
 )
-from emulator.scenario.sections import DAY_S, FAR_M, Section
+from emulator.scenario.sections import DAY_S, FAR_M, Section, Switch
 from emulator.scenario.sidelink import CrLimit, Sidelink
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
 from vnet.errors import ProgramError, shown
@@ -53,7 +53,7 @@ class Run(Section):
     """Agent processes: `fork` them from one that has imported what they need (on Linux) or `spawn` interpreters."""
     join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
     """Time for agents to join, or to come back after a fault (wall clock)."""
-    windows: bool = True
+    windows: Switch = True
     """Lockstep: processes run alone for as long as no frame sent meanwhile can arrive (`radio.latency_ms`), and not
     for one instant. The run is the same; `false` is for agents that know no windows."""
     order: Literal["fifo", "shuffle", "pct"] = "fifo"
@@ -82,7 +82,7 @@ class Run(Section):
     memory_limit_mb: float | None = Field(None, gt=0, le=1_000_000_000)
     """Megabytes of private memory that a process of programs may hold; more ends the run as unknown. No limit if
     left out. In a simulation the process may be the emulator's own, with its trace."""
-    keep_payloads: bool = False
+    keep_payloads: Switch = False
     """Keep the payloads of all frames in `payloads.parquet`; until the end of the run they are in memory."""
     control_hz: float = Field(10.0, ge=10, le=100)
     """Control instants a second of vehicles that programs drive: a whole multiple of `world.gnss.rate_hz`."""

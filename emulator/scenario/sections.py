@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar, get_args
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from vnet.errors import did_you_mean, printable, shown
@@ -19,6 +19,8 @@ WILD_M = 1e5
 """No standard deviation is larger, so that fixes stay near enough for frames to say."""
 FAR_S = 1e11
 """Times of files, which may be seconds since 1970, are within ± three thousand years."""
+Switch = Annotated[bool, Field(strict=True)]
+"""True or false, and no word or number that stands for it."""
 
 WORDS = {
     **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "a table is needed"),

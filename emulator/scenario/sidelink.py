@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from emulator.scenario.sections import Section
+from emulator.scenario.sections import Section, Switch
 from vnet.units import NS_PER_MS
 
 QPSK_07_SINR_DB = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 20.0, 20.001)
@@ -52,7 +52,7 @@ class Sidelink(Section):
     """Slots from a frame to its selection window, to process it: in mode 4 at most 4, in mode 2 at most 9."""
     t2_ms: int = Field(100, ge=10, le=100)
     """End of the selection window, and the delay beyond which a frame gets a resource of its own."""
-    retransmit: bool = False
+    retransmit: Switch = False
     """True if each frame is transmitted twice, the second time within 15 slots."""
     in_band_emission_db: float = Field(30.0, ge=0, le=300)
     """Attenuation of a signal in the subchannels that it does not use."""
@@ -114,7 +114,7 @@ class LteMode4(Sidelink):
 
     kind: Literal["lte-mode4"]
     """This MAC."""
-    one_shot: bool = False
+    one_shot: Switch = False
     """True if every second to sixth frame is sent on a resource of its own, once (SAE J3161/1)."""
 
 
@@ -135,7 +135,7 @@ class NrMode2(Sidelink):
     """Percentage of the resources that must remain as candidates."""
     scheduling: Literal["sps", "dynamic"] = "sps"
     """`sps` reserves a resource for the frames to come; `dynamic` selects one for each frame."""
-    re_evaluation: bool = True
+    re_evaluation: Switch = True
     """True if a new resource is checked once more, `t1_slots` before it is used, and replaced if it is taken."""
 
     @property

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from emulator.scenario.network import Driven, Ranging, control_step_ns
 from emulator.scenario.program import Entry
-from emulator.scenario.sections import DAY_S, FAR_M, FAR_S, WILD_M, Section
+from emulator.scenario.sections import DAY_S, FAR_M, FAR_S, WILD_M, Section, Switch
 from vnet.units import NS_PER_MS, NS_PER_S
 
 
@@ -61,7 +61,7 @@ class Gnss(Section):
     covariance: Literal["noise", "total"] = "noise"
     """Covariance that fixes state: that of the receiver's `noise` alone, or in `total` with its multipath, of which
     they then state deviation and correlation time, too."""
-    heading: bool = True
+    heading: Switch = True
     """True if fixes have a heading."""
     heading_sigma_rad: float = Field(0.01, ge=0, le=1)
     """Standard deviation of that heading."""

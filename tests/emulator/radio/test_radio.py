@@ -67,10 +67,14 @@ def test_who_is_in_range_is_told_by_the_powers_where_there_are_any(
     then_m[7] = np.nan
     topology = Topology(first_m, reach, 1000, nakagami)
     topology.move(then_m)
+    topology.move(then_m.copy())
     assert counted.times == (2 if "path_loss" in radio else 0), "once for each set of positions"
     in_range = reach.in_range(then_m, distances_m(then_m))
     assert np.array_equal(topology.now.in_range, in_range)
     assert in_range.any() and not in_range[7].any() and not in_range[:, 7].any()
+    then_m[:] = first_m
+    topology.move(then_m)
+    assert np.array_equal(topology.now.in_range, reach.in_range(first_m, distances_m(first_m))), "moved in place"
 
 
 def test_where_vehicles_drive_powers_are_worked_out_once_a_period(
