@@ -275,17 +275,20 @@ def check_isolation(recorded: RecordedRun) -> Finding:
     refused = sum(int(event.details.get("count", 0)) for event in recorded.event(EventKind.refused_total))
     arrived = int(recorded.arrived.sum())
     strangers_at = sorted({event.node or "" for event in recorded.event(EventKind.extra_session)})
-    if not arrived and not strangers_at:
+    found_at = sorted({event.node or "" for event in recorded.event(EventKind.found_session)})
+    if not arrived and not strangers_at and not found_at:
         return nothing_seen(recorded, "nothing arrived")
     foreign = _foreign(recorded)
     claims = _claims_beyond(recorded)
-    broken = int(foreign.sum()) + len(claims) + len(strangers_at)
+    broken = int(foreign.sum()) + len(claims) + len(strangers_at) + len(found_at)
     reporting = int(np.isfinite(recorded.value("heard")).any(axis=0).sum())
     text = f"{counted(arrived, 'arrival')} as they were sent"
     text += f"; {reporting} programs report no more received packets than that" if reporting else ""
     unsent, overstated = counted(int(foreign.sum()), "arrival"), counted(len(claims), "report")
     broken_text = f"{unsent} of what was never sent, {overstated} of more than arrived"
     broken_text += f", sessions beside the radio at {first_names(strangers_at)}" if strangers_at else ""
+    if found_at:
+        broken_text += f', peers of {first_names(found_at)} are found by multicast (mode "client" is not)'
     figures = {"arrivals": arrived, "foreign": int(foreign.sum()), "claims": len(claims), "refused": refused}
     return result(broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
 

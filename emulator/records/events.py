@@ -160,6 +160,9 @@ class EventKind(StrEnum):
     extra_session = (
         "extra_session", "vehicle", "count limit which", "more Zenoh sessions than `program.zenoh.sessions` are "
         "connected to its endpoint: a way around the radio, and no isolation", FAILURE)
+    found_session = (
+        "found_session", "vehicle", "which", "this session of its program is a peer that others find by multicast, "
+        "past the radio: mode `client`, which `Config.from_env()` has, prevents it", FAILURE)
     observer_ended = "observer_ended", "process", "how", "a recorder ended before the run did", WARNING
     host_gone = (
         "host_gone", "", "host where", "the connection of this host closed; its processes have `died` with it",

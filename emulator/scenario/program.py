@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from emulator.scenario.sections import DAY_S, FAR_M, Section
 from vnet.errors import ScenarioError, shown
+from vnet.gateway import FILLED_IN
 
 _MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
@@ -59,8 +60,6 @@ ZENOH_ENTRY = "vnet.gateway.emulated:main"
 _ENTRY = "agents.beacon:main"
 PYTHON = ("python", "python3")
 """First words of a command that stand for the interpreter of vnet."""
-FILLED_IN = ("{id}", "{endpoint}", "{port}")
-"""Words of a command that vnet fills in."""
 PLACEHOLDER = re.compile(r"\{[a-z_]+\}", re.IGNORECASE)
 """A word that is meant to be filled in. Within a word braces may be a program's own."""
 

@@ -3,11 +3,13 @@
 import json
 import re
 import socket
+import threading
 from collections import Counter
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+import zenoh
 
 from tests.support.paths import ROOT
 from tests.system.conftest import Finished, Vnet
@@ -18,6 +20,7 @@ WAITS = (
     "import sys, time, zenoh; session = zenoh.open(zenoh.Config.from_env()); name = sys.argv[1]; {}; time.sleep({})"
 )
 """A program of one line: what it does after it has connected, and for how long it stays."""
+CLIENT = "config.insert_json5('mode', json.dumps('client')); config.insert"
 SLOW = (0, 3)
 """Exit statuses of a run that is as it should be: a slow machine makes one in real time unknown."""
 
@@ -122,6 +125,30 @@ def test_a_session_at_another_vehicles_endpoint_is_no_isolation(vnet: Vnet, tmp_
     assert done.status == 1
     assert {event["node"] for event in done.events_of("extra_session")} == {"v02"}
     assert done.check("isolation")["verdict"] == "invalid"
+
+
+def test_a_peer_that_others_find_by_multicast_is_no_isolation(vnet: Vnet, tmp_path: Path) -> None:
+    """Zenoh's default mode: peers of two vehicles find each other, and talk whatever the radio loses."""
+    seen = threading.Event()
+    with zenoh.open(zenoh.Config()):
+        scout = zenoh.scout(lambda hello: seen.set(), what="peer")
+        has_multicast = seen.wait(5.0)
+        scout.stop()
+    if not has_multicast:
+        pytest.skip("no multicast on this machine: peers do not find each other")
+    program = (
+        "import json, sys, time, zenoh; config = zenoh.Config(); "
+        "config.insert_json5('connect/endpoints', json.dumps([sys.argv[1]])); session = zenoh.open(config); "
+        "time.sleep(100)"
+    )
+    words = ('["python", "talker.py", "{id}"]', json.dumps(["python", "-c", program, "{endpoint}"]))
+    done = vnet("run", scenario(tmp_path, words, ("duration_s = 8.0", "duration_s = 4.0")))
+    assert done.status == 1
+    assert {event["node"] for event in done.events_of("found_session")} == {"v01", "v02", "v03", "v04"}
+    assert done.check("isolation")["verdict"] == "invalid"
+    client = json.dumps(["python", "-c", program.replace("config.insert", CLIENT, 1), "{endpoint}"])
+    done = vnet("run", scenario(tmp_path, (words[0], client), ("duration_s = 8.0", "duration_s = 4.0")))
+    assert not done.events_of("found_session")
 
 
 def test_a_program_that_never_connects_and_a_port_that_is_taken_are_named(vnet: Vnet, tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ class Gateway:
         self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
         self.sessions: set[str] = set()
-        """Ids of the sessions that are connected."""
+        """Names of the sessions that are connected."""
 
     def open(self, listen: str) -> str:
         """Open the vehicle's router at an endpoint; returns it with its port. Raises TransportError.
@@ -149,8 +149,7 @@ class Gateway:
         self._tell("report", sample.payload.to_bytes())
 
     def _connected(self, event: zenoh.TransportEvent) -> None:
-        who = f"{event.transport.zid} ({event.transport.whatami})"
-        self._tell("session", (who, event.kind == zenoh.SampleKind.PUT))
+        self._tell("session", (session_name(event.transport), event.kind == zenoh.SampleKind.PUT))
 
     # The run's loop.
 
@@ -322,6 +321,16 @@ class Gateway:
                 # Before the declaration, whose echo must not count as a token of this vehicle's own.
                 self._declared[key] = None
                 self._declared[key] = self._session.liveliness().declare_token(key)
+
+
+def session_name(session: zenoh.Transport | zenoh.Hello) -> str:
+    """Return what a session is called: its id and its mode."""
+    return f"{session.zid} ({session.whatami})"
+
+
+def is_peer(name: str) -> bool:
+    """Return whether a session of this name is a peer, which others may find."""
+    return name.endswith("(peer)")
 
 
 def session_environment(

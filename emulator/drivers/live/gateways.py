@@ -16,20 +16,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import zenoh
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit, Launcher
-from emulator.drivers.live.gateway import Gateway, session_environment
+from emulator.drivers.live.gateway import Gateway, is_peer, session_environment, session_name
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
-from emulator.scenario.program import FILLED_IN, PYTHON
+from emulator.scenario.program import PYTHON
 from vnet.errors import ProgramError, VnetError, first_names, shown
+from vnet.gateway import filled_in
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
 from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY
 from vnet.gateway.ros2 import ROS2_KEYS, Ros2
@@ -119,6 +122,9 @@ class Gateways:
         """Told which endpoints wait for programs."""
         self.endpoints: dict[str, str] = {}
         """The endpoint of each vehicle, which it keeps."""
+        self._scout: zenoh.Scout[None] | None = None
+        self._found: set[str] = set()
+        """Sessions of programs that have answered to multicast."""
 
     def _now_ns(self) -> int:
         """Emulated time; 0 before the start."""
@@ -127,7 +133,7 @@ class Gateways:
     def _check(self, node_ids: Sequence[str]) -> None:
         """Raise ProgramError for what is no command, and for vehicles without a port, before anything starts."""
         for words in self._program.all_commands if self._starts else ():
-            self._filled(words, {})
+            _found(words)
         port = int(self._settings.listen.rpartition(":")[2])
         if port and port + len(node_ids) - 1 > HIGHEST_PORT:
             raise ProgramError(
@@ -299,6 +305,7 @@ class Gateways:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*waits, *self._closing.values(), *self._tasks, return_exceptions=True)
+        self._stop_scouting()
         self._folder.cleanup()
 
     # In the place of an agent: what it is told.
@@ -333,24 +340,15 @@ class Gateways:
         environment |= {STARTED_BY_VNET: "1", "PYTHONUNBUFFERED": "1"}
         if self._ros2 is not None:
             environment["ROS_DOMAIN_ID"] = str(self._ros2.domain)
-        filled = dict(zip(FILLED_IN, (node, endpoint, endpoint.rpartition(":")[2]), strict=True))
         try:
             for number, words in enumerate(commands, start=1):
                 name = node if number == 1 else f"{node}~{number}"
-                self._launcher.start_command(name, self._filled(words, filled), environment, vehicle.nice)
+                words = filled_in(_found(words), node, endpoint)
+                self._launcher.start_command(name, words, environment, vehicle.nice)
                 vehicle.names.append(name)
                 self._vehicle_of[name] = node
         except VnetError as error:
             self._say_hello(vehicle, failure=str(error))
-
-    def _filled(self, words: Sequence[str], filled: Mapping[str, str]) -> list[str]:
-        """Return the words of a command with all filled in. Raises ProgramError if there is no such command."""
-        for name, value in filled.items():
-            words = [word.replace(name, value) for word in words]
-        found = sys.executable if words[0] in PYTHON else shutil.which(words[0])
-        if found is None:
-            raise ProgramError(f"program.command: {shown(words[0])} is no command")
-        return [found, *words[1:]]
 
     def _take_batch(self, vehicle: _Vehicle, batch: wire.Batch) -> None:
         now_ns = self._now_ns()
@@ -405,11 +403,15 @@ class Gateways:
         hello = wire.Hello(node, node, vehicle.nonce, pid, host, ready, failure, wire.VERSION)
         self._tell("local", node, hello)
 
-    def take(self, what: str, item: tuple[Gateway, Any]) -> None:
+    def take(self, what: str, item: tuple[Gateway | None, Any]) -> None:
         """Take what a gateway has told, on the loop."""
         gateway, told = item
         if what == "bug":
             raise told
+        if what == "hello":
+            self._find(told)
+            return
+        assert gateway is not None
         vehicle = self._vehicles.get(gateway.node)
         if vehicle is None or vehicle.gateway is not gateway:  # it is gone
             return
@@ -421,6 +423,8 @@ class Gateways:
             self._transmit(vehicle, message)
         elif what == "session":
             self._look_at_sessions(vehicle)
+            if any(is_peer(who) for who in gateway.sessions - self._found):
+                self._seek_peers()
 
     def _transmit(self, vehicle: _Vehicle, message: Message) -> None:
         """Send a message by the vehicle's radio: a reply to one vehicle, if the MAC repeats what is lost."""
@@ -502,6 +506,25 @@ class Gateways:
             )
         self._changes.set()
 
+    def _seek_peers(self) -> None:
+        """Ask by multicast for peers, as those of other vehicles do: at once, and again after seconds."""
+        self._stop_scouting()
+        with suppress(zenoh.ZError):  # without multicast nobody is found
+            self._scout = zenoh.scout(lambda hello: self._hear("gateway", "hello", (None, hello)), what="peer")
+
+    def _stop_scouting(self) -> None:
+        if self._scout is not None:
+            self._scout.stop()
+            self._scout = None
+
+    def _find(self, hello: zenoh.Hello) -> None:
+        """Tell of a peer that answers to multicast, if it is the session of a program."""
+        who = session_name(hello)
+        for node, vehicle in self._vehicles.items():
+            if who in vehicle.gateway.sessions and who not in self._found:
+                self._found.add(who)
+                self._emulation.folder.event(self._now_ns(), EventKind.found_session, node, which=who)
+
     def missed(self, nodes: Sequence[str], timeout_s: float) -> str:
         """Say in one line which programs have not connected in time."""
         where = [f"{node} at {self.endpoints[node]}" for node in nodes if node in self.endpoints]
@@ -511,6 +534,14 @@ class Gateways:
         return f"programs of {len(where)} of {total} vehicles have not connected within {timeout_s:g} s: " + (
             first_names(where)
         )
+
+
+def _found(words: Sequence[str]) -> list[str]:
+    """Return the words of a command with the path of its first. Raises ProgramError if there is no such command."""
+    found = sys.executable if words[0] in PYTHON else shutil.which(words[0])
+    if found is None:
+        raise ProgramError(f"program.command: {shown(words[0])} is no command")
+    return [found, *words[1:]]
 
 
 async def _opened(gateway: Gateway, listen: str) -> str:

@@ -352,3 +352,13 @@ def test_options_of_python_that_change_nothing_are_no_script(drive: Drive, tmp_p
     command = ["python", "-u", "-B", str(tmp_path / "hello.py"), "{id}"]
     run = drive(program={"command": [command]})
     assert log(run)[0] == "['v01']"
+
+
+def test_a_command_is_told_an_endpoint_which_its_sessions_do_not_need(drive: Drive) -> None:
+    text = (
+        "import json, os, sys, zenoh; config = zenoh.Config(); "
+        "config.insert_json5('connect/endpoints', json.dumps([sys.argv[2]])); zenoh.open(config).close(); "
+        "print(sys.argv[1], sys.argv[2].endswith(':' + sys.argv[3]), sys.argv[2] == os.environ['VNET_ENDPOINT'])"
+    )
+    run = drive(program={"command": ["python", "-c", text, "{id}", "{endpoint}", "{port}"]}, duration_s=0.2)
+    assert log(run)[0] == "v01 True True"

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from vnet.errors import ProgramError
+from vnet.gateway import filled_in
+from vnet.gateway.emulated.modules import ENDPOINT
 from vnet.gateway.emulated.programs import run_program
 from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.gateway.keys import RADIO_KEYS
@@ -39,7 +41,7 @@ async def main(node: Node) -> None:
     try:
         async with asyncio.TaskGroup() as tasks:
             for words in commands:
-                tasks.create_task(run_program(vehicle, [word.replace("{id}", node.id) for word in words]))
+                tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT)))
     except* Exception as errors:
         raise errors.exceptions[0] from None
     finally:

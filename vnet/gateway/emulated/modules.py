@@ -38,6 +38,8 @@ from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.units import NS_PER_S
 
+ENDPOINT = "tcp/127.0.0.1:7447"
+"""Endpoint that programs are told. Sessions here have no transport, and connect to nothing."""
 EPOCH_NS = 1_735_689_600 * NS_PER_S
 """The wall clock of programs at the start of a run: 2025-01-01T00:00:00Z."""
 FLAGS = frozenset(["-u", "-B", "-E", "-I", "-O", "-OO", "-s", "-S", "-P", "-q"])
@@ -285,7 +287,7 @@ class ProgramModules:
         return Facade(sys, argv=self.argv, path=self.path, modules=self.modules, stdin=io.StringIO())
 
     def _os(self) -> ModuleType:
-        environ = {**os.environ, "VNET_NODE": self.node.id}
+        environ = {**os.environ, "VNET_NODE": self.node.id, "VNET_ENDPOINT": ENDPOINT}
         if "ros2" in self.node.options:
             environ["ROS_DOMAIN_ID"] = str(self.node.options["ros2"]["domain"])
         return Facade(
