@@ -6,6 +6,7 @@ import socket
 import threading
 from collections import Counter
 from pathlib import Path
+from typing import Any, cast
 
 import pyarrow.parquet as pq
 import pytest
@@ -131,9 +132,9 @@ def test_a_peer_that_others_find_by_multicast_is_no_isolation(vnet: Vnet, tmp_pa
     """Zenoh's default mode: peers of two vehicles find each other, and talk whatever the radio loses."""
     seen = threading.Event()
     with zenoh.open(zenoh.Config()):
-        scout = zenoh.scout(lambda hello: seen.set(), what="peer")
+        scout = zenoh.scout(cast(Any, lambda hello: seen.set()), what="peer")
         has_multicast = seen.wait(5.0)
-        scout.stop()
+        scout.stop()  # type: ignore[no-untyped-call]
     if not has_multicast:
         pytest.skip("no multicast on this machine: peers do not find each other")
     program = (

@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import msgspec
 import zenoh
@@ -122,7 +122,7 @@ class Gateways:
         """Told which endpoints wait for programs."""
         self.endpoints: dict[str, str] = {}
         """The endpoint of each vehicle, which it keeps."""
-        self._scout: zenoh.Scout[None] | None = None
+        self._scout: zenoh.Scout[Any] | None = None
         self._found: set[str] = set()
         """Sessions of programs that have answered to multicast."""
 
@@ -510,11 +510,14 @@ class Gateways:
         """Ask by multicast for peers, as those of other vehicles do: at once, and again after seconds."""
         self._stop_scouting()
         with suppress(zenoh.ZError):  # without multicast nobody is found
-            self._scout = zenoh.scout(lambda hello: self._hear("gateway", "hello", (None, hello)), what="peer")
+            self._scout = zenoh.scout(cast(Any, self._tell_hello), what="peer")
+
+    def _tell_hello(self, hello: zenoh.Hello) -> None:
+        self._hear("gateway", "hello", (None, hello))
 
     def _stop_scouting(self) -> None:
         if self._scout is not None:
-            self._scout.stop()
+            self._scout.stop()  # type: ignore[no-untyped-call]
             self._scout = None
 
     def _find(self, hello: zenoh.Hello) -> None:
