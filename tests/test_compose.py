@@ -57,6 +57,7 @@ def test_it_starts_with_one_command() -> None:
     assert "7447" in SERVICES["emulator"]["healthcheck"]["test"]
 
 
+@pytest.mark.slow
 def test_each_host_of_the_emulator_has_its_container_and_its_credentials() -> None:
     parsed = options("emulator")
     assert str(parsed["scenario"]) == "scenarios/beacon.toml"

@@ -185,6 +185,7 @@ def problems(path: Path) -> list[str]:
     return [*fragments(language), *sorted(language.names & REPLACED_NAMES), *words]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", CODE)
 def test_code_speaks_the_language(package: str) -> None:
     assert {relative(path): found for path in code_files(package) if (found := problems(path))} == {}

@@ -98,6 +98,7 @@ def test_every_package_that_is_installed_has_an_exact_version() -> None:
     assert {name for name in names if re.sub(r"[-_.]+", "-", name).lower() not in normal} == set()
 
 
+@pytest.mark.slow
 def test_every_package_that_is_installed_accepts_the_first_python_that_vnet_does() -> None:
     """Debian 12 has Python 3.11.2: a package that needs 3.11.5 stops `make setup` there."""
     first = re.fullmatch(r">=([\d.]+)", PROJECT["project"]["requires-python"])

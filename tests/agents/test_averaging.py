@@ -22,6 +22,7 @@ names = st.frozensets(st.integers(0, 10_000).map(lambda number: short_name(f"v{n
 reals = st.floats(allow_nan=False, allow_infinity=False)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 2**32), st.tuples(reals, reals, reals), names, names)
 def test_a_frame_comes_back_as_it_was(
@@ -128,12 +129,14 @@ def frames_by_period(emulation: Emulation, node: str) -> list[int]:
     return np.bincount(periods, minlength=round(emulation.duration_ns / PERIOD_NS)).tolist()
 
 
+@pytest.mark.slow
 def test_one_frame_a_period(tmp_path: Path) -> None:
     emulation = emulate(tmp_path / "run", {"rule": "ratio"})
     for node in emulation.world.node_ids:
         assert frames_by_period(emulation, node) == [1] * 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["ratio", "metropolis", "max-degree"])
 def test_all_find_the_mean_of_inputs_that_stay(tmp_path: Path, rule: str) -> None:
     emulation = emulate(tmp_path / "run", {"rule": rule}, 6.0)
@@ -144,6 +147,7 @@ def test_all_find_the_mean_of_inputs_that_stay(tmp_path: Path, rule: str) -> Non
     assert np.array([row["mean_m"] for row in states[-4:]]) == pytest.approx(np.tile(mean, (4, 1)), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_silent_vehicle_neither_sends_nor_reports_and_comes_back_afresh(tmp_path: Path) -> None:
     emulation = emulate(tmp_path / "run", {"rule": "ratio", "silent": {"v02": [5.0, 12.0]}}, 20.0)
     assert frames_by_period(emulation, "v02") == [1] * 50 + [0] * 70 + [1] * 80

@@ -76,6 +76,7 @@ values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from([field.name for field in msgspec.structs.fields(Example)]), values)
 def test_any_value_is_converted_or_refused_by_its_name(key: str, value: object) -> None:

@@ -57,6 +57,7 @@ def test_lives_of_resources_have_the_mean_of_their_counters() -> None:
     assert lives(0.0)[4] == 1 and lives(0.0)[15] == pytest.approx(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [Case(40), Case(20, keep=0.4), Case(20, keep=None)], ids=lambda case: case.name)
 def test_mode_2_meets_others_as_often_as_its_closed_form_says(case: Case) -> None:
     assert abs(measured(case, 6.0) - meets(case)) <= 0.03

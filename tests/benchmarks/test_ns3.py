@@ -15,6 +15,8 @@ from benchmarks.ns3.ground import RATE_HZ, Curve, Outcome, ScheduleConstraints
 from benchmarks.ns3.simulators import ours
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 60.0
 RECORDED = json.loads((ROOT / "benchmarks" / "ns3" / "recorded.json").read_text())
 ACKNOWLEDGED = json.loads((ROOT / "benchmarks" / "ns3" / "acknowledged.json").read_text())
@@ -24,7 +26,6 @@ def curve(pairs: list[int], share: list[float]) -> Curve:
     return Curve(np.array(pairs), np.array(share))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fading", [False, True])
 def test_delivery_by_distance_and_the_busy_ratio_are_those_of_ns3(fading: bool, tmp_path: Path) -> None:
     recorded = next(one for one in RECORDED if one["vehicles"] == 50 and one["fading"] == fading)
@@ -77,7 +78,6 @@ def test_a_curve_counts_every_pair_at_its_distance() -> None:
     assert found.share[:2].tolist() == [1.0, 3 / 5]
 
 
-@pytest.mark.slow
 def test_without_ns3_it_says_in_one_line_how_to_get_it(tmp_path: Path) -> None:
     environment = {**os.environ, "PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-P", "-m", "benchmarks.ns3", "--out", str(tmp_path / "out")]
@@ -87,7 +87,6 @@ def test_without_ns3_it_says_in_one_line_how_to_get_it(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_buildings_cut_the_same_rays_as_in_ns3_where_it_is_installed(capsys: pytest.CaptureFixture[str]) -> None:
     status = buildings.main()
     if status == 2:
@@ -96,7 +95,6 @@ def test_buildings_cut_the_same_rays_as_in_ns3_where_it_is_installed(capsys: pyt
     assert (status, capsys.readouterr().out) == (0, "19,900 rays: 12,026 cut in ns-3, 12,026 in vnet; 0 differ\n")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 3, 6])
 def test_frames_to_one_vehicle_fare_as_in_ns3(number: int) -> None:
     recorded = ACKNOWLEDGED[number]

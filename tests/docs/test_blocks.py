@@ -93,6 +93,7 @@ def test_what_has_passed_is_skipped_but_not_in_ci_nor_what_has_failed(
     assert ran == [failure, None, None]
 
 
+@pytest.mark.slow
 def test_there_are_pages_and_blocks() -> None:
     found = [block for path in PAGES for block in blocks(path.read_text(encoding="utf-8"), path.name)]
     assert len(PAGES) > 20

@@ -45,6 +45,7 @@ def last_reports(
     return found
 
 
+@pytest.mark.slow
 def test_a_warning_is_forwarded_to_vehicles_out_of_range(tmp_path: Path) -> None:
     line = [[int(abs(a - b) == 1) for b in range(5)] for a in range(5)]
     reports = last_reports(tmp_path / "run", line)

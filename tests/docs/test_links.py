@@ -22,6 +22,7 @@ def broken(path: Path, text: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_link_leads_nowhere(path: Path) -> None:
     assert broken(path, path.read_text(encoding="utf-8")) == []

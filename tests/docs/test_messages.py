@@ -95,6 +95,7 @@ def _fields_of(kind: Any) -> list[str]:
 # An independent reader.
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(agent_messages | emulator_messages | unit_messages | welcomes)
 def test_a_plain_reader_decodes_what_vnet_encodes(message: Any) -> None:
@@ -112,6 +113,7 @@ def test_a_plain_reader_decodes_reports(report: Report) -> None:
     assert PAGE.problem_of("Report", msgpack.unpackb(wire.encode(report))) == ""
 
 
+@pytest.mark.slow
 def test_a_plain_reader_decodes_what_observers_get(tmp_path: Path) -> None:
     scenario = Scenario.model_validate(
         {
@@ -140,6 +142,7 @@ def test_a_plain_reader_decodes_what_observers_get(tmp_path: Path) -> None:
 # An independent writer.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DECODERS)
 def test_vnet_accepts_what_a_plain_writer_encodes(kind: str) -> None:
     decode: Any = DECODERS[kind]

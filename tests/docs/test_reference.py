@@ -17,6 +17,7 @@ from emulator.scenario.sections import Section
 from tests.support.recorded import recorded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_is_made_from_the_code_as_it_is(name: str) -> None:
     assert (REFERENCE / name).read_text(encoding="utf-8") == PAGES[name](), "stale: make docs"

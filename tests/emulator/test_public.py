@@ -72,6 +72,7 @@ def fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("emulator.api.is_fit", lambda: True)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fit")
 def test_simulate_gives_a_run_with_what_was_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -87,12 +88,14 @@ def test_simulate_gives_a_run_with_what_was_changed(tmp_path: Path, monkeypatch:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fit")
 def test_another_seed_is_another_run(tmp_path: Path) -> None:
     one, two = (emulator.simulate(SMALL, seed=seed, out=tmp_path / str(seed)) for seed in (1, 2))
     assert not one.trace.equals(two.trace)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fit")
 def test_simulate_works_inside_a_running_event_loop(tmp_path: Path) -> None:
     async def main() -> emulator.Run:
@@ -116,6 +119,7 @@ def test_a_function_that_no_command_can_import_runs_here_and_replay_is_not_warra
     assert run.reproduce.endswith("scenario.toml --program MODULE:FUNCTION")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fit")
 def test_an_interrupted_simulation_is_written_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C reaches the thread that waits; the run's own thread stops between two instants."""
@@ -179,6 +183,7 @@ def nested() -> Any:
     return main
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fit")
 def test_a_notebook_shows_the_report_in_a_frame_that_cannot_reach_it(tmp_path: Path) -> None:
     shown = emulator.simulate(SMALL, out=tmp_path / "run")._repr_html_()

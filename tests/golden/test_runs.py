@@ -22,6 +22,7 @@ EXEMPT = {
 """Scenarios without a row, and why."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "way"), CASES)
 def test_a_run_comes_to_what_the_table_says(name: str, way: str, tmp_path: Path) -> None:
     row = ROWS[name]

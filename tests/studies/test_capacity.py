@@ -35,6 +35,7 @@ def test_few_in_one_place_hear_all_and_find_the_air_as_busy_as_they_make_it() ->
     assert point.busy == pytest.approx(5 * RATE_HZ * airtime_ns(300, 6.0) / 1e9, rel=0.02)
 
 
+@pytest.mark.slow
 def test_frames_that_have_been_sent_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else memory would grow with the length of the run: the engine may keep a hundred, of 250 sent."""
 
@@ -62,6 +63,7 @@ def test_a_road_has_hidden_terminals_and_a_control_that_gives_way() -> None:
     assert held.busy < open_.busy - 0.1
 
 
+@pytest.mark.slow
 def test_the_report_ends_each_series_where_it_is_hopeless(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def measured(variant: capacity.Variant, size_bytes: int, peers: int, seconds: float, seed: int) -> Point:
         share = max(0.0, 1.0 - peers / (400 if size_bytes == 300 else 40) - 0.02 * seed)

@@ -56,6 +56,7 @@ def settled_m(recorded: RecordedRun) -> Any:
     return after(reference_series(recorded), 50)["common_error_rmse_m"]
 
 
+@pytest.mark.slow
 def test_the_bound_knows_the_common_error_and_its_own_error(recorded: RecordedRun) -> None:
     bound = reference_series(recorded)
     figures: dict[str, Any] = after(bound, 50)
@@ -68,23 +69,27 @@ def test_the_bound_knows_the_common_error_and_its_own_error(recorded: RecordedRu
     assert bound["component_rmse_m"][:, 0] == pytest.approx(common_m)
 
 
+@pytest.mark.slow
 def test_a_report_has_the_bound_as_a_line(recorded: RecordedRun, tmp_path: Path) -> None:
     page = report_page(Source(simulate_into(scenario(), tmp_path / "run")))
     assert "Bound: a Kalman filter that hears every fix of its component" in page
     assert "times the bound" in page
 
 
+@pytest.mark.slow
 def test_a_cell_has_the_figures_of_the_bound(recorded: RecordedRun) -> None:
     figures = compute(study_cell({"seed": 1}, scenario(), 5.0)).figures
     assert figures["reference_common_error_rmse_m"] == pytest.approx(settled_m(recorded))
     assert figures["reference_common_error_rmse_m"] < figures["rmse_m"]
 
 
+@pytest.mark.slow
 def test_a_cell_without_the_bound_has_no_such_figures() -> None:
     city = scenario(network={"kind": "city", "vehicles": 3, "size_m": 1000.0}, run={"duration_s": 1.0})
     assert not [name for name in compute(study_cell({"seed": 1}, city)).figures if name.startswith("reference")]
 
 
+@pytest.mark.slow
 def test_outliers_are_told_to_the_bound(recorded: RecordedRun) -> None:
     plain_m = settled_m(recorded)
     fix_m = recorded.vectors("fix_m")
@@ -118,6 +123,7 @@ def test_where_there_is_no_bound_the_reason_is_said(sections: dict[str, Any], ve
     assert (words in why) if words else why == ""
 
 
+@pytest.mark.slow
 def test_a_program_that_says_nothing_of_a_common_error_has_no_bound(tmp_path: Path) -> None:
     silent = scenario(program={"entry": f"{__name__}:say_nothing"}, run={"duration_s": 1.0, "settle_s": 0.0})
     with pytest.raises(VnetError, match="no program reported what the bound is compared with"):

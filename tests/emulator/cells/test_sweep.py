@@ -94,6 +94,7 @@ async def crash(node: Any) -> None:
     raise RuntimeError(node.id)
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def one_only(jobs: list[Cell], *_: object) -> Any:
         yield jobs[0], compute(jobs[0])
@@ -114,6 +115,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "runs/sweep-tiny/sweep.html" in result.output
 
 
+@pytest.mark.slow
 def test_shards_may_run_anywhere_and_the_last_makes_the_table(tmp_path: Path, in_this_process: list[Cell]) -> None:
     (tmp_path / "tiny.toml").write_text("[run]\nname = 'tiny'\nduration_s = 0.4\n[network]\nvehicles = 3\n")
     given = [str(tmp_path / "tiny.toml"), "--seeds", "3", "--out", str(tmp_path / "out")]
@@ -175,6 +177,7 @@ def test_a_mean_is_rounded_by_its_interval(mean: Mean, text: str) -> None:
     assert str(mean) == text
 
 
+@pytest.mark.slow
 def test_programs_are_compared_on_the_same_seeds(tmp_path: Path, in_this_process: list[Cell]) -> None:
     (tmp_path / "tiny.toml").write_text("[run]\nname = 'tiny'\nduration_s = 0.4\n[network]\nvehicles = 3\n")
     for name, share in {"a": 1, "b": 3}.items():
@@ -240,6 +243,7 @@ def test_the_list_of_runs_has_the_sweeps(tmp_path: Path) -> None:
     assert index.count("sweep.parquet: not the table of a sweep") == 2
 
 
+@pytest.mark.slow
 def test_the_page_shows_own_figures_first_and_no_constants() -> None:
     rows: list[dict[str, Any]] = [
         {

@@ -67,6 +67,7 @@ def simulated(folder: Path, entry: str = "agents.beacon:main", duration_s: float
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("added")
 def test_it_is_in_the_verdict_of_a_run_and_of_vnet_check(tmp_path: Path) -> None:
     folder = simulated(tmp_path / "run")
@@ -76,6 +77,7 @@ def test_it_is_in_the_verdict_of_a_run_and_of_vnet_check(tmp_path: Path) -> None
     assert "frame_size" in {check.name for check in check_run(folder).checks}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("added")
 def test_it_makes_a_run_invalid_and_shows_the_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = simulated(tmp_path / "run")
@@ -86,6 +88,7 @@ def test_it_makes_a_run_invalid_and_shows_the_rows(tmp_path: Path, monkeypatch: 
     assert len(found.figures["rows"]) == 10
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("added")
 def test_its_reason_not_to_apply_is_listed(tmp_path: Path) -> None:
     judgement = check_run(simulated(tmp_path / "run", "agents.averaging:main"))
@@ -99,6 +102,7 @@ def test_the_reference_page_has_its_row() -> None:
     assert row in check_page.page()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("added")
 def test_a_campaign_has_its_column(tmp_path: Path) -> None:
     checks = check_run(simulated(tmp_path / "run")).checks
@@ -125,6 +129,7 @@ def test_names_are_unique_and_documented() -> None:
     assert {"transport", "kept_up", "memory"} == {c.name for c in CHECKS if c.subject is Subject.MACHINE}
 
 
+@pytest.mark.slow
 def test_a_check_of_the_machine_is_never_invalid(tmp_path: Path) -> None:
     recorded = RecordedRun.open(simulated(tmp_path / "run"))
     for check in CHECKS:

@@ -46,6 +46,7 @@ def broken(judgement: Judgement) -> set[str]:
     return {check.name for check in judgement.checks if check.verdict is Verdict.INVALID}
 
 
+@pytest.mark.slow
 def test_a_run_as_it_was_written_is_valid_and_every_check_of_its_folder_judged_it(run: Path) -> None:
     judgement = check_run(run)
     assert judgement.verdict is Verdict.VALID
@@ -127,6 +128,7 @@ def of_format(number: int) -> Callable[[Path], None]:
     return apply
 
 
+@pytest.mark.slow
 def test_a_folder_whose_manifest_is_gone_is_invalid_and_an_earlier_one_needs_none(copy: Path) -> None:
     without_manifest(copy)
     assert broken(check_run(copy)) == {"files"}
@@ -154,6 +156,7 @@ def test_a_manifest_names_files_of_the_folder_alone(copy: Path, name: str) -> No
     assert [row["file"] for row in found.figures["rows"]] == [name]
 
 
+@pytest.mark.slow
 def test_a_run_whose_world_comes_from_a_file_says_why_it_is_not_computed_again(tmp_path: Path) -> None:
     (tmp_path / "network.csv").write_text("id,x_m,y_m,heading_rad\na,0,0,0\nb,100,0,0\n")
     network = {"kind": "file", "path": tmp_path / "network.csv"}
@@ -165,6 +168,7 @@ def test_a_run_whose_world_comes_from_a_file_says_why_it_is_not_computed_again(t
     )
 
 
+@pytest.mark.slow
 def test_a_busy_ratio_is_computed_again(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "log_distance"}, "mac": {}, "bitrate_mbps": 6.0}
     folder = simulated(tmp_path / "run", radio=radio, fault=[], program={"entry": "agents.beacon:main"})
@@ -180,6 +184,7 @@ def test_files_that_vnet_adds_to_a_finished_run_are_no_edit(copy: Path) -> None:
     assert check_run(copy).verdict is Verdict.VALID
 
 
+@pytest.mark.slow
 def test_a_file_that_the_manifest_lacks_is_told(copy: Path) -> None:
     shutil.copy(copy / "states.parquet", copy / "busy.parquet")
     assert broken(check_run(copy)) == {"files"}
@@ -187,6 +192,7 @@ def test_a_file_that_the_manifest_lacks_is_told(copy: Path) -> None:
     assert check_run(copy).verdict is Verdict.VALID
 
 
+@pytest.mark.slow
 def test_payloads_are_those_of_the_trace(tmp_path: Path) -> None:
     run = {"duration_s": 1.0, "keep_payloads": True}
     folder = simulated(tmp_path / "run", run=run, fault=[], program={"entry": "agents.beacon:main"})
@@ -224,6 +230,7 @@ def test_a_log_that_the_manifest_lacks_is_told(copy: Path) -> None:
     assert broken(check_run(copy)) == {"files"}
 
 
+@pytest.mark.slow
 def test_no_verdict_of_the_file_itself_excuses_its_files(copy: Path) -> None:
     verdict = json.loads((copy / "verdict.json").read_text())
     left = {"name": "files", "verdict": "valid", "text": "all kept", "figures": {"unkept": ["x"]}}

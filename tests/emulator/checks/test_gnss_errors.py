@@ -13,6 +13,8 @@ from emulator.checks.judge import check_run
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Scenario
 
+pytestmark = pytest.mark.slow
+
 ALL_ERRORS = {
     "multipath_sigma_m": 1.0,
     "outlier_probability": 0.02,

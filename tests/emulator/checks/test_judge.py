@@ -92,6 +92,7 @@ def figures(check: CheckResult | NotExercised) -> dict[str, Any]:
     return {name: figure for name, figure in check.figures.items() if name != "rows"}
 
 
+@pytest.mark.slow
 def test_without_events_nothing_is_known_of_the_course_of_a_run(recorded: RecordedRun) -> None:
     silent = replace(recorded, events=[])
     assert verdict(silent, "agents_alive") is Verdict.UNKNOWN
@@ -122,6 +123,7 @@ def test_one_vehicle_alone_has_no_radio_to_judge(tmp_path: Path) -> None:
     assert {"conservation", "range", "peer_cap", "loss_rate"} <= {left.name for left in judgement.not_exercised}
 
 
+@pytest.mark.slow
 def test_a_cap_that_could_act_and_never_did_is_unknown(tmp_path: Path) -> None:
     radio = {"max_peers": 2}
     recorded = run(tmp_path / "run", program=f"{__name__}:first_only", vehicles=6, radio=radio)
@@ -166,6 +168,7 @@ def test_deliveries_that_were_never_timed_leave_real_time_unknown(recorded: Reco
         assert verdict(timed, "kept_up") is expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pacing", ["realtime", "lockstep"])
 def test_lateness_of_the_machine_is_not_the_radios(tmp_path: Path, pacing: str) -> None:
     recorded = four(tmp_path, "agents.cooperative:main")
@@ -224,6 +227,7 @@ def with_lost(recorded: RecordedRun, count: int) -> pa.Table:
     return timely(recorded.trace.set_column(index, "outcome", column))
 
 
+@pytest.mark.slow
 def test_an_honest_line_of_four_is_valid_with_its_figures(line: RecordedRun) -> None:
     assert damaged(line, line.trace) == {}
     conservation, range_ = result(line, "conservation"), result(line, "range")
@@ -286,6 +290,7 @@ def test_the_loss_rate_is_valid_up_to_the_border_of_its_band_and_invalid_beyond(
         }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "wrong"), [(0.0, 1), (1.0, -1)])
 def test_without_chance_a_single_pair_decides(tmp_path: Path, loss: float, wrong: int) -> None:
     recorded = four(tmp_path, radio={"loss": loss})
@@ -294,6 +299,7 @@ def test_without_chance_a_single_pair_decides(tmp_path: Path, loss: float, wrong
     assert damaged(recorded, with_lost(recorded, lost + wrong))["loss_rate"].verdict is Verdict.INVALID
 
 
+@pytest.mark.slow
 def test_when_everything_is_lost_nothing_is_known_of_the_range(tmp_path: Path) -> None:
     recorded = four(tmp_path, radio={"loss": 1.0})
     judgement = judge(recorded)
@@ -313,6 +319,7 @@ async def dies_early(node: Node) -> None:
         await node.radio.broadcast(b"hello")
 
 
+@pytest.mark.slow
 def test_a_death_makes_room_under_the_cap_and_is_told_with_its_figures(tmp_path: Path) -> None:
     recorded = four(tmp_path, f"{__name__}:dies_early", radio={"max_peers": 1, "loss": 0.0})
     assert verdict(recorded, "peer_cap") is Verdict.VALID
@@ -330,6 +337,7 @@ def test_a_death_makes_room_under_the_cap_and_is_told_with_its_figures(tmp_path:
     assert wrong.figures["wrong"] > 0
 
 
+@pytest.mark.slow
 def test_each_pair_on_the_wrong_side_of_the_cap_is_counted(tmp_path: Path) -> None:
     recorded = four(tmp_path, radio={"max_peers": 1, "loss": 0.0})
     capped, heard = first(recorded, "peer_cap"), first(recorded, "delivered")
@@ -357,6 +365,7 @@ async def reports_nan(node: Node) -> None:
         node.report(fix.position_m, fix.covariance_m2, x=float("nan") if node.id == "v2" else 0.0)
 
 
+@pytest.mark.slow
 def test_numbers_that_are_none_are_counted(tmp_path: Path) -> None:
     found = result(four(tmp_path, f"{__name__}:reports_nan"), "finite")
     assert isinstance(found, CheckResult)
@@ -380,6 +389,7 @@ def test_invalid_wins_over_unknown_over_valid_in_a_run(line: RecordedRun) -> Non
 FORK = [[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [1, 1, 1, 0]]  # 0 → 1 → 2, and 3 hears them all
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", [True, False])
 def test_a_matrix_run_is_judged_by_its_matrix(tmp_path: Path, written: bool) -> None:
     """Vehicles 0 and 3 are out of range, 1 and 0 well within it: only the matrix explains who heard whom."""
@@ -396,6 +406,7 @@ def test_a_matrix_run_is_judged_by_its_matrix(tmp_path: Path, written: bool) -> 
     assert verdict(by_range, "conservation") is Verdict.INVALID
 
 
+@pytest.mark.slow
 def test_a_delivery_against_the_matrix_breaks_range_and_conservation(tmp_path: Path) -> None:
     recorded = four(tmp_path, radio={"links": FORK, "loss": 0.0})
     row = int(np.flatnonzero((recorded.nodes("sender") == 1) & (recorded.nodes("receiver") == 2))[0])
@@ -407,18 +418,21 @@ def test_a_delivery_against_the_matrix_breaks_range_and_conservation(tmp_path: P
     assert found["range"].figures["beyond"] == found["conservation"].figures["not_in_range"] == 1
 
 
+@pytest.mark.slow
 def test_a_capped_pair_that_was_delivered_is_found_in_a_matrix_run(tmp_path: Path) -> None:
     recorded = four(tmp_path, radio={"links": FORK, "loss": 0.0, "max_peers": 2})
     forged = with_names(recorded.trace, "outcome", first(recorded, "peer_cap"), "delivered")
     assert set(damaged(recorded, forged)) == {"peer_cap"}
 
 
+@pytest.mark.slow
 def test_a_matrix_in_which_nobody_hears_leaves_no_radio_to_judge(tmp_path: Path) -> None:
     judgement = judge(four(tmp_path, radio={"links": [[0] * 4] * 4}))
     assert judgement.verdict is Verdict.VALID
     assert {"conservation", "range", "peer_cap", "loss_rate"} <= {left.name for left in judgement.not_exercised}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json", "events.jsonl"]
 )
@@ -430,6 +444,7 @@ def test_a_folder_without_one_of_its_files_is_refused_in_one_line(name: str, tmp
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json"])
 def test_a_file_that_was_cut_short_is_refused(name: str, tmp_path: Path) -> None:
     four(tmp_path)

@@ -26,6 +26,7 @@ def test_a_leak_and_memory_taken_once_are_told_apart(duration_s: float) -> None:
     assert steady_growth_kib_per_s(time_s, once_kb) == 0
 
 
+@pytest.mark.slow
 @given(durations, st.floats(60, 5_000), st.floats(0, 1e6))
 def test_every_leak_is_found_with_its_rate(duration_s: float, kb_per_s: float, base_kb: float) -> None:
     time_s = times(duration_s)
@@ -33,6 +34,7 @@ def test_every_leak_is_found_with_its_rate(duration_s: float, kb_per_s: float, b
     assert steady_growth_kib_per_s(time_s, size_kb) == pytest.approx(kb_per_s, rel=0.01)
 
 
+@pytest.mark.slow
 @given(durations, st.lists(st.tuples(st.floats(0, 1), st.floats(0, 1e6)), max_size=2))
 def test_two_steps_are_no_growth_whatever_their_size(duration_s: float, steps: list[tuple[float, float]]) -> None:
     time_s = times(duration_s)
@@ -40,6 +42,7 @@ def test_two_steps_are_no_growth_whatever_their_size(duration_s: float, steps: l
     assert steady_growth_kib_per_s(time_s, size_kb) == 0
 
 
+@pytest.mark.slow
 @given(durations, st.integers(0, 2**32 - 1), st.floats(0, FLOOR_KIB / 2.1))
 def test_noise_below_the_floor_is_no_growth(duration_s: float, seed: int, half_width_kb: float) -> None:
     time_s = times(duration_s)
@@ -47,6 +50,7 @@ def test_noise_below_the_floor_is_no_growth(duration_s: float, seed: int, half_w
     assert steady_growth_kib_per_s(time_s, (BASE_KB + noise_kb).tolist()) == 0
 
 
+@pytest.mark.slow
 @given(durations, st.floats(0.1, 0.5), st.floats(100, 20_000))
 def test_what_grows_in_the_first_half_alone_is_no_growth(duration_s: float, share: float, kb_per_s: float) -> None:
     time_s = times(duration_s)
@@ -54,6 +58,7 @@ def test_what_grows_in_the_first_half_alone_is_no_growth(duration_s: float, shar
     assert steady_growth_kib_per_s(time_s, size_kb) == 0
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.floats(-1e5, 1e5))
 def test_the_base_does_not_matter(seed: int, base_kb: float) -> None:
     time_s = times(60.0)

@@ -181,6 +181,7 @@ def test_a_fault_is_an_event_of_each_of_its_nodes(faulty: Run) -> None:
     assert told == [(t, node, *rest) for t, *rest in loss for node in ("v01", "v02", "v03")] + on_v02
 
 
+@pytest.mark.slow
 def test_a_fault_leads_to_a_reported_value(faulty: Run) -> None:
     found = leads_to(faulty, "dead", kill, dead, within_s=1.0)
     assert (found.verdict, found.figures) == ("valid", {"slowest_s": pytest.approx(0.3)})
@@ -201,6 +202,7 @@ def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty:
     assert always(faulty, "typing error", lambda m: m["no_such"] <= 1).verdict == "unknown"
 
 
+@pytest.mark.slow
 def test_a_test_promises_what_follows_a_fault_that_it_injects(tmp_path: Path) -> None:
     scenario = make_scenario(
         fault_scenario() | {"fault": []}, {"program": "tests.emulator.checks.test_properties:counts_the_dead"}
@@ -245,6 +247,7 @@ def test_the_result_is_one_of_a_check_of_ones_own(tmp_path: Path, monkeypatch: p
     assert judged.verdict == "invalid" and check.text.startswith("does not hold: first of v01 at 0.5 s")
 
 
+@pytest.mark.slow
 def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
     scenario = make_scenario(
         {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
@@ -273,6 +276,7 @@ def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
     assert Run.open(tmp_path / "run").verdict == "invalid"
 
 
+@pytest.mark.slow
 def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: Path) -> None:
     scenario = make_scenario(
         {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},

@@ -14,6 +14,8 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult
 from vnet import Node
 
+pytestmark = pytest.mark.slow
+
 RADIO: dict[str, Any] = {"path_loss": {"kind": "log_distance", "tx_power_dbm": 33.0}, "mac": {}, "max_peers": 1000}
 FAULTS: list[dict[str, Any]] = [
     {"kind": "loss", "at_s": 0.2, "duration_s": 0.3, "probability": 0.3, "nodes": {"count": 8}},
@@ -72,7 +74,6 @@ def test_a_frame_that_a_full_queue_drops_was_not_sent_though_its_addressee_is_ou
     assert {row["outcome"] for row in rows if not row["seq"]} == {"out_of_range"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "faults"),
     [({"fading": {}, "loss": 0.1}, []), ({}, FAULTS), ({"congestion": {"kind": "etsi"}, "max_peers": 4}, [])],
@@ -85,7 +86,6 @@ def test_checks_accept_what_the_radio_does(more: Any, faults: Any, tmp_path: Pat
     assert 0 < figures.acknowledged < figures.sent
 
 
-@pytest.mark.slow
 def test_checks_accept_vehicles_that_come_back_between_attempts(tmp_path: Path) -> None:
     """Each is down for a millisecond or nine, in turn, while the others send to it."""
     kills = [
@@ -109,7 +109,6 @@ def test_checks_accept_vehicles_that_come_back_between_attempts(tmp_path: Path) 
     assert {"receiver_down", "delivered", "duplicate"} <= {row["outcome"] for row in rows}
 
 
-@pytest.mark.slow
 def test_a_broken_exchange_is_found(tmp_path: Path) -> None:
     recorded = run_of(tmp_path / "run", radio={**RADIO, "loss": 0.2})
     assert badly_acknowledged(recorded) == 0

@@ -56,6 +56,7 @@ def spied(tmp_path: Path, *arguments: str) -> tuple[str, str, set[str]]:
     return how, seed, set(modules)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("argument", ["--help", "--version"])
 def test_what_needs_no_command_imports_none(argument: str, tmp_path: Path) -> None:
     how, _, modules = spied(tmp_path, argument)
@@ -100,6 +101,7 @@ def test_help_lists_every_command_on_a_line_of_eighty_columns(
     assert max(map(len, lines.values())) <= 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ALL)
 def test_help_of_every_command_fits_eighty_columns(
     path: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

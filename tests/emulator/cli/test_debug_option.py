@@ -19,6 +19,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "simulate"])
 @pytest.mark.parametrize(("options", "message"), REFUSED)
 def test_a_debugger_that_cannot_be_is_refused(

@@ -69,6 +69,7 @@ def vnet(folder: Path, *arguments: str, at_start: str = "") -> tuple[int, str, s
     return done.returncode, done.stdout, errors.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "module"),
     [
@@ -113,6 +114,7 @@ def test_a_program_that_does_not_yield_ends_at_the_second(tmp_path: Path) -> Non
     assert "verdict: unknown" in shown
 
 
+@pytest.mark.slow
 def test_a_process_in_the_background_goes_on_ignoring_it(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -35,12 +35,14 @@ def test_show_says_how_long_roads_are_and_what_is_odd(town: Path) -> None:
     assert "dead ends: 3" in text
 
 
+@pytest.mark.slow
 def test_show_draws_a_picture(town: Path, tmp_path: Path) -> None:
     status, text = vnet_map("show", town, "--out", tmp_path / "town.png")
     assert status == 0 and f"wrote {tmp_path / 'town.png'}" in text.replace("\n", "")
     assert (tmp_path / "town.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_show_a_part(town: Path) -> None:
     arguments = ("--origin", "42.28,-83.74", "--side-km", "0.1")
     assert "1 roads, 2 points" in vnet_map("show", town, "--at", "200,120", *arguments)[1]
@@ -53,6 +55,7 @@ def test_convert_writes_what_show_reads(town: Path, tmp_path: Path) -> None:
     assert read_roads(tmp_path / "town.npz").length_m.sum() == pytest.approx(550, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

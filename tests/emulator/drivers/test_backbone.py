@@ -40,6 +40,7 @@ def got(emulation: Emulation) -> list[tuple[str, int, dict[str, Any]]]:
 messages = st.lists(st.tuples(st.integers(0, 10**8), st.sampled_from(NAMES), st.sampled_from([None, *NAMES])))
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(messages, st.floats(0.001, 50), st.floats(0, 50), st.sampled_from([0.0, 0.5, 1.0]))
 def test_messages_keep_their_order_and_none_is_early_or_forgotten(
@@ -96,6 +97,7 @@ def test_units_hear_the_same_together_apart_and_without_windows() -> None:
     assert together.backbone.table() == apart.backbone.table() == without.backbone.table()
 
 
+@pytest.mark.slow
 def test_a_unit_that_is_down_hears_nothing_and_goes_on_afterwards() -> None:
     fault = {"kind": "kill", "nodes": {"ids": ["rsu02"]}, "at_s": 0.5, "duration_s": 0.5}
     emulation = run_together(scenario(2, fault=[fault], backbone={"latency_ms": 30.0}))
@@ -108,6 +110,7 @@ def test_a_unit_that_is_down_hears_nothing_and_goes_on_afterwards() -> None:
     assert down and all(5e8 <= time_ns < 1e9 for time_ns in down)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["shuffle", "pct"])
 def test_every_order_of_events_repeats_itself(order: str) -> None:
     runs = [run_together(scenario(run={"order": order}, backbone={"latency_ms": 7.0})) for _ in range(2)]

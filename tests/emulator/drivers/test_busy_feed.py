@@ -10,6 +10,8 @@ from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000
 RADIO: dict[str, Any] = {
     "path_loss": {"kind": "log_distance", "tx_power_dbm": 40.0},
@@ -72,7 +74,6 @@ def busy(on_air: list[tuple[int, int]], begin_ns: int, end_ns: int) -> float:
     return taken_ns / (end_ns - begin_ns)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("latency_ms", [0.3, 2.0, 35.0])
 def test_the_ratio_is_that_of_100_ms_one_lookahead_ago(latency_ms: float) -> None:
     emulation = run_together(scenario(latency_ms=latency_ms))
@@ -86,7 +87,6 @@ def test_the_ratio_is_that_of_100_ms_one_lookahead_ago(latency_ms: float) -> Non
     assert max(ratio for _, _, ratio in read) > 0.5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entry", "latency_ms"), [(MEASURES, 0.3), (SLEEPS, 35.0)], ids=["busy programs", "quiet instants"]
 )

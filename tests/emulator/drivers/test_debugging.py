@@ -104,6 +104,7 @@ def stops(said: list[str]) -> list[str]:
     return [line.removeprefix("-> ") for line in said if line.startswith("-> ")]
 
 
+@pytest.mark.slow
 def test_it_stops_at_the_first_line_and_steps_over_what_waits(debug: Debug) -> None:
     emulation, said, _ = debug("sends", "v02", "n", "n", "n", "p node.id, node.now_ns", "c")
     assert stops(said) == [
@@ -117,6 +118,7 @@ def test_it_stops_at_the_first_line_and_steps_over_what_waits(debug: Debug) -> N
     assert fingerprint(emulation) == fingerprint(run_together(scenario_of([], HERE + "sends")))
 
 
+@pytest.mark.slow
 def test_a_step_goes_on_in_who_awaits(debug: Debug) -> None:
     _, said, _ = debug("sends", "v03", "n", "n", "s", "n", "n", "n", "w", "c")
     assert stops(said)[3:7] == [

@@ -55,6 +55,7 @@ def test_what_was_written_is_there_after_a_kill_and_in_the_run_at_its_end(nodes_
         assert not emulation.folder.disks.exists()
 
 
+@pytest.mark.slow
 def test_a_restart_finds_its_disk_too() -> None:
     emulation = run_together(scenario_of(FAULTS, f"{__name__}:keeps_a_diary", vehicles=3))
     concluded(emulation)
@@ -121,6 +122,7 @@ def test_a_disk_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
     assert (tmp_path / "other" / "file").exists()
 
 
+@pytest.mark.slow
 def test_many_files_and_deep_folders_are_bounded(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
     disk = Disks(folder.disks).of("v01")

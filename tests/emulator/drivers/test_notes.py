@@ -98,6 +98,7 @@ def test_lines_that_are_broken_keep_their_beginning_apart() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_flood_is_cut_and_counted() -> None:
     emulation = run_together(scenario_of([], f"{__name__}:floods", vehicles=2))
     conclude(emulation, 1.0, "simulate")

@@ -44,6 +44,7 @@ async def prints_everywhere(node: Node) -> None:
 WHERE = ["main", "a task", "a callback", "a job", "a thread", "error", "pieces"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", [run_together, run_forked])
 def test_prints_are_in_the_log_of_their_vehicle_and_in_the_terminal(
     capsys: pytest.CaptureFixture[str], run: Callable[[Scenario], Emulation]

@@ -117,6 +117,7 @@ def test_live_processes_are_told_what_their_simulation_is(entry: str, latency_ms
         assert other.engine.trace.sha256() == together.engine.trace.sha256()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nodes_per_process", [1, 2])
 def test_a_live_process_that_gives_up_a_send_goes_on(nodes_per_process: int) -> None:
     """Its result is an instant of the process all the same, for which it has to be granted."""
@@ -161,6 +162,7 @@ def test_a_send_that_outlasts_the_run_is_dropped_without_a_word(caplog: pytest.L
     assert not [event for event in emulation.folder.events if event.kind == "unhandled"]
 
 
+@pytest.mark.slow
 def test_a_result_for_a_paused_vehicle_waits_and_the_run_goes_on() -> None:
     """With one sender only: when its result comes, nobody else has anything to do."""
     fault = {"kind": "pause", "nodes": {"ids": ["v01"]}, "at_s": 0.01, "duration_s": 0.1}

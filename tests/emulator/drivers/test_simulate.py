@@ -36,6 +36,7 @@ async def computes_for_ever(node: Node) -> None:
             signal.raise_signal(signal.SIGINT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", ["is_interrupted", "computes_for_ever"])
 def test_an_interruption_is_recorded_and_the_run_judged(
     tmp_path: Path, program: str, caplog: pytest.LogCaptureFixture

@@ -52,6 +52,7 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> list[Snapshot]:
     return found
 
 
+@pytest.mark.slow
 def test_time_and_speed(shots: list[Snapshot]) -> None:
     assert [shot.emulated_s for shot in shots[:3]] == pytest.approx([0.0, 0.1, 0.2])
     assert (shots[0].phase, shots[0].real_time_factor) == ("starting", None)
@@ -105,6 +106,7 @@ def test_figures_over_time_are_in_equal_parts_of_the_run(shots: list[Snapshot]) 
     assert asdict(half)["over_time"]["fix_rmse_m"] == half.over_time["fix_rmse_m"]
 
 
+@pytest.mark.slow
 def test_many_periods_share_a_part(tmp_path: Path) -> None:
     emulation = emulate(tmp_path / "run", run={"duration_s": 24.0})
     course = Course(emulation)

@@ -116,6 +116,7 @@ def capture(recorded: OpenedRun) -> bytes:
     return file.getvalue()
 
 
+@pytest.mark.slow
 def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: OpenedRun) -> None:
     (first, section), *rest = blocks(capture)
     assert first == 0x0A0D0D0A and struct.unpack_from("<IHH", section) == (0x1A2B3C4D, 1, 0)
@@ -162,6 +163,7 @@ def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, 
         assert struct.unpack_from("<H", mac, 22)[0] >> 4 == int(seq.split()[0]) % 4096
 
 
+@pytest.mark.slow
 def test_a_frame_to_one_vehicle_has_its_address_retries_and_acknowledgements(tmp_path: Path) -> None:
     recorded = exchange_run(tmp_path, COPYING)
     file = io.BytesIO()
@@ -190,6 +192,7 @@ async def changes_its_rate(node: Any) -> None:
         await node.radio.broadcast(b"x", rate_mbps=27 if fix.time_ns % 200_000_000 else None)
 
 
+@pytest.mark.slow
 def test_a_packet_has_the_bit_rate_of_its_own_frame(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "free_space", "floor_dbm": -150.0}, "bitrate_mbps": 3.0}
     scenario = {"run": {"duration_s": 1.0, "settle_s": 0.1}, "network": {"vehicles": 2, "layout": "dense"}}
@@ -318,6 +321,7 @@ def test_a_name_of_another_format_is_refused(folder: Path, options: list[str], m
     assert (done.exit_code, done.stderr) == (2, f"vnet: {message}\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", ["pcapng", "mcap", "csv", "links"])
 def test_an_export_goes_where_it_is_told_and_never_over_something_else(
     folder: Path, tmp_path: Path, to: str
@@ -350,6 +354,7 @@ def test_the_links_of_a_run_are_what_the_file_says(
     assert expected.loss[before][-1] > 0
 
 
+@pytest.mark.slow
 def test_links_of_frames_to_one_vehicle_are_those_of_attempts_and_acknowledgements(tmp_path: Path) -> None:
     recorded = exchange_run(tmp_path, COPYING)
     table = measured_links(recorded, 10**9)

@@ -27,6 +27,7 @@ EXAMPLE = ROOT / "docs" / "examples" / "its"
 places = st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
 
 
+@pytest.mark.slow
 @given(places, st.floats(0, 2 * math.pi), st.floats(0, 160), st.integers(0, 2**32 - 1), st.integers(0, 10**14))
 def test_place_speed_and_heading_of_a_cam_are_read_from_its_bits(
     position_m: tuple[float, float], heading_rad: float, speed_m_s: float, station: int, time_ns: int
@@ -43,6 +44,7 @@ def test_place_speed_and_heading_of_a_cam_are_read_from_its_bits(
     assert again.position_m == pytest.approx(position_m, abs=0.02)
 
 
+@pytest.mark.slow
 @given(places, st.integers(0, 2**32 - 1), st.integers(0, 65535), st.integers(0, 10**14))
 def test_the_place_of_a_denm_is_read_from_its_bits(
     position_m: tuple[float, float], station: int, number: int, time_ns: int

@@ -36,6 +36,7 @@ def test_without_a_word_all_are_meant(count: int) -> None:
     assert chosen(some_nodes(count)) == list(range(count))
 
 
+@pytest.mark.slow
 @given(counts, st.data())
 def test_ids_are_exactly_those(count: int, data: st.DataObject) -> None:
     ids = data.draw(st.lists(st.integers(0, count - 1), max_size=count))
@@ -108,6 +109,7 @@ def test_a_polygon_need_not_be_convex_and_its_order_counts() -> None:
     assert chosen(nodes, polygon=horseshoe) == [0, 1, 2, 4]
 
 
+@pytest.mark.slow
 @given(seeds, st.integers(0, 20), st.integers(0, 20))
 def test_a_degree_is_between_the_least_and_the_most(seed: int, one: int, other: int) -> None:
     nodes, least, most = some_nodes(20, seed % 1000), min(one, other), max(one, other)
@@ -126,6 +128,7 @@ def test_the_same_seed_and_place_make_the_same_choice_and_others_another() -> No
     assert len(by_seed) == 20
 
 
+@pytest.mark.slow
 @given(seeds, st.lists(st.sampled_from(["kill", "block", "partition", "swizzle"]), min_size=1, max_size=5))
 def test_one_more_fault_at_the_end_changes_nothing_before_it(seed: int, kinds: list[str]) -> None:
     faults = [{"kind": k, "duration_s": 1} | ({} if k == "partition" else {"nodes": {"count": 3}}) for k in kinds]
@@ -137,6 +140,7 @@ def test_one_more_fault_at_the_end_changes_nothing_before_it(seed: int, kinds: l
             assert swizzle_times_ns(one, seed) == swizzle_times_ns(same, seed)
 
 
+@pytest.mark.slow
 @given(seeds, st.data())
 def test_links_have_an_end_among_the_nodes_and_go_from_senders_to_receivers(seed: int, data: st.DataObject) -> None:
     some = st.lists(st.integers(0, 7), unique=True).map(lambda ns: [f"v{n}" for n in ns]) | st.none()
@@ -193,6 +197,7 @@ def test_on_a_ring_each_hears_a_majority_and_no_two_the_same_one(count: int, see
         assert len(set(heard)) == count
 
 
+@pytest.mark.slow
 @given(st.integers(1, 12), seeds, st.floats(0.001, 24), st.floats(0.001, 30))
 def test_a_swizzle_cuts_all_off_one_by_one_and_has_them_back_by_its_end(
     count: int, seed: int, over_s: float, duration_s: float

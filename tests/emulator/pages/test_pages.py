@@ -88,6 +88,7 @@ def failure(text: str) -> str:
     return render("failure.html.j2", title=text, checks={text: text}, parting=parting, timeline=timeline)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [campaign, comparison, failure])
 @pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
 def test_hostile_text_adds_no_element_no_attribute_and_no_control(make: Callable[[str], str], text: str) -> None:

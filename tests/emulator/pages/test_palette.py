@@ -4,6 +4,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 from emulator.pages.palette import PAGE, PALETTE
 from tests.support.paths import ROOT
 
@@ -16,6 +18,7 @@ def strings(path: Path) -> list[str]:
     return [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
 
 
+@pytest.mark.slow
 def test_no_colour_stands_anywhere_else() -> None:
     sources = [path for path in (ROOT / "emulator").rglob("*.py") if path.name != "palette.py"]
     found = {path.name: text for path in sources for text in strings(path) if re.fullmatch(HEX, text)}

@@ -54,6 +54,7 @@ def recorded(folder: Path) -> OpenedRun:
     return RecordedRun.open(folder)
 
 
+@pytest.mark.slow
 def test_the_house_takes_the_car_out_of_reach_while_it_is_behind_it(recorded: OpenedRun) -> None:
     rows = [row for row in recorded.trace.to_pylist() if {row["sender"], row["receiver"]} == {"car", "hidden"}]
     times_s = {round(row["sent_ns"] / 1e9, 1) for row in rows}
@@ -67,6 +68,7 @@ def test_all_checks_agree_from_the_folder_alone(recorded: OpenedRun) -> None:
     assert {verdicts[name] for name in ("conservation", "range", "fading", "medium")} == {"valid"}, verdicts
 
 
+@pytest.mark.slow
 def test_the_checks_find_a_run_that_took_no_buildings_into_account(folder: Path, tmp_path: Path) -> None:
     free = run_scenario(tmp_path / "free", among_buildings(tmp_path, FAR_AWAY))
     with_house = RecordedRun.open(folder)

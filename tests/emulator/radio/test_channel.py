@@ -86,6 +86,7 @@ def test_draws_depend_on_the_frame_and_not_on_what_was_drawn_before(
     assert np.all((fresh >= 0) & (fresh < 1))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.lists(st.tuples(frames_of, st.integers(0, 99)), min_size=1, max_size=6), st.data())
 def test_single_draws_are_those_of_the_frames_whole_vectors(
@@ -153,6 +154,7 @@ def test_the_range_is_a_closed_disc_without_its_centre() -> None:
     assert [Outcome(o).name for o in heard] == ["out_of_range", "pending", "out_of_range", "pending"]
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(lattice, st.integers(1, 5), st.integers(1, 6), st.sets(st.integers(0, 11), max_size=4))
 def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
@@ -225,6 +227,7 @@ def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]
     return ends
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 2_000_000), st.integers(0, 1400)), min_size=1, max_size=25),

@@ -90,6 +90,7 @@ def test_senders_measure_each_on_its_own_clock() -> None:
     assert set(np.round(seen, 3)) == {round(part / 10, 3) for part in range(11)}
 
 
+@pytest.mark.slow
 def test_limeric_takes_the_mean_of_two_windows() -> None:
     steady, by_turns = (LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1)) for _ in range(2))
     for first in range(2000):

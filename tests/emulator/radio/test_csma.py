@@ -85,6 +85,7 @@ options = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seeds, crowds, options, st.lists(st.integers(0, 8 * MS), max_size=40))
 def test_however_time_is_cut_the_same_happens(
@@ -140,6 +141,7 @@ def test_however_time_is_cut_copies_have_the_same_numbers(
     assert rows(one) == rows(other)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seeds, crowds, options)
 def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
@@ -169,6 +171,7 @@ def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
     assert plain.trace.sha256() == asked.trace.sha256()
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(seeds, crowds, st.permutations(range(6)), options)
 def test_at_one_instant_it_does_not_matter_whom_the_drivers_ask_first(
@@ -183,6 +186,7 @@ def test_at_one_instant_it_does_not_matter_whom_the_drivers_ask_first(
     assert one.trace.sha256() == other.trace.sha256()
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(seeds, crowds, st.lists(st.tuples(st.integers(0, 4 * MS), st.integers(6, 8)), max_size=10), options)
 def test_others_far_away_change_nothing(
@@ -339,6 +343,7 @@ def test_a_throttled_sender_has_no_longer_a_queue_than_others() -> None:
     assert np.all(mine[full]["left_ns"] >= mine[full]["sent_ns"])
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(seeds, crowds, options)
 def test_every_pair_has_one_outcome_and_what_collided_met_a_frame_in_its_receivers_range(
@@ -370,6 +375,7 @@ def test_every_pair_has_one_outcome_and_what_collided_met_a_frame_in_its_receive
             assert any(mine[0] < end and start < mine[1] for start, end in others)
 
 
+@pytest.mark.slow
 def test_the_same_frames_alone_show_what_would_have_arrived() -> None:
     """Outcomes among many vehicles, against those of each frame alone: faded in both, or collided only there."""
     position_m = scattered(12, 3, side_m=900)

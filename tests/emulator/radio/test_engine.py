@@ -74,6 +74,7 @@ def run_all(subject: Engine, order: list[int], steps: int) -> list[Delivery]:
     return deliveries
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(seeds, st.permutations(range(6)), st.integers(1, 7))
 def test_neither_the_order_of_calls_nor_the_size_of_steps_matters(seed: int, order: list[int], steps: int) -> None:
@@ -221,6 +222,7 @@ def test_a_row_of_a_long_trace_in_which_bytes_were_changed_costs_no_more_than_of
     assert most_bytes < 20_000
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.integers(2, 9), st.integers(0, 3))
 def test_arrivals_at_one_time_are_ordered_and_are_shown_in_that_order(seed: int, count: int, tick_ms: int) -> None:

@@ -32,6 +32,7 @@ EVERYTHING = [
 ENDED_NS = 6_200_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_with_everything_at_once_each_reception_has_one_outcome_and_all_are_counted(seed: int) -> None:
     air = FaultyEngine(EVERYTHING, seed=seed, loss=0.1, max_peers=3, queue_frames=8)
@@ -71,6 +72,7 @@ def test_one_more_fault_changes_no_reception_it_does_not_touch(seed: int, data: 
     assert before == after
 
 
+@pytest.mark.slow
 def test_copies_of_one_fault_do_not_depend_on_how_many_another_made() -> None:
     """A flood's copies are drawn for themselves, though the duplicates of other pairs take numbers in between."""
     flood = fault("DoS", nodes={"ids": ["v1"]}, factor=5)
@@ -135,6 +137,7 @@ def test_after_all_have_ended_the_engine_is_as_one_that_never_had_faults(seed: i
     assert air.rows(ENDED_NS + S) == free.rows(ENDED_NS + S)
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.data())
 def test_the_next_change_visits_every_start_and_end_once(data: st.DataObject) -> None:

@@ -47,6 +47,7 @@ def run(coroutine: Any) -> None:
         coroutine.send(None)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.floats(-40, 0), st.sampled_from(RATES_MBPS), st.integers(20, 200))
 def test_power_shifts_the_received_one_and_rate_the_airtime(

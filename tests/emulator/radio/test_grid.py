@@ -42,6 +42,7 @@ frame_lists = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(frame_lists, st.sampled_from([20, 50, 100]), st.integers(1, 2), st.sampled_from([1, 3, 50]))
 def test_excluded_are_the_resources_that_others_reserved(

@@ -16,6 +16,7 @@ NOISE_DBM = -97.0
 LOG_DISTANCE: dict[str, Any] = {"kind": "log_distance"}
 
 
+@pytest.mark.slow
 @given(st.floats(1, 400), st.floats(0, 33))
 def test_a_frame_that_is_alone_has_the_power_of_its_path_loss(distance_m: float, tx_power_dbm: float) -> None:
     subject = engine(line(0, distance_m), path_loss={**LOG_DISTANCE, "tx_power_dbm": tx_power_dbm}, mac={})

@@ -79,6 +79,7 @@ def test_shadowing_has_its_deviation(field: ShadowField) -> None:
     assert abs(stats.kurtosis(loss)) < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_m", [5.0, 25.0, 60.0])
 def test_shadowing_has_gudmundsons_correlation_for_either_end(step_m: float) -> None:
     count, upper = 200, np.triu_indices(200, 1)

@@ -115,6 +115,7 @@ def test_winner_b1_is_the_published_formula() -> None:
 # Time.
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**63 - 1), crowds, kinds, keys, st.lists(st.integers(0, 200 * MS), max_size=20))
 def test_however_time_is_cut_the_same_happens(
@@ -128,6 +129,7 @@ def test_however_time_is_cut_the_same_happens(
     assert one.trace.sha256() == other.trace.sha256() and one.counts == other.counts
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(0, 400 * MS), min_size=1, max_size=12, unique=True), kinds, keys)
 def test_frames_go_on_air_in_whole_slots_and_never_arrive_within_the_window(
@@ -151,6 +153,7 @@ def test_frames_go_on_air_in_whole_slots_and_never_arrive_within_the_window(
     assert len(set(begins)) == len(begins), "one frame a slot"
 
 
+@pytest.mark.slow
 def test_periodic_frames_keep_their_resource_for_the_counter_and_change_it_then() -> None:
     rows = beacons(engine(line(0, 50), **LTE), 1, 20.0)
     phases = [row["on_air_ns"] % (100 * MS) for row in rows]
@@ -176,6 +179,7 @@ def test_a_period_is_learned_from_frames_where_a_program_does_not_say_it() -> No
     assert gaps[50] > 0.7 * len(rows)
 
 
+@pytest.mark.slow
 def test_one_shots_leave_the_reservation_now_and_then() -> None:
     rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True, keep_probability=0.8)), 1, 20.0)
     phases = Counter(row["on_air_ns"] % (100 * MS) for row in rows)
@@ -198,6 +202,7 @@ def test_outcomes_in_their_order() -> None:
     assert all((row["outcome"] == "half_duplex") == (row["on_air_ns"] in same) for row in between)
 
 
+@pytest.mark.slow
 def test_equal_signals_on_one_resource_collide_and_beside_each_other_do_not() -> None:
     for subchannels, outcome in ((1, "collided"), (2, "delivered")):
         mac = {"kind": "nr-mode2", "scs_khz": 15, "subchannels": subchannels, "t1_slots": 1, "t2_ms": 10}
@@ -214,6 +219,7 @@ def test_equal_signals_on_one_resource_collide_and_beside_each_other_do_not() ->
         assert {row["outcome"] for row in heard if times[row["on_air_ns"]] == 1} == {"delivered"}
 
 
+@pytest.mark.slow
 def test_a_second_transmission_saves_frames_and_arrives_after_it() -> None:
     once, twice = (
         beacons(engine(line(*range(0, 750, 50)), **with_mac(LTE, retransmit=again)), 15, 4.0)
@@ -225,6 +231,7 @@ def test_a_second_transmission_saves_frames_and_arrives_after_it() -> None:
     assert {(row["left_ns"] - row["on_air_ns"]) // MS for row in once} == {1}
 
 
+@pytest.mark.slow
 def test_occupancy_limit_drops_frames_of_a_busy_channel_alone() -> None:
     """Each may send four frames a second, however busy the channel is, or if a fifth of it is busy."""
     limit: dict[str, Any] = {"congestion": {"kind": "cr_limit", "busy": [0.0], "most": [0.001]}}
@@ -278,6 +285,7 @@ def chance(successes: int, trials: int, probability: float) -> bool:
     return abs(successes - trials * probability) <= 5 * sqrt(trials * probability * (1 - probability)) + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("slots", "subchannels"), [(10, 1), (10, 2), (14, 3)])
 def test_dynamic_selections_meet_as_often_as_all_pairs_of_choices_say(slots: int, subchannels: int) -> None:
     """Two vehicles that know nothing of each other choose among all resources of the window, independently."""

@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from emulator.records.radio_metrics import unicast_figures
 from tests.support.exchange_programs import COPYING, exchange_run
+
+pytestmark = pytest.mark.slow
 
 
 def test_figures_of_frames_to_one_vehicle_are_what_the_program_was_told(tmp_path: Path) -> None:

@@ -96,6 +96,7 @@ def many_rows(path: Path, count: int) -> None:
     pq.write_table(pa.table(columns, schema=first.schema), path, compression="zstd")
 
 
+@pytest.mark.slow
 def test_a_table_of_many_more_rows_than_the_verdict_speaks_of_is_refused(copy: Path) -> None:
     many_rows(copy / "trace.parquet", 2_000_000)
     before = pa.total_allocated_bytes()

@@ -50,6 +50,7 @@ def test_without_them_one_line_says_what_is_needed(run: Path) -> None:
         assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_what_needs_no_world_is_read_without_them(run: Path) -> None:
     recorded = RecordedRun.open(run)
     assert (recorded.record.format, recorded.record.vehicles, recorded.node_ids) == (1, 3, ["a", "b", "c"])

@@ -123,6 +123,7 @@ def test_every_figure_is_the_one_that_its_definition_gives(seed: int, count: int
         assert getattr(found, name) == pytest.approx(value, rel=1e-9, abs=1e-12), name
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 30), st.sampled_from([0.0, 0.02, 0.6, 1.0]))
 def test_the_figures_of_many_periods_are_those_of_each_bit_by_bit(
@@ -242,6 +243,7 @@ def test_the_tables_come_back_from_their_files(tmp_path: Path) -> None:
     assert kept.metrics_table()["time_ns"].to_pylist() == [0, 100_000_000]
 
 
+@pytest.mark.slow
 @given(rows_a_piece=st.integers(1, 9), periods=st.integers(0, 8))
 def test_states_do_not_depend_on_how_many_are_packed_at_a_time(rows_a_piece: int, periods: int) -> None:
     tables = []

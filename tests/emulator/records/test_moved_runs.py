@@ -200,6 +200,7 @@ def readers(tree: ast.Module) -> set[str]:
     return {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and n.attr in READ}
 
 
+@pytest.mark.slow
 def test_only_records_opens_the_files_of_a_folder() -> None:
     paths = [*(ROOT / "emulator").rglob("*.py")]
     outside = [path for path in paths if path.parent != ROOT / "emulator" / "records"]

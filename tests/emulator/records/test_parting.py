@@ -58,6 +58,7 @@ def test_a_lost_frame_is_a_reception_and_what_follows_is_told(tmp_path: Path) ->
     assert len(told(plain, reception)) == 8
 
 
+@pytest.mark.slow
 def test_vehicles_of_one_run_alone_are_named_and_values_are_those_of_both(tmp_path: Path) -> None:
     """Campaigns compare shrunk runs, which have fewer vehicles."""
     program = {"program": {"entry": "agents.beacon:main"}}
@@ -100,6 +101,7 @@ def test_a_parting_names_the_entry_that_one_run_lacks(
     assert _first_entry("frame", first, second) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other, status, told",
     [("a", 0, "the runs agree"), ("b", 1, "the runs part at 0.000000 s"), ("nothing", 2, "nothing")],

@@ -188,6 +188,7 @@ def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(
     assert told.links.equals(expected.links) and told.totals == expected.totals
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(traces(), st.floats(5, 200))
 def test_vehicles_distances_and_totals_add_up(trace: tuple[list[Row], np.ndarray, bool], bin_m: float) -> None:
@@ -220,6 +221,7 @@ def test_vehicles_distances_and_totals_add_up(trace: tuple[list[Row], np.ndarray
         )
 
 
+@pytest.mark.slow
 def test_a_beacon_that_all_hear_is_as_old_as_its_period_and_its_way(tmp_path: Path) -> None:
     """Sent each 0.2 s, 3 ms on the way: the age goes from 3 to 203 ms, and is 103 ms in the mean."""
     vehicles = {"a": [(0, 9, still(0))], "b": [(0, 9, still(100))], "c": [(3, 6, along(0, 10))]}

@@ -55,6 +55,7 @@ def only_invalid(recorded: RecordedRun, trace: pa.Table) -> set[str]:
     return {name for name, verdict in verdicts(recorded, trace=trace).items() if verdict is Verdict.INVALID}
 
 
+@pytest.mark.slow
 def test_a_missing_frame_breaks_conservation(recorded: RecordedRun) -> None:
     first = recorded.trace.slice(0, 1).to_pylist()[0]
     same = pc.and_(
@@ -94,6 +95,7 @@ def test_a_program_that_sends_nothing_leaves_checks_unknown(recorded: RecordedRu
     }
 
 
+@pytest.mark.slow
 def test_a_cap_that_cannot_act_is_left_out_with_its_reason(tmp_path: Path) -> None:
     judgement = judge(beacons(tmp_path / "run"))
     assert judgement.verdict is Verdict.VALID

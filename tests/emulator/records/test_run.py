@@ -22,6 +22,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_folder_is_opened_as_a_run(folder: Path) -> None:
     run = emulator.Run.open(folder)
     assert run.folder == folder

@@ -41,6 +41,7 @@ def simulated(folder: Path, wear: pa.Table, monkeypatch: pytest.MonkeyPatch) -> 
     return RecordedRun.open(folder)
 
 
+@pytest.mark.slow
 def test_a_table_is_added_by_its_declaration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     TABLES.append(TYRES)
     try:
@@ -56,6 +57,7 @@ def test_a_table_is_added_by_its_declaration(tmp_path: Path, monkeypatch: pytest
     assert "| `wear_m` | `double` | m | how much of the rubber is gone |" in text
 
 
+@pytest.mark.slow
 def test_a_gap_and_a_wrong_type_are_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     TABLES.append(TYRES)
     try:

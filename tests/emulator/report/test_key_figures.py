@@ -56,6 +56,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate_into(Scenario.model_validate(SCENARIO), tmp_path_factory.mktemp("runs") / "run")
 
 
+@pytest.mark.slow
 def test_a_figure_is_declared_in_one_place(run: Path) -> None:
     verdict = json.loads((run / "verdict.json").read_text())
     console = Console(file=io.StringIO(), width=120)
@@ -94,6 +95,7 @@ def test_a_declared_figure_is_what_its_function_gives(run: Path) -> None:
     assert {check.name: check.verdict.value for check in check_run(run).checks}["metrics"] == "valid"
 
 
+@pytest.mark.slow
 def test_a_recording_and_the_live_picture_have_a_declared_figure(run: Path, tmp_path: Path) -> None:
     with Recorder(Sinks(save=tmp_path / "run.rrd"), "run") as recorder:
         for stream, message in messages(run):

@@ -45,6 +45,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Source:
     return Source(folder)
 
 
+@pytest.mark.slow
 def test_each_value_has_a_chart(source: Source) -> None:
     charts, missing = draw_charts(program_charts(source))
     found = {chart.title: chart for chart in charts}
@@ -88,6 +89,7 @@ def test_names_on_a_map_do_not_overlap() -> None:
     assert _draw_names(canvas("x", "y"), ["a", "b"], np.array([[0.2, 0.5], [np.nan, 0.5]])) == ""
 
 
+@pytest.mark.slow
 def test_vehicles_are_coloured_by_values_that_differ(source: Source) -> None:
     charts, _ = draw_charts(map_charts(source))
     found = {chart.title: chart for chart in charts}

@@ -59,6 +59,7 @@ def shown(source: Source, most: int = 20_000) -> tuple[Timeline, dict[str, Any]]
     return found, json.loads(found.data)
 
 
+@pytest.mark.slow
 def test_every_reception_is_there_once_with_its_outcome_and_time(run: Source) -> None:
     found, data = shown(run)
     trace = run.trace.to_pylist()

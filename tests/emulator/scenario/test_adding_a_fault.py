@@ -55,6 +55,7 @@ def scenario_with(**fault: Any) -> Scenario:
     return Scenario.model_validate({**SMALL, "radio": {"loss": 0.0, "range_m": 1e5}, "fault": [written]})
 
 
+@pytest.mark.slow
 def test_it_acts_in_a_run_and_its_effect_is_found(tmp_path: Path, spike: type[Fault]) -> None:
     recorded = run_scenario(tmp_path / "run", scenario_with(probability=0.5))
     latency_ms = (recorded.arrival_ns - recorded.sent_ns) / 1e6
@@ -65,6 +66,7 @@ def test_it_acts_in_a_run_and_its_effect_is_found(tmp_path: Path, spike: type[Fa
     assert Verdict.INVALID not in verdicts.values()
 
 
+@pytest.mark.slow
 def test_nothing_shows_its_effect_where_it_never_strikes(tmp_path: Path, spike: type[Fault]) -> None:
     recorded = run_scenario(tmp_path / "run", scenario_with(probability=1e-12))
     (effect,) = [check for check in judge(recorded).checks if check.name == "effect:latency_spike-0"]

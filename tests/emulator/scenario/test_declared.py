@@ -54,6 +54,7 @@ def written(folder: Path, name: str, declared: str = DECLARED) -> Scenario:
     return load_scenario(folder / "scenario.toml")
 
 
+@pytest.mark.slow
 def test_a_program_s_checks_and_reference_are_those_that_it_declares(tmp_path: Path) -> None:
     run = simulate_into(written(tmp_path, "declaring"), tmp_path / "run")
     checks = {check["name"]: check["verdict"] for check in json.loads((run / "verdict.json").read_text())["checks"]}

@@ -148,6 +148,7 @@ def written_faults(draw: st.DrawFn) -> dict[str, Any]:
     return fault
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.lists(written_faults(), max_size=5))
 def test_any_faults_survive_being_written_and_read(

@@ -66,6 +66,7 @@ def sizes(folder: str) -> set[int]:
     return set(RecordedRun.open(Path(folder)).trace["size_bytes"].to_pylist())
 
 
+@pytest.mark.slow
 def test_the_scenarios_own_folder_comes_before_the_current_one(here: Path) -> None:
     program(here / "pp_hello.py", b"here")
     program(here / "scenarios" / "pp_hello.py", b"beside")
@@ -91,6 +92,7 @@ def test_vnets_own_programs_and_what_is_installed_need_no_folder(here: Path) -> 
     assert load('program.entry="json:dumps"').program.folders == ()
 
 
+@pytest.mark.slow
 def test_a_file_of_the_command_line_is_one_of_the_current_folder(here: Path) -> None:
     program(here / "pp_hello.py", b"here")
     program(here / "scenarios" / "pp_hello.py", b"beside")
@@ -98,12 +100,14 @@ def test_a_file_of_the_command_line_is_one_of_the_current_folder(here: Path) -> 
     assert sizes("first") == {len(b"here")}
 
 
+@pytest.mark.slow
 def test_a_file_may_name_its_function_and_lie_anywhere(here: Path) -> None:
     program(here / "deep" / "er: 2" / "pp_far.py", b"far")
     assert simulate("scenarios/own.toml", "--program", "deep/er: 2/pp_far.py:other", "--out", "first")[0] == 0
     assert sizes("first") == {1}
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_from_any_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program(here / "pp_hello.py", b"here")
     simulate("scenarios/own.toml", "--program", "pp_hello:main", "--out", "first")
@@ -115,6 +119,7 @@ def test_a_run_is_repeated_from_any_folder(here: Path, monkeypatch: pytest.Monke
     assert first == again
 
 
+@pytest.mark.slow
 def test_the_stored_command_works_from_any_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program(here / "scenarios" / "pp_hello.py", b"here")
     simulate("scenarios/own.toml", "--program", "pp_hello.py", "--out", "my first")
@@ -197,6 +202,7 @@ def test_what_cannot_be_found_is_named_in_one_line(here: Path, override: str, sa
         load(*[] if key == "program" else [override])
 
 
+@pytest.mark.slow
 def test_an_option_is_short_for_a_key_of_the_scenario(here: Path) -> None:
     program(here / "pp_hello.py", b"x")
     arguments = ["scenarios/own.toml", "--program", "pp_hello.py", "--out", "one"]
@@ -234,6 +240,7 @@ def test_agents_of_a_live_run_are_told_the_folders(tmp_path: Path, monkeypatch: 
     assert arguments[-4:] == ["--path", str(tmp_path / "a b"), "--path", str(tmp_path)]
 
 
+@pytest.mark.slow
 def test_a_file_name_may_have_blanks(here: Path) -> None:
     program(here / "pp my prog.py", b"blank")
     status, said = simulate("scenarios/own.toml", "--program", "pp my prog.py", "--out", "run")

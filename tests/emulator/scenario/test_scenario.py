@@ -131,6 +131,7 @@ OPTIONS = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 2**63 - 1),

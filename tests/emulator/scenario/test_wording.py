@@ -62,6 +62,7 @@ def all_problems() -> Iterator[str]:
         yield problem({"fault": [{"kind": kind}]})
 
 
+@pytest.mark.slow
 def test_no_word_of_pydantic_s_is_shown() -> None:
     said = {text for text in all_problems() if text}
     assert len(said) > 500

@@ -55,6 +55,7 @@ class Clock:
         self.time_s += seconds
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 0.5), min_size=1, max_size=30), st.floats(0.1, 10))
 def test_no_message_comes_early_or_later_than_it_must(costs_s: list[float], speed: float) -> None:
     """Whatever showing costs: a message comes when it is due, or right after the one before it."""

@@ -98,6 +98,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     return watch(scenario, tmp_path_factory.mktemp("shared") / "run")
 
 
+@pytest.mark.slow
 def test_the_files_tell_what_was_told_live(watched: Watched) -> None:
     played = list(messages(watched.folder))
     assert [stream for stream, _ in played] == [stream for stream, _ in watched.told]
@@ -115,6 +116,7 @@ def _crossed_pair(pair: tuple[str, dict[str, Any]]) -> tuple[str, dict[str, Any]
     return pair[0], crossed(pair[1])
 
 
+@pytest.mark.slow
 def test_the_files_of_a_shared_medium_tell_the_same(shared: Watched) -> None:
     played = list(messages(shared.folder))
     for (_, live), (stream, again) in zip(shared.told, map(_crossed_pair, played), strict=True):

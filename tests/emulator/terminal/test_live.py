@@ -93,6 +93,7 @@ def of_states(folder: Path) -> None:
     pq.write_table(states.append_column(f"a.{HOSTILE}", states["heading_rad"]), path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edits", [[of_events, of_verdict, of_states], [of_manifest]], ids=["records", "manifest"])
 @pytest.mark.parametrize("command", ["check", "report", "compare", "radio", "trace", "play"])
 def test_no_command_sends_what_a_folder_holds(run: Path, tmp_path: Path, edits: list[Edit], command: str) -> None:

@@ -93,6 +93,7 @@ def told(folder: Path, show: Callable[..., Progress], file: Any, **sections: obj
     return verdict
 
 
+@pytest.mark.slow
 def test_plain_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PlainLines, "every_s", 0.0)
     file = io.StringIO()
@@ -112,6 +113,7 @@ def test_plain_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert int(told_of[1]) < decided <= counts["delivered"] + counts["lost"] + counts["receiver_down"]
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_has_a_line_at_once(tmp_path: Path) -> None:
     file = io.StringIO()
     told(tmp_path / "run", PlainLines, file, program=CRASHING)
@@ -130,6 +132,7 @@ def test_plain_lines_of_joining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     ]
 
 
+@pytest.mark.slow
 def test_lines_of_json_hold_the_figures_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(JsonLines, "every_s", 0.0)
     file = io.StringIO()
@@ -174,6 +177,7 @@ def test_lines_of_json_of_joining(tmp_path: Path) -> None:
     assert told == [("starting", [], 6), ("joining", ["v01", "v02"], 6), ("running", [], 6)]
 
 
+@pytest.mark.slow
 def test_a_picture_of_a_run_leaves_nothing_but_what_was_said(tmp_path: Path) -> None:
     screen = Terminal(80, 24)
     verdict = told(tmp_path / "run", lambda emulation, file: Picture(emulation, file.console), screen)

@@ -36,11 +36,13 @@ def test_what_nobody_reads_is_dropped() -> None:
     assert stream.failure is not None and stream.failure.errno == errno.EPIPE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "status"), [(["--version"], 0), ([], 2)])
 def test_a_closed_pipe_leaves_the_status_as_it_is(arguments: list[str], status: int, tmp_path: Path) -> None:
     assert with_closed_pipe(tmp_path, *arguments) == (status, b"")
 
 
+@pytest.mark.slow
 def test_output_that_cannot_be_written_is_an_error_of_one_line() -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run([*VNET, "--version"], env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True)

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import Explanation, explain
@@ -37,6 +39,7 @@ def explained(scenario: Scenario, tmp_path: Path, passed: Scenario | None = None
     return explain(scenario, tmp_path / "failing", passed, pool), pool
 
 
+@pytest.mark.slow
 def test_an_order_is_compared_with_fifo_and_the_crash_has_its_line(tmp_path: Path) -> None:
     found, pool = explained(planted("tells_before_it_measures", run={"order": "shuffle"}), tmp_path)
     assert found.passing == "the same run in FIFO order" and pool.runs == 1
@@ -50,6 +53,7 @@ def test_an_order_is_compared_with_fifo_and_the_crash_has_its_line(tmp_path: Pat
     assert crash["in this run"] in found.text()
 
 
+@pytest.mark.slow
 def test_faults_are_compared_with_none(tmp_path: Path) -> None:
     pause = {"kind": "pause", "at_s": 0.25, "duration_s": 0.4, "nodes": {"ids": ["v02"]}}
     found, pool = explained(planted("impatient", fault=[pause]), tmp_path)
@@ -60,6 +64,7 @@ def test_faults_are_compared_with_none(tmp_path: Path) -> None:
     assert "v02 until then, in this run:" in found.text()
 
 
+@pytest.mark.slow
 def test_a_seed_is_compared_with_one_that_passes_and_without_one_says_so(tmp_path: Path) -> None:
     scenarios = [with_seed(planted("northerner"), seed) for seed in range(1, 9)]
     pool = Here(scenarios[0])
@@ -78,6 +83,7 @@ def test_a_seed_is_compared_with_one_that_passes_and_without_one_says_so(tmp_pat
     assert alone.as_json() == {"why_not": "no run of the campaign has passed"}
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_in_any_case_says_what_was_tried(tmp_path: Path) -> None:
     pause = {"kind": "pause", "at_s": 0.25, "duration_s": 0.4}
     found, pool = explained(planted("growing", run={"duration_s": 2.0}, fault=[pause]), tmp_path)
@@ -91,6 +97,7 @@ def test_a_run_without_a_trace_is_not_compared(tmp_path: Path) -> None:
     assert found.why_not == "the run did not come to its end, and has no trace" and pool.runs == 0
 
 
+@pytest.mark.slow
 def test_nothing_is_run_once_the_pool_is_closed(tmp_path: Path) -> None:
     pool = Here(scenario := planted("growing", run={"duration_s": 2.0}))
     assert pool.run(scenario, tmp_path / "failing").failed

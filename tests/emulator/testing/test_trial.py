@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from emulator.checks.own import PREFIX
 from emulator.records.run_folder import SCENARIO_FILE, RunFolder
 from emulator.records.tables import TRACE
@@ -39,6 +41,7 @@ def test_the_next_run_finds_nothing_of_the_last(tmp_path: Path) -> None:
     assert folder.events == [] and not folder.is_open
 
 
+@pytest.mark.slow
 def test_a_kept_trial_and_one_that_is_not_give_the_same(tmp_path: Path) -> None:
     scenario = scenario_with("reads_tables")
     kept = run_trial(scenario, RunFolder.create(tmp_path / "kept", scenario))

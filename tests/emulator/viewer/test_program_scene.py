@@ -56,6 +56,7 @@ def entities(path: Path) -> dict[str, Entity]:
     return read_back(path)
 
 
+@pytest.mark.slow
 def test_a_value_is_a_curve_of_mean_band_and_vehicle(entities: dict[str, Entity]) -> None:
     delay = entities["/program/curve/delay_ms"]
     numbers = list(delay.at["Scalars:scalars"].values())

@@ -107,6 +107,7 @@ def views(path: Path) -> tuple[list[str], list[str]]:
     return largest
 
 
+@pytest.mark.slow
 def test_the_blueprint_has_four_tabs_and_shows_whatever_there_is(path: Path, entities: dict[str, Entity]) -> None:
     names, origins = views(path)
     assert {"Overview", "Radio", "Vehicle v03", "Program"} <= set(names)
@@ -230,6 +231,7 @@ def test_who_is_down_is_red_on_the_map(entities: dict[str, Entity]) -> None:
     assert [number for number, colour in enumerate(colours[1.0]) if colour != colours[0.0][0]] == [1]
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_enters_is_not_red_any_more(told: Told, tmp_path: Path) -> None:
     def without_v02(message: dict[str, Any], until_s: float) -> dict[str, Any]:
         if "up" not in message or message["time_ns"] >= until_s * 1e9:
@@ -346,6 +348,7 @@ def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, E
     assert "| v03 (itself) |" in table
 
 
+@pytest.mark.slow
 def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path) -> None:
     def without_v03(message: dict[str, Any]) -> dict[str, Any]:
         if "up" not in message or message["time_ns"] < 1.5e9:
@@ -365,6 +368,7 @@ def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path)
         assert max(last) == pytest.approx(1.5) and len(last[max(last)]) == 0, name
 
 
+@pytest.mark.slow
 def test_missing_periods_are_counted_and_told(told: Told, tmp_path: Path) -> None:
     recorder = write([*told[:5], *told[9:]], tmp_path / "gap.rrd")
     assert recorder.missed == 4
@@ -372,6 +376,7 @@ def test_missing_periods_are_counted_and_told(told: Told, tmp_path: Path) -> Non
     assert logged == ["4 periods before this one are missing: the recording could not keep up"]
 
 
+@pytest.mark.slow
 def test_what_comes_before_the_scene_and_what_is_unknown_is_left_out(told: Told, tmp_path: Path) -> None:
     write([*told[1:3], ("weather", {}), told[0], told[0], *told[3:]], tmp_path / "late.rrd")
     times = read_back(tmp_path / "late.rrd")["/map/true"].at["Points2D:positions"]

@@ -60,6 +60,7 @@ def test_it_finds_the_common_error_as_well_as_cooperation_does(told: list[dict[s
     assert late(steps(told)) < 0.3 * late([period["figures"]["fix_rmse_m"] for period in told[1:]])
 
 
+@pytest.mark.slow
 def test_it_is_the_same_each_time(told: list[dict[str, Any]]) -> None:
     assert steps(told) == steps(told)
 

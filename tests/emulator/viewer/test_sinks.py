@@ -107,6 +107,7 @@ def test_a_port_that_is_taken_is_passed_by_or_said() -> None:
         assert place_to_serve().port > first.port
 
 
+@pytest.mark.slow
 def test_two_processes_do_not_choose_the_same_port() -> None:
     program = "from emulator.viewer.sinks import place_to_serve; print(place_to_serve().port)"
     own = place_to_serve().port
@@ -144,6 +145,7 @@ def draw(recording: rr.RecordingStream, count: int) -> None:
         recording.log("line", rr.Scalars(number))
 
 
+@pytest.mark.slow
 def test_all_sinks_get_everything_and_none_listens_beyond_the_loopback_interface(tmp_path: Path) -> None:
     place = place_to_serve()
     with open_recording(Sinks(tmp_path / "saved.rrd", place), "both") as recording:

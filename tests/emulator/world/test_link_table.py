@@ -78,6 +78,7 @@ rows = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(rows, st.lists(st.integers(0, 7), min_size=1, max_size=8), st.permutations(range(4)))
 def test_a_row_holds_until_the_next_of_its_pair_in_whatever_order_times_are_asked(
     drawn: list[tuple[int, list[int], float | None]], asked_s: list[int], gone: list[int]
@@ -214,6 +215,7 @@ def test_a_row_for_each_frame_replays_exactly_what_was_received(measured: Record
     assert np.array_equal(again.loss, links.loss, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_row_for_each_second_replays_the_same_share(measured: RecordedRun, tmp_path: Path) -> None:
     links = measured_links(measured, S)
     assert len(links.time_ns) < 60
@@ -230,6 +232,7 @@ def test_a_row_for_each_second_replays_the_same_share(measured: RecordedRun, tmp
     assert sum(after.values()) == pytest.approx(sum(before.values()), abs=4 * deviation)
 
 
+@pytest.mark.slow
 def test_what_is_lost_on_a_link_that_loses_nothing_is_found(measured: RecordedRun, tmp_path: Path) -> None:
     write(tmp_path / "links.csv", table((0, 0, 1, 0.0), (0, 1, 0, 1.0)), measured.node_ids)
     scenario = measured_scenario(tmp_path, links=str(tmp_path / "links.csv"))

@@ -1,6 +1,7 @@
 """The grid finds the pairs in range that comparing all pairs finds, with the same distances."""
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -25,6 +26,7 @@ def by_brute_force(position_m: Array, range_m: float) -> tuple[list[int], list[i
     return sender.tolist(), receiver.tolist(), distance_m[near].tolist()
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     st.one_of(places(lattice), places(anywhere), places(far_apart)),
@@ -44,6 +46,7 @@ def test_the_grid_finds_what_brute_force_finds(vehicles: list[tuple[float, float
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(places(lattice), st.floats(0, 360), st.sampled_from([1.0, 2.0, 5.0]))
 def test_the_distance_of_a_neighbour_may_be_the_range_itself(
@@ -69,6 +72,7 @@ def test_what_is_compared_follows_the_pairs_in_range() -> None:
     assert candidates[1] < 10 * candidates[0]
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(places(lattice), st.sampled_from([1.0, 2.0, 5.0]))
 def test_pairs_are_found_by_number_and_in_the_matrix(vehicles: list[tuple[float, float]], range_m: float) -> None:

@@ -76,6 +76,7 @@ def readings(emulation: Emulation) -> list[tuple[str, int, str, list[float]]]:
     return sorted((node, ns, each["sensor"], list(map(float, each["value"].split()))) for node, ns, each in said)
 
 
+@pytest.mark.slow
 def test_programs_read_what_the_function_says_wherever_they_run() -> None:
     plan = scenario("counts", "places")
     emulation = run_together(plan)
@@ -99,6 +100,7 @@ def test_a_function_cannot_change_the_truth() -> None:
     assert np.abs(emulation.world.position_m(0)).min() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "options", "said"),
     [
@@ -124,6 +126,7 @@ def test_a_sensor_that_fails_is_named_once(function: str, options: dict[str, Any
     assert len([1 for _, _, name, _ in readings(emulation) if name == "other"]) == 30, "others go on"
 
 
+@pytest.mark.slow
 def test_the_failure_of_a_sensor_comes_in_the_order_of_time_wherever_programs_run() -> None:
     pause = {"kind": "pause", "at_s": 0.2, "duration_s": 0.5, "nodes": ["v03"]}
     plan = scenario("stumbles", "counts", faults=[pause])
@@ -136,6 +139,7 @@ def test_the_failure_of_a_sensor_comes_in_the_order_of_time_wherever_programs_ru
     assert (500_000_000, "rule_failed", None) in apart
 
 
+@pytest.mark.slow
 def test_readings_of_many_vehicles_and_periods_take_little_memory_and_time() -> None:
     sensors = OwnSensors(1, {"radar": OwnSensor(model=f"{HERE}:ones")}, Program(entry="agents.beacon:main"))
     ids = tuple(f"v{number:04d}" for number in range(1000))

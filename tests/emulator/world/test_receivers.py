@@ -32,6 +32,7 @@ def errors_m(world: World) -> Array:
     return np.array([each.fix_m - each.position_m - each.common_error_m for each in instants])
 
 
+@pytest.mark.slow
 def test_multipath_is_each_vehicles_own_and_stays_for_its_time() -> None:
     quiet = {"sigma_m": 0.0, "multipath_sigma_m": 1.5, "multipath_tau_s": 2.0}
     error_m = errors_m(world_of(quiet, 1000.0)).reshape(-1, 20)
@@ -41,6 +42,7 @@ def test_multipath_is_each_vehicles_own_and_stays_for_its_time() -> None:
     assert np.abs(np.corrcoef(error_m.T) - np.eye(20)).max() < 0.2, "vehicles and axes are independent"
 
 
+@pytest.mark.slow
 def test_multipath_leaves_the_noise_as_it_is() -> None:
     plain, with_multipath = errors_m(world_of({})), errors_m(world_of({"multipath_sigma_m": 1.0}))
     added = with_multipath - plain

@@ -17,6 +17,7 @@ def world_of(network: dict[str, Any], units: list[dict[str, Any]]) -> World:
     return build_world(Scenario.model_validate({"run": run, "network": network, "roadside": units}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "network", [{"vehicles": 4}, {"kind": "city", "vehicles": 3}, {"kind": "driven", "vehicles": 3}]
 )

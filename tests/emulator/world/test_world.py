@@ -47,6 +47,7 @@ def common_error_m(sigma_m: float, tau_s: float, duration_s: float, seed: int = 
     return np.array([world.at(k).common_error_m for k in range(world.periods)])
 
 
+@pytest.mark.slow
 def test_the_common_error_has_its_deviation_and_forgets_at_its_rate() -> None:
     error_m = common_error_m(sigma_m=2.0, tau_s=5.0, duration_s=4000)
     assert error_m.std(axis=0) == pytest.approx([2.0, 2.0], rel=0.1)
@@ -56,6 +57,7 @@ def test_the_common_error_has_its_deviation_and_forgets_at_its_rate() -> None:
     assert abs(np.mean(east * north)) < 0.1 * 4, "east and north are independent"
 
 
+@pytest.mark.slow
 def test_the_common_error_is_stationary_from_the_first_period_on() -> None:
     """Over many seeds the first period is spread like the last, even where the run is short against tau."""
     ends = np.array([common_error_m(3.0, 600.0, 1.0, seed)[[0, -1]] for seed in range(150)])
@@ -75,6 +77,7 @@ def test_all_vehicles_share_the_common_error() -> None:
 # The receivers' noise.
 
 
+@pytest.mark.slow
 def test_receiver_noise_is_white_and_each_vehicles_own() -> None:
     world = build_world(scenario(run={"duration_s": 500}, world={"gnss": {"sigma_m": 0.5}}))
     instants = [world.at(k) for k in range(world.periods)]
@@ -122,6 +125,7 @@ def test_a_fix_is_what_the_instant_says_to_the_last_bit(heading: bool) -> None:
 # The lateral offset.
 
 
+@pytest.mark.slow
 def test_vehicles_stay_inside_their_lanes() -> None:
     offsets_m = lateral_m(build_world(scenario(run={"duration_s": 300})))
     assert np.abs(offsets_m).max() <= HALF_WIDTH_M + 1e-6
@@ -129,6 +133,7 @@ def test_vehicles_stay_inside_their_lanes() -> None:
     assert np.abs(np.diff(offsets_m, axis=0)).max() < 0.25, "no jumps"
 
 
+@pytest.mark.slow
 def test_vehicles_are_reflected_and_do_not_stick() -> None:
     """The offset is uniform over a narrow lane, up to its edge, if the process is wide."""
     narrow = {"lateral": {"half_width_m": 0.5, "sigma_m": 5.0, "tau_s": 10.0}}
@@ -139,6 +144,7 @@ def test_vehicles_are_reflected_and_do_not_stick() -> None:
     assert np.mean(np.abs(offsets_m) > 0.5 - 1e-6) < 1e-3, "a clipped process would sit at the edge"
 
 
+@pytest.mark.slow
 def test_in_a_wide_lane_the_offset_is_stationary_and_forgets_at_its_rate() -> None:
     wide = {"lateral": {"half_width_m": 50.0, "sigma_m": 0.4, "tau_s": 4.0}}
     offsets_m = lateral_m(build_world(scenario(run={"duration_s": 1000}, world=wide)))
@@ -214,6 +220,7 @@ def test_periods_cover_the_run_and_its_end(duration_s: float, rate_hz: float, pe
 # The map.
 
 
+@pytest.mark.slow
 def test_the_map_holds_every_lane_and_no_label() -> None:
     world = build_world(scenario(network={"vehicles": 38}))
     assert len(world.lane_map) == 38
@@ -243,6 +250,7 @@ def test_components_of_a_chain_and_its_gap() -> None:
     assert set(components(position_m, 500.0)) == {0}
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     cells=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=25),

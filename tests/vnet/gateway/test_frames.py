@@ -41,6 +41,7 @@ MESSAGES: st.SearchStrategy[Message] = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(MESSAGES, max_size=8), st.integers(60, 500), st.data())
 def test_a_message_arrives_as_it_was_if_all_its_frames_do_and_else_not_at_all(
     messages: list[Message], max_payload: int, data: st.DataObject

@@ -22,6 +22,7 @@ TALK = """
     """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["fifo", "shuffle"])
 def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive, order: str) -> None:
     first, again = (drive(TALK, vehicles=3, loss=0.3, run={"order": order}) for _ in range(2))

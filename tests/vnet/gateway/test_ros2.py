@@ -71,6 +71,7 @@ def graph_tokens(draw: st.DrawFn) -> GraphToken:
     return GraphToken(*where, kind, "/", draw(st.just("/") | paths), draw(names), endpoint)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @given(topic_keys)
 def test_a_topics_key_reads_as_composed_and_others_compose_the_same(topic: TopicKey) -> None:
     assert parse_topic(topic.key) == topic
@@ -81,6 +82,7 @@ def test_a_topics_key_reads_as_composed_and_others_compose_the_same(topic: Topic
         assert pamoja.entity_key(topic.domain, topic.topic, topic.type, topic.type_hash) == topic.key
 
 
+@pytest.mark.slow
 @given(graph_tokens())
 def test_a_token_reads_as_composed_and_others_compose_the_same(token: GraphToken) -> None:
     assert parse_token(token.key) == token
@@ -96,6 +98,7 @@ def test_a_token_reads_as_composed_and_others_compose_the_same(token: GraphToken
         assert sdk_keys.node_liveliness_keyexpr(node) == token.key
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_an_attachment_reads_as_composed_and_others_compose_the_same(seq: int, time_ns: int, gid: bytes) -> None:
     content = Attachment(seq, time_ns, gid).to_bytes()
@@ -104,6 +107,7 @@ def test_an_attachment_reads_as_composed_and_others_compose_the_same(seq: int, t
     assert sdk_attachment.Attachment(seq, time_ns, gid).to_bytes() == content
 
 
+@pytest.mark.slow
 @given(st.text() | st.text("@ros2_lv/0aMPSNC%:").map("@ros2_lv/".__add__), st.binary(max_size=40))
 def test_no_text_and_no_bytes_fail_to_be_read(text: str, content: bytes) -> None:
     token = parse_token(text)

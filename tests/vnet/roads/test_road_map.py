@@ -56,6 +56,7 @@ def by_hand(roads: RoadMap, position_m: Any, heading_rad: float, reach_m: float)
     return found
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**32),
     count=st.integers(0, 40),
@@ -98,6 +99,7 @@ def test_only_lanes_of_the_heading_fit_also_across_north_and_east() -> None:
     assert segment[row == 1].tolist() == [0, 1, 2, 3]  # who does not know its heading fits all
 
 
+@pytest.mark.slow
 def test_a_map_whose_lanes_are_endless_does_not_fill_the_memory() -> None:
     roads = road_map([[0.0, 0.0], [0.0, 5.0]], [0.0, 0.0], [1e8, 10.0])
     _, segment, _ = roads.near(np.array([[1e6, 1.0]]), np.zeros(1), np.full(1, 3.0))
@@ -114,6 +116,7 @@ def test_who_is_nowhere_has_no_lane_near() -> None:
 # Parts.
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32), side_m=st.floats(0.1, 300), east_m=st.floats(-300, 300))
 @settings(deadline=None)
 def test_a_part_holds_what_touches_the_box(seed: int, side_m: float, east_m: float) -> None:
@@ -145,6 +148,7 @@ def assert_same(one: RoadMap, other: RoadMap) -> None:
         assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32), count=st.integers(0, 20))
 def test_a_map_comes_through_a_message_bit_by_bit(seed: int, count: int) -> None:
     roads = scattered(seed, count)
@@ -197,6 +201,7 @@ def test_what_is_no_map_is_refused(name: str) -> None:
         RoadMap.from_wire(WRONG[name])
 
 
+@pytest.mark.slow
 @given(
     st.recursive(
         st.none() | st.integers() | st.floats() | st.text(max_size=5) | st.binary(max_size=40),

@@ -119,6 +119,7 @@ async def computes(node: Node) -> None:
     await asyncio.sleep(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("does", [sends, reports, logs, notes, listens, works])
 def test_what_a_program_tells_is_asked_for_at_once(
     run: Callable[[Program, Swap], wire.Traffic], does: Program

@@ -118,6 +118,7 @@ async def _call_at(node: Node, seconds: float) -> None:
 WAYS = [_sleep, _wait_for, _timeout, _timeout_at, _call_later, _call_at]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
 @pytest.mark.parametrize(
     ("fault", "from_s", "takes_s"),
@@ -155,6 +156,7 @@ def test_two_seconds_are_two_on_the_clock_by_which_they_were_set(
     assert took_ns == [pytest.approx(takes_s * S, abs=2)]
 
 
+@pytest.mark.slow
 def test_the_node_and_its_loop_show_the_same_wrong_time_and_the_right_one_again_after_it() -> None:
     clocks: list[tuple[PlannedFault, Callable[[float], float]]] = [
         (SKEW, lambda t: t - 1.5),
@@ -176,6 +178,7 @@ def test_the_node_and_its_loop_show_the_same_wrong_time_and_the_right_one_again_
             assert said_s == pytest.approx([expected] * 3, abs=2e-9)
 
 
+@pytest.mark.slow
 def test_a_packet_bears_the_time_that_the_clock_showed_when_it_came_and_not_when_it_was_read() -> None:
     """So it does not matter when a process that does not wait for it is woken: live and simulated are the same."""
     heard: dict[str, list[float]] = {}
@@ -237,6 +240,7 @@ drifts = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(drifts)
 def test_any_drifts_together_go_on_without_a_jump_while_they_act_and_never_stand_still(

@@ -30,6 +30,7 @@ def test_importing_vnet_changes_nothing_in_the_caller_s_environment(packages: st
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_what_sets_the_environment_imports_no_numpy() -> None:
     modules = "vnet.runtime.environment, vnet.runtime.die_with_parent, agents.cli, emulator.cli"
     done = python("-c", f"import {modules}; {LOOK}")
@@ -57,6 +58,7 @@ ENTRY_POINTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", ENTRY_POINTS.values(), ids=ENTRY_POINTS.keys())
 @pytest.mark.parametrize("own", [{}, {"OMP_NUM_THREADS": "2"}], ids=["default", "own"])
 def test_an_entry_point_sets_the_arithmetic_before_numpy_is_imported_unless_told_otherwise(
@@ -68,6 +70,7 @@ def test_an_entry_point_sets_the_arithmetic_before_numpy_is_imported_unless_told
     assert {name: seen.get(name) for name in SAME_ARITHMETIC} == {**SAME_ARITHMETIC, **own}
 
 
+@pytest.mark.slow
 def test_a_command_starts_itself_again_with_a_fixed_hash_seed() -> None:
     done = python("-m", "agents.cli", "--help")
     assert done.returncode == 0 and "vehicle" in done.stdout.lower()
@@ -130,6 +133,7 @@ def test_a_numpy_that_does_not_know_the_variables_computes_as_its_processor_does
     assert environment.arithmetic() == expected
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("OPENBLAS_CORETYPE" not in SAME_ARITHMETIC, reason="this processor has no AVX2")
 def test_openblas_and_numpy_take_what_they_are_told_and_a_run_says_so() -> None:
     program = (

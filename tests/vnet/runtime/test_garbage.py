@@ -48,6 +48,7 @@ def test_the_collector_waits_within_the_block_alone(thresholds: tuple[int, int, 
     assert gc.get_freeze_count() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("objects_before", "threshold", "collects"), [(1, 700, True), (1, 0, False), (10**9, 700, False)]
 )
@@ -108,6 +109,7 @@ def collects_each_period(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host, "COLLECTION_NS", PERIOD_NS)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("collects_each_period")
 def test_nothing_is_collected_where_nothing_has_run() -> None:
     collections: dict[int, list[int]] = {1: [], 2: []}

@@ -265,6 +265,7 @@ def test_asyncio_s_primitives_hold_in_every_order(program: Callable[[Node], Awai
     assert len(different) > 100, "orders were explored"
 
 
+@pytest.mark.slow
 def test_what_one_callback_registers_keeps_its_order() -> None:
     """Also if it is due at a later instant, and whatever else is due then."""
 
@@ -283,6 +284,7 @@ def test_what_one_callback_registers_keeps_its_order() -> None:
         run(program, Order("shuffle", seed))
 
 
+@pytest.mark.slow
 def test_timers_of_different_callbacks_and_mail_come_in_any_order() -> None:
     seen = set()
 

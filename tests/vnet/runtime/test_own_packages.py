@@ -88,6 +88,7 @@ def test_a_file_that_is_found_in_place_of_vnet_s_own_package(tmp_path: Path) -> 
     assert foreign_on_path("json", [str(tmp_path)]) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("package", "arguments"),
     [

@@ -98,6 +98,7 @@ def test_tasks_queues_and_locks_work_as_ever(loop: VirtualTimeLoop) -> None:
     assert run(loop, program) == [(i, (i + 1) * 1_000_000_000) for i in range(5)]
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(min_value=0, max_value=10**12), min_size=1, max_size=20))
 def test_timers_fire_in_order_at_their_nanosecond(delays_ns: list[int]) -> None:

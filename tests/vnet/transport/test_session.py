@@ -99,6 +99,7 @@ def test_many_that_log_in_at_once_do_not_keep_an_agent_out() -> None:
             assert list(client.info.routers_zid()) == [router.zid()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wanted", [None, "off", "debug", "trace,zenoh::api::session=trace"])
 def test_zenohs_log_never_tells_a_configuration(wanted: str | None) -> None:
     """Run in a process of its own, because a log is opened only once."""
@@ -163,6 +164,7 @@ def segments() -> set[Path]:
     return {path for path in found if path.is_relative_to("/dev/shm")}
 
 
+@pytest.mark.slow
 def test_a_local_router_keeps_no_shared_memory_of_its_programs() -> None:
     """Those of closed connections added up: a process that makes many runs came to a thousand descriptors."""
     before = segments()

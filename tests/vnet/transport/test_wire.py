@@ -137,6 +137,7 @@ def test_what_agents_say_comes_back(message: wire.AgentMessage) -> None:
     assert wire.decode_tx(wire.encode(message)) == message
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(emulator_messages)
 def test_what_the_emulator_says_comes_back(message: wire.EmulatorMessage) -> None:
@@ -213,6 +214,7 @@ def test_lateness_bins_have_an_edge_at_the_limit() -> None:
     assert wire.lateness_bin(2**62) == wire.LATENESS_BINS - 1
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(emulator_messages)
 def test_batches_are_told_from_their_first_bytes(message: wire.EmulatorMessage) -> None:

@@ -65,6 +65,7 @@ def test_of_a_winding_lane_only_the_nearest_piece_is_a_candidate() -> None:
     assert lane.tolist() == [0]
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     st.lists(st.floats(-60, 60), min_size=1, max_size=6),
@@ -126,6 +127,7 @@ def straight(x: float, y: float, heading: float, speed_m_s: float, seconds: floa
 COMMON_M = np.array([2.0, -3.0])
 
 
+@pytest.mark.slow
 def test_two_who_drive_across_each_other_find_the_common_error() -> None:
     courses = [straight(-200, 0.3, EAST, 12.0, 20), straight(-0.3, -200, NORTH, 12.0, 20)]
     rbpf = drive(CROSSING, courses, COMMON_M)
@@ -133,6 +135,7 @@ def test_two_who_drive_across_each_other_find_the_common_error() -> None:
     assert np.sqrt(np.diag(rbpf.estimate_covariance_m2)) == pytest.approx([0.6, 0.6], abs=0.35)
 
 
+@pytest.mark.slow
 def test_a_turn_is_evidence_across_the_new_road_and_the_old_is_kept() -> None:
     """One vehicle that has driven both roads knows both parts of the error."""
     first, then = straight(-200, 0.0, EAST, 12.0, 16), straight(0.0, 0.0, NORTH, 12.0, 16)
@@ -144,6 +147,7 @@ def test_a_turn_is_evidence_across_the_new_road_and_the_old_is_kept() -> None:
     assert np.sqrt(np.diag(one.estimate_covariance_m2))[0] > 2.0, "along its road nothing is known"
 
 
+@pytest.mark.slow
 def test_who_stands_says_the_same_again_and_no_more() -> None:
     """Its offset is what it was: a minute of standing must not make the filter any surer than a second does."""
     config = RbpfConfig(2000, 3.0, common_tau_s=1e9)
@@ -159,6 +163,7 @@ def test_parallel_lanes_stay_hypotheses_until_somebody_else_decides() -> None:
     assert across[1] > 1.5, "it may be on several lanes"
 
 
+@pytest.mark.slow
 def test_one_on_a_parking_lot_does_not_outvote_those_on_roads() -> None:
     on_roads = [straight(-200, 0.0, EAST, 12.0, 20), straight(0.0, -200, NORTH, 12.0, 20)]
     on_roads += [straight(-150, 0.3, EAST, 11.0, 20), straight(0.4, -150, NORTH, 10.0, 20)]
@@ -187,6 +192,7 @@ def test_vehicles_that_brake_and_turn_stay_inside_the_gate() -> None:
         assert np.hypot(*error) < 1.5
 
 
+@pytest.mark.slow
 def test_who_stands_between_two_directions_says_the_same_again_and_no_more() -> None:
     """Without a heading either lane may be the nearer one: which of them is has nothing to do with a turn."""
     street = road_map([(-500, -1.75, EAST, 1000), (500, 1.75, np.pi, 1000)])

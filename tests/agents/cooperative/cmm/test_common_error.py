@@ -12,6 +12,7 @@ def particles(count: int = 4) -> CommonErrorParticles:
     return CommonErrorParticles(np.arange(2.0 * count).reshape(2, count))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-900, 900), min_size=4, max_size=4), st.floats(-500, 500))
 def test_weights_are_normalized_and_do_not_depend_on_the_constant(log_weight: list[float], constant: float) -> None:

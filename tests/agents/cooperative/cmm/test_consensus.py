@@ -84,6 +84,7 @@ def lossy(linked: np.ndarray, loss: float, seed: int) -> Hears:
     return lambda _, j, i: bool(linked[j, i] and rng.random() >= loss)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_all_find_the_mean_and_no_mass_is_lost(loss: float) -> None:
     inputs = np.random.default_rng(1).normal(size=(30, 2))
@@ -116,6 +117,7 @@ def test_under_a_peer_cap_only_those_who_hear_take_a_share() -> None:
     assert net.errors().max() < 1e-3
 
 
+@pytest.mark.slow
 def test_after_a_death_the_survivors_agree_on_their_own_mean() -> None:
     inputs = np.random.default_rng(1).normal(size=(20, 2)) * 10
     net = Net(inputs, lossy(graph(20, 4, 0.45), 0.1, 3))
@@ -134,6 +136,7 @@ def test_after_a_death_the_survivors_agree_on_their_own_mean() -> None:
     assert net.total() == pytest.approx([*np.sum(survivors, axis=0), 17], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_restarted_node_brings_its_mass_only_once() -> None:
     inputs = np.random.default_rng(2).normal(size=(15, 2))
     net = Net(inputs, lossy(graph(15, 6, 0.5), 0.1, 3))
@@ -144,6 +147,7 @@ def test_a_restarted_node_brings_its_mass_only_once() -> None:
     assert net.errors().max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_link_that_turns_one_way_carries_no_share_any_more() -> None:
     linked = graph(15, 6, 0.5)
     one_way = linked.copy()
@@ -157,6 +161,7 @@ def test_a_link_that_turns_one_way_carries_no_share_any_more() -> None:
     assert net.errors().max() < 1e-3
 
 
+@pytest.mark.slow
 def test_it_tracks_inputs_that_move() -> None:
     inputs = np.random.default_rng(2).normal(size=(15, 2))
     net = Net(inputs, lossy(graph(15, 6, 0.5), 0.1, 3))
@@ -223,6 +228,7 @@ def averaging(rule: str, loss: float) -> tuple[np.ndarray, list[np.ndarray]]:
     return inputs, states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["metropolis", "max-degree"])
 def test_averaging_without_loss_keeps_the_mean_and_finds_it(rule: str) -> None:
     inputs, states = averaging(rule, 0.0)
@@ -245,6 +251,7 @@ def test_metropolis_averaging_is_the_linear_iteration() -> None:
     assert states[51] == pytest.approx(matrix @ states[50], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_loss_moves_the_mean_of_averaging_which_is_why_running_sums_are_the_default() -> None:
     inputs, states = averaging("metropolis", 0.3)
     assert states[-1].std(axis=0).max() < 1e-3, "they agree"

@@ -87,6 +87,7 @@ def test_given_c_a_new_vehicle_is_where_its_fix_says_less_c(common_sigma_m: floa
     assert pytest.approx(np.array([[1.0, 1.0]] * 5)) == conditioned.past_m[0].T
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(0, 20), min_size=1, max_size=4), st.integers(0, 2**32))
 def test_fusion_keeps_the_number_of_particles_and_counts_what_it_imports(sizes: list[int], seed: int) -> None:

@@ -41,6 +41,7 @@ def covariances(draw: st.DrawFn) -> Array:
     return np.asarray(turn @ np.diag(np.square(sigma)) @ turn.T)
 
 
+@pytest.mark.slow
 @given(covariances())
 def test_inverse_and_square_root_are_those_of_the_matrix(matrix: Array) -> None:
     assert_allclose(inverse(matrix) @ matrix, np.eye(2), atol=1e-6)
@@ -54,6 +55,7 @@ def said(draw: st.DrawFn) -> Five:
     return a, b, d, draw(st.floats(-9, 9)), draw(st.floats(-9, 9))
 
 
+@pytest.mark.slow
 @given(said())
 def test_plain_moments_are_those_of_arrays(information: Five) -> None:
     mean_m, covariance_m2 = Information(information).moments()
@@ -63,6 +65,7 @@ def test_plain_moments_are_those_of_arrays(information: Five) -> None:
     assert_allclose((x - 0.5, y + 2.0), mean_m, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 @given(said(), covariances(), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
 def test_a_deviation_is_that_of_matrices(
     information: Five, covariance_m2: Array, mean: tuple[float, float]
@@ -75,6 +78,7 @@ def test_a_deviation_is_that_of_matrices(
     assert value == pytest.approx(off @ np.linalg.solve(total, off), rel=1e-5, abs=1e-9)
 
 
+@pytest.mark.slow
 @given(covariances(), covariances())
 def test_a_cloud_that_is_transported_has_the_new_covariance(old: Array, new: Array) -> None:
     moves = transport(old, new)
@@ -83,6 +87,7 @@ def test_a_cloud_that_is_transported_has_the_new_covariance(old: Array, new: Arr
     assert np.linalg.eigvalsh(moves)[0] > 0
 
 
+@pytest.mark.slow
 @given(covariances(), covariances(), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
 def test_what_is_gained_is_what_was_added(prior: Array, noise: Array, fix: tuple[float, float]) -> None:
     before = Information.of(np.array([1.0, -2.0]), prior)

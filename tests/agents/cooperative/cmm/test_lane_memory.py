@@ -98,6 +98,7 @@ def _take(memory: CommonMemory, increments: list[Five], is_before: bool = False)
         memory.take(kind, information, is_before)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(vehicles())
 def test_increments_of_all_receivers_add_up_exactly(drawn: tuple[Array, list[int], int]) -> None:

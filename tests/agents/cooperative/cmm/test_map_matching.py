@@ -20,6 +20,7 @@ def reference(offset_m: float, sigma_m: float) -> float:
     return float(log_upper + np.log1p(-np.exp(log_lower - log_upper)))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.floats(-500, 500), st.floats(0.01, 10))
 def test_it_is_the_closed_form_near_and_far(offset_m: float, sigma_m: float) -> None:

@@ -64,6 +64,7 @@ def vehicle_on(lanes: RoadMap, config: RbpfConfig = STEADY) -> OwnVehicleOnMap:
     return OwnVehicleOnMap(config, lanes, np.random.default_rng(3))
 
 
+@pytest.mark.slow
 def test_a_lane_counts_once_for_a_vehicle_that_stands() -> None:
     """However long it stands, it knows of c across the lane what one lane with its deviation says."""
     sigma_m2 = 1.0**2 + 0.85**2 / 3
@@ -78,6 +79,7 @@ def test_a_lane_counts_once_for_a_vehicle_that_stands() -> None:
     assert vehicle.estimate_covariance_m2[0, 0] == pytest.approx(9, rel=0.1), "along the lane nothing is known"
 
 
+@pytest.mark.slow
 def test_a_way_renews_the_offset() -> None:
     """A long way along one lane says more of c than a short one."""
     variance_m2 = []
@@ -88,6 +90,7 @@ def test_a_way_renews_the_offset() -> None:
     assert variance_m2[1] < 0.7 * variance_m2[0]
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_has_turned_knows_both_components_of_c() -> None:
     vehicle = vehicle_on(roads((0, 0, EAST), (300, 0, NORTH), sigma_m=0.3))
     run(vehicle, fixes(driving(15, (120, 0), EAST), EAST))
@@ -97,6 +100,7 @@ def test_a_vehicle_that_has_turned_knows_both_components_of_c() -> None:
     assert np.linalg.norm(vehicle.estimate_m - COMMON_M) < 1.5
 
 
+@pytest.mark.slow
 def test_increments_add_up_to_what_is_known() -> None:
     """Also where lanes compete and less is known than before: that is owed, and taken from what is said later."""
     vehicle = vehicle_on(roads((0, 0, EAST), (0, 7, EAST), (300, 0, NORTH), (310, 0, NORTH)))

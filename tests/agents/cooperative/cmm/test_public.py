@@ -19,6 +19,7 @@ def test_the_public_names_are_there_and_say_what_they_are() -> None:
         cmm.Filter  # noqa: B018
 
 
+@pytest.mark.slow
 def test_the_estimators_need_neither_emulator_nor_transport() -> None:
     code = (
         "import sys; from agents.cooperative.cmm import *\n"

@@ -26,12 +26,14 @@ def test_it_is_the_quantile_of_the_divergence(sigma_m: float) -> None:
     assert sample_size(sigma_m**2 * np.eye(2), 1, 10**9) == pytest.approx(wanted, rel=0.01)
 
 
+@pytest.mark.slow
 @given(st.floats(0, 1e4), st.floats(0, 1e4), st.floats(-1, 1), st.integers(1, 500), st.integers(500, 5000))
 def test_it_is_between_the_bounds(a: float, d: float, correlation: float, least: int, most: int) -> None:
     b = correlation * math.sqrt(a * d)
     assert least <= sample_size(np.array([[a, b], [b, d]]), least, most) <= most
 
 
+@pytest.mark.slow
 def test_particles_become_fewer_and_say_the_same() -> None:
     """As long as what is known of c is narrow, as in a network; lanes 0.5 m apart compete for long."""
     lanes = np.array([[0.0, 0.5], [0.0, 0.0]]), np.zeros(2)

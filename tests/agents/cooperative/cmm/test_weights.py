@@ -30,6 +30,7 @@ def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 SOLVERS = [OptimizedWeights, ActiveSetWeights]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("seed", range(30))
 def test_optimized_weights_are_the_minimum(seed: int, solver: type[OptimizedWeights]) -> None:
@@ -52,6 +53,7 @@ def test_optimized_weights_are_the_minimum(seed: int, solver: type[OptimizedWeig
     assert np.all((weights >= 0) & (weights <= 1))
 
 
+@pytest.mark.slow
 def test_the_same_history_gives_the_same_bits() -> None:
     first, second = OptimizedWeights(), OptimizedWeights()
     for seed in range(40):
@@ -74,6 +76,7 @@ def test_a_covariance_that_is_none_is_refused(bad: np.ndarray) -> None:
         OptimizedWeights().solve(np.zeros((2, 2)), np.array([np.eye(2), bad]), np.zeros(2))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(0.001, 1), min_size=1, max_size=31), st.integers(0, 500))
 def test_largest_remainder_shares_out_everything_in_proportion(raw: list[float], total: int) -> None:

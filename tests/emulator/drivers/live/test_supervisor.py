@@ -313,6 +313,7 @@ operations = st.lists(
 )
 
 
+@pytest.mark.slow
 @example(operations=[("pause", "v01"), ("dies", "v01"), ("restart", "v01")], pacing="realtime", launch=True)
 @settings(deadline=None, max_examples=50)
 @given(operations=operations, pacing=st.sampled_from(["lockstep", "realtime"]), launch=st.booleans())

@@ -30,6 +30,7 @@ def test_motion_within_the_limits_is_the_matrix_exponential(step_s: float) -> No
     assert_allclose(later[:, 0], exact[:3], rtol=1e-13)
 
 
+@pytest.mark.slow
 @given(lag_s=LAGS, step_s=STEPS, speed=SPEEDS, acceleration=ACCELERATIONS, command=ACCELERATIONS)
 def test_speeds_and_accelerations_stay_within_their_limits(
     lag_s: float, step_s: float, speed: float, acceleration: float, command: float
@@ -43,6 +44,7 @@ def test_speeds_and_accelerations_stay_within_their_limits(
         state = later
 
 
+@pytest.mark.slow
 @given(lag_s=LAGS, step_s=STEPS, speed=SPEEDS, acceleration=ACCELERATIONS, command=ACCELERATIONS)
 def test_two_halves_of_an_interval_are_the_whole(
     lag_s: float, step_s: float, speed: float, acceleration: float, command: float

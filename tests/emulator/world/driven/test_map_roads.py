@@ -42,6 +42,7 @@ def restless(vehicles: DrivenVehicles, rng: np.random.Generator) -> None:
         vehicles.take(vehicles.now_ns, number, action)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_map_with_one_straight_road_is_the_straight_road(tmp_path: Path, seed: int) -> None:
     """Positions, gaps and events to 1e-9, with lane changes, pile-ups and vehicles that leave."""
@@ -67,6 +68,7 @@ def test_a_map_with_one_straight_road_is_the_straight_road(tmp_path: Path, seed:
     assert on_map.may_leave
 
 
+@pytest.mark.slow
 def test_vehicles_of_two_roads_collide_where_they_cross(tmp_path: Path) -> None:
     world = world_on(write_map(tmp_path, *CROSS), 2, {"routes": [EAST, NORTH], "start_m": [60, 58], "lag_s": 0.0})
     (collision,) = drive(world, 100)
@@ -79,6 +81,7 @@ def test_vehicles_of_two_roads_collide_where_they_cross(tmp_path: Path) -> None:
     assert_allclose(position_m[0], [-140 + 20 * 6.9 + 10**2 / 16, 0], atol=2.5)
 
 
+@pytest.mark.slow
 def test_vehicles_that_cross_one_after_the_other_do_not_collide(tmp_path: Path) -> None:
     world = world_on(write_map(tmp_path, *CROSS), 2, {"routes": [EAST, NORTH], "start_m": [60, 50]})
     assert drive(world, 100) == []
@@ -99,6 +102,7 @@ def turn_of(tmp_path: Path, route: list[str], **keys: Any) -> DrivenWorld:
     return world_on(write_map(tmp_path, *roads), 3, {"routes": [route, EAST], "speed_mps": 8.0} | keys)
 
 
+@pytest.mark.slow
 def test_a_turn_is_driven_on_an_arc_from_lane_to_lane(tmp_path: Path) -> None:
     world = turn_of(tmp_path, ["edge 0", "edge 2"], start_m=[250, 50, 200], start_lanes=[0, 0, 0])
     course = []
@@ -141,6 +145,7 @@ def test_a_vehicle_ahead_is_seen_across_a_junction(tmp_path: Path) -> None:
     assert np.isfinite(gap_m[1]), "the third is ahead of the second, which does not turn"
 
 
+@pytest.mark.slow
 def test_a_lane_that_ends_is_left_within_the_taper(tmp_path: Path) -> None:
     roads = ([(0.0, 0.0), (200.0, 0.0)], (2, 0)), ([(200.0, 0.0), (500.0, 0.0)], (1, 0))
     world = world_on(
@@ -162,6 +167,7 @@ def test_a_lane_that_ends_is_left_within_the_taper(tmp_path: Path) -> None:
     assert [each.details["reason"] for each in drive(world, 1)] == ["there is no lane"]
 
 
+@pytest.mark.slow
 def test_two_side_by_side_collide_where_one_lane_ends(tmp_path: Path) -> None:
     roads = ([(0.0, 0.0), (200.0, 0.0)], (2, 0)), ([(200.0, 0.0), (500.0, 0.0)], (1, 0))
     keys = {"routes": [["edge 0", "edge 1"]], "start_m": [150, 149], "start_lanes": [0, 1]}
@@ -181,6 +187,7 @@ def test_people_may_drive_on_the_left(tmp_path: Path) -> None:
     assert_allclose(distance_m, 0, atol=1e-9, err_msg="vehicles are on the lanes that programs know")
 
 
+@pytest.mark.slow
 def test_a_closed_road_goes_on(tmp_path: Path) -> None:
     angle = np.linspace(0, 2 * np.pi, 41)[:-1]
     corners: list[Point] = [(50 * float(np.cos(a)), 50 * float(np.sin(a))) for a in angle]

@@ -125,6 +125,7 @@ def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Pat
     assert lost > 2 * found
 
 
+@pytest.mark.slow
 def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> None:
     """The next process has run a filter too, and continues; one that starts later does not take over."""
     courses: dict[str, list[Stay]] = {

@@ -238,6 +238,7 @@ def test_what_edges_say_of_themselves(tmp_path: Path) -> None:
     assert roads.lane_width_m.tolist() == [3.1, 2.6]
 
 
+@pytest.mark.slow
 @given(edges=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7)), min_size=1, max_size=30))
 @settings(deadline=None)
 def test_no_edge_is_lost_and_none_is_added(tmp_path_factory: Any, edges: list[tuple[int, int]]) -> None:

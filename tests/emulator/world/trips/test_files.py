@@ -263,6 +263,7 @@ def test_a_file_without_end_in_sight_is_bounded(tmp_path: Path, monkeypatch: pyt
     assert world_of(path, duration_s=1.0, start_s=0.0, longest_gap_s=2.0).node_ids == ("a",)
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(
     rows=st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 8), st.integers(0, 1)), min_size=1, max_size=30),

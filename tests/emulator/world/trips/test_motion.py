@@ -151,6 +151,7 @@ def test_what_needs_an_impossible_acceleration_is_cut_and_counted() -> None:
     assert not np.isnan(x_of(motion_of([jumping], selection, RULES))[:299]).any(), "driven if not asked for"
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(st.lists(st.floats(-30, 30), min_size=30, max_size=120))
 def test_nothing_that_is_driven_needs_more_than_allowed(steps_m: list[float]) -> None:
@@ -192,6 +193,7 @@ def test_real_driving_is_not_taken_for_jumps() -> None:
         assert len(rows) > 100
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(0.05, 3.0), st.floats(-300, 300)), min_size=2, max_size=40),
@@ -305,6 +307,7 @@ def test_a_given_speed_says_who_stands() -> None:
     assert np.isnan(stands).all() and drives == pytest.approx(np.zeros(99))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.floats(0, 2 * math.pi), st.floats(1, 40), st.integers(0, 30), st.integers(40, 90))
 def test_a_straight_drive_is_straight_wherever_its_samples_are(
