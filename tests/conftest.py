@@ -3,6 +3,7 @@
 import gc
 import re
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,23 @@ def pytest_collection_finish() -> None:
     """Keep garbage collection from looking through all tests and modules again at the end of each simulation."""
     gc.collect()
     gc.freeze()
+
+
+STARTS = {"subprocess.Popen", "os.exec", "os.fork", "os.forkpty", "os.posix_spawn"}
+_started: list[str] = []
+sys.addaudithook(lambda event, arguments: _started.append(f"{event} {arguments[:2]}") if event in STARTS else None)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Forget the processes of the test before."""
+    _started.clear()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """Keep `make quick` quick on every machine: a process costs what a hundred other tests do."""
+    assert item.get_closest_marker("slow") or not _started, f"bears no @pytest.mark.slow, and starts {_started}"
 
 
 MOST_LEFT_OPEN = 100

@@ -54,11 +54,8 @@ HEAVY = ["rerun", "matplotlib", "pandas", "pyarrow", "pydantic", "tomli_w", "emu
 
 @cache
 def source_files() -> dict[str, Path]:
-    """The project's modules by name: those that git knows, and not what else lies about."""
-    command = ["git", "ls-files", "-z", "-co", "--exclude-standard", *(f"{package}/*.py" for package in PACKAGES)]
-    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
-    paths = sorted(ROOT / name for name in set(listed) if name and (ROOT / name).exists())
-    return {module_name(path): path for path in paths}
+    """The project's modules by name."""
+    return {module_name(path): path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))}
 
 
 def module_name(path: Path) -> str:
@@ -223,12 +220,11 @@ FIGURES = re.compile(
 
 def test_neither_vnet_nor_the_emulator_names_an_example_program_or_its_figures() -> None:
     """A program declares all that belongs to it; only the studies are about one."""
-    listed = subprocess.run(["git", "ls-files", "vnet", "emulator"], cwd=ROOT, capture_output=True, text=True)
-    files = [name for name in listed.stdout.split() if (ROOT / name).is_file() and "/experiments/" not in name]
-    assert len(files) > 200
-    naming = {name for name in files if EXAMPLES.search((ROOT / name).read_text())}
-    assert naming == NAMING_EXAMPLES
-    assert [name for name in files if FIGURES.search((ROOT / name).read_text())] == [MEAN_OF_FIXES]
+    files = [path for package in ("vnet", "emulator") for path in (ROOT / package).rglob("*") if path.is_file()]
+    texts = {str(path.relative_to(ROOT)): path.read_text() for path in files if path.suffix != ".pyc"}
+    assert len(texts) > 200
+    assert {name for name, text in texts.items() if EXAMPLES.search(text)} == NAMING_EXAMPLES
+    assert [name for name, text in texts.items() if FIGURES.search(text)] == [MEAN_OF_FIXES]
 
 
 def test_there_are_no_circles() -> None:

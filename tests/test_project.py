@@ -38,6 +38,7 @@ def test_the_workflow_can_be_run() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_action_runs_a_campaign_with_its_inputs(tmp_path: Path) -> None:
     action = yaml.safe_load((ROOT / ".github" / "actions" / "campaign" / "action.yml").read_text())
     (step,) = [step for step in action["runs"]["steps"] if "vnet campaign" in step.get("run", "")]
@@ -107,6 +108,7 @@ def test_every_package_that_is_installed_accepts_the_first_python_that_vnet_does
     assert {n: v for n, v in needs.items() if not SpecifierSet(v).contains(f"{first.group(1)}.0")} == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("installed", "said"),
     [

@@ -268,6 +268,7 @@ class Lockstep:
         more_ns = emulation.next_change_ns(), emulation.next_control_ns(), self.horizon_ns
         ends_ns += [end_ns for end_ns in more_ns if end_ns is not None]
         self.now_ns, self._end_ns = time_ns, min(ends_ns)
+        assert time_ns < self._end_ns, "an empty window would be opened for ever"
         self._quiet_ns = min([(time_ns // period_ns + 2) * period_ns, *ends_ns[2:]])
         self._show(self._end_ns - 1)
         emulation.close_periods(time_ns)

@@ -10,6 +10,7 @@ import pytest
 from benchmarks import scale
 
 
+@pytest.mark.slow
 def test_a_row_that_is_measured_replaces_its_line_and_no_other(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -33,6 +34,7 @@ def test_the_page_has_a_line_for_each_row() -> None:
     assert [name for name in scale.ROWS if page.count(f"(`{name}`) |") != 1] == []
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_children() -> None:
     child = subprocess.Popen([sys.executable, "-c", "print('ready', flush=True); input()"], stdin=-1, stdout=-1)
     assert child.stdin is not None and child.stdout is not None

@@ -60,6 +60,7 @@ def test_the_public_names_are_these_and_no_more() -> None:
         emulator.simulat  # noqa: B018
 
 
+@pytest.mark.slow
 def test_importing_the_package_imports_nothing_heavy() -> None:
     code = "import sys, emulator; print([m for m in ('numpy', 'pydantic', 'zenoh') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -31,6 +31,7 @@ class Command(subprocess.Popen[str]):
 
     def _execute_child(self, args: Sequence[str], *more: Any) -> None:
         assert list(args[: len(VNET)]) == VNET and more[1] is None, "no other command, and no `preexec_fn`"
+        sys.audit("subprocess.Popen", args[0], args, more[4], more[5])
         cwd, environment, pipes = more[4], more[5], more[9:15]
         standard = [here if pipe < 0 else pipe for here, pipe in enumerate((pipes[0], pipes[3], pipes[5]))]
         request = {"words": list(args[len(VNET) :]), "cwd": str(cwd or Path.cwd()), "has_session": more[-2]}

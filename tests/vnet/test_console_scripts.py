@@ -9,6 +9,8 @@ import pytest
 
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 # Imported at the start of Python: presses Ctrl-C when a module is about to be imported.
 AT_IMPORT = """
 import os, signal, sys

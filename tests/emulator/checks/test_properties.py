@@ -15,6 +15,7 @@ from emulator.records.events import Event
 from emulator.records.run import Run
 from emulator.testing.harness import RunHarness
 from emulator.testing.scenarios import make_scenario
+from tests.support.recorded import recorded
 from vnet import Node
 from vnet.errors import VnetError
 
@@ -40,17 +41,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         "run": {"duration_s": 2.0, "settle_s": 0.0},
         "network": {"vehicles": 4},
         "radio": {"range_m": 1e6},
+        "program": {"entry": "tests.emulator.checks.test_properties:brakes"},
     }
-    return simulate(
-        scenario, program="tests.emulator.checks.test_properties:brakes", out=tmp_path_factory.mktemp("run") / "run"
-    )
+    return Run.open(recorded(scenario, tmp_path_factory.mktemp("run") / "run"))
 
 
 def braked(moment: Moment) -> bool:
     return moment.event == "braked"
 
 
-@pytest.mark.slow
 def test_always_and_never_ask_at_each_period_of_each_vehicle(run: Run) -> None:
     assert always(run, "counts", lambda m: m["count"] >= 0).verdict == "valid"
     assert never(run, "far", lambda m: np.abs(m["position_m"]).max() > 1e7).text == "false at 80 moments"
@@ -191,6 +190,7 @@ def test_a_fault_leads_to_a_reported_value(faulty: Run) -> None:
     assert leads_to(faulty, "dead", kill, dead, 1.0, at="event").verdict == "invalid", "no event has that value"
 
 
+@pytest.mark.slow
 def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty: Run) -> None:
     assert always(faulty, "few", lambda m: m["dead"] <= 1).text == "true at 50 of 60 moments"
     assert never(faulty, "some", lambda m: m["dead"] > 1).verdict == "valid"

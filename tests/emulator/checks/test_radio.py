@@ -136,12 +136,22 @@ def test_with_fading_any_pair_may_do_anything_once(faded: RecordedRun) -> None:
     assert verdict(changed(faded, arrives), "fading") is Verdict.VALID
 
 
-def test_too_much_fading_is_seen(faded: RecordedRun) -> None:
+def test_too_much_and_too_little_fading_is_seen_where_no_link_alone_tells(
+    faded: RecordedRun,
+) -> None:
+    few = replace(faded, trace=faded.trace.slice(0, faded.trace.num_rows // 4))
+
     def fade(columns: dict[str, Any], arrived: np.ndarray) -> None:
         for row in arrived[::4].tolist():
             became(columns, row, "faded")
 
-    assert verdict(changed(faded, fade), "fading") is Verdict.INVALID
+    def arrive(columns: dict[str, Any], _: np.ndarray) -> None:
+        for row in np.flatnonzero(few.outcome_is("faded")).tolist():
+            columns["outcome"][row], columns["arrival_ns"][row] = "delivered", columns["left_ns"][row] + 2_500_000
+
+    for change in (fade, arrive):
+        found = checked(changed(few, change), "fading")
+        assert (found.verdict, found.figures["links"]) == (Verdict.INVALID, 0)
 
 
 def test_another_law_than_the_scenarios_is_seen(faded: RecordedRun) -> None:

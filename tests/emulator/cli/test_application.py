@@ -65,6 +65,7 @@ def test_what_needs_no_command_imports_none(argument: str, tmp_path: Path) -> No
     assert "typer" in modules, "the spy sees imports"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [command.name for command in COMMANDS if command.runs_programs])
 def test_what_runs_programs_starts_again_before_it_imports_anything(name: str, tmp_path: Path) -> None:
     how, seed, modules = spied(tmp_path, name, "--help")

@@ -10,6 +10,8 @@ import pytest
 
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 pytestmark = pytest.mark.usefixtures("default_signals")
 
 BEACON = str(ROOT / "scenarios" / "beacon.toml")
@@ -69,7 +71,6 @@ def vnet(folder: Path, *arguments: str, at_start: str = "") -> tuple[int, str, s
     return done.returncode, done.stdout, errors.read_text()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "module"),
     [
@@ -104,7 +105,6 @@ def test_while_a_command_starts_itself_again(tmp_path: Path) -> None:
     assert (status, said) == (130, "")
 
 
-@pytest.mark.slow
 def test_a_program_that_does_not_yield_ends_at_the_second(tmp_path: Path) -> None:
     (tmp_path / "busy.py").write_text(BUSY)
     status, shown, said = vnet(tmp_path, "simulate", BEACON, "--program", "busy:main", "--quiet")
@@ -114,7 +114,6 @@ def test_a_program_that_does_not_yield_ends_at_the_second(tmp_path: Path) -> Non
     assert "verdict: unknown" in shown
 
 
-@pytest.mark.slow
 def test_a_process_in_the_background_goes_on_ignoring_it(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

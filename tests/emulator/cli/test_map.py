@@ -76,6 +76,7 @@ def test_what_cannot_be_is_said(
     assert status == 2 and said in text
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_known_before_the_map_is_read(tmp_path: Path) -> None:
     status, text = vnet_map("convert", tmp_path / "none.npz", tmp_path / "town.shp")
     assert status == 2 and "town.shp: unknown map format; allowed are *.geojson" in text

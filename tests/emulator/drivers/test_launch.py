@@ -9,6 +9,8 @@ from emulator.drivers.launch import Launcher
 from tests.support.processes import has_ended
 from vnet.transport.access import Access
 
+pytestmark = pytest.mark.slow
+
 SAY = "import os; print(os.getsid(0), os.getpgrp() == os.getpid())"
 
 

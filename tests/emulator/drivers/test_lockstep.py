@@ -102,6 +102,16 @@ def test_only_those_are_granted_an_instant_who_have_something_to_do_at_it() -> N
     assert times(lockstep.step()) == {"v01": 30 * MS}
 
 
+def test_vehicles_have_driven_to_an_instant_before_who_wakes_at_it_is_granted_it() -> None:
+    lockstep, emulation = barrier(network={"kind": "driven", "driven": {"road": "ring", "length_m": 600.0}})
+    grants = lockstep.start()
+    control_ns = emulation.next_control_ns()
+    assert control_ns is not None
+    yield_all(lockstep, grants, v01=control_ns)
+    assert times(lockstep.step()) == {"v01": control_ns}
+    assert (emulation.next_control_ns() or control_ns) > control_ns
+
+
 @pytest.mark.parametrize("next_ms", [10, 33])
 def test_a_timer_before_the_end_of_the_window_is_refused(next_ms: int) -> None:
     lockstep, _ = barrier(radio={"latency_ms": 4})

@@ -2,10 +2,14 @@
 
 from pathlib import Path
 
+import pytest
+
 import emulator
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.samples import key_figures
 from emulator.records.tables import SAMPLES
+
+pytestmark = pytest.mark.slow
 
 
 def test_every_message_has_a_row_and_one_fate_at_each_receiver(tmp_path: Path) -> None:

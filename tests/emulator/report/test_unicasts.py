@@ -22,6 +22,8 @@ from emulator.report.source import Source
 from emulator.report.write import report_page
 from vnet import Node
 
+pytestmark = pytest.mark.slow
+
 
 async def send_and_broadcast(node: Node) -> None:
     """Have `a` broadcast, then send to a vehicle out of range and to one in range."""
@@ -47,7 +49,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-@pytest.mark.slow
 def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> None:
     whole = RecordedRun.open(run)
     assert (whole.attempt > 1).any() and whole.outcome_is("duplicate").any() and whole.outcome_is("delivered").any()
@@ -73,7 +74,6 @@ def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> No
     assert judged_figures(verdict)["packet_delivery_ratio"] == ratio, "a row of a sweep has it, too"
 
 
-@pytest.mark.slow
 def test_a_run_without_broadcasts_has_its_frames_to_one_vehicle(tmp_path: Path) -> None:
     async def send(node: Node) -> None:
         await node.radio.send("v02" if node.id == "v01" else "v01", b"hello")
@@ -86,7 +86,6 @@ def test_a_run_without_broadcasts_has_its_frames_to_one_vehicle(tmp_path: Path) 
     assert section.totals["frames to one vehicle"].startswith("2 sent, 2 acknowledged")
 
 
-@pytest.mark.slow
 def test_figures_count_receptions_in_range_and_links_broadcasts(run: Path) -> None:
     source = Source(run)
     assert "of the one link" in links(source).caption
@@ -104,7 +103,6 @@ def test_outcomes_over_time_stack_up_to_all_receptions(run: Path) -> None:
     assert Outcome.duplicate.name in {layer.get_label() for layer in layers}
 
 
-@pytest.mark.slow
 def test_times_on_the_edge_of_a_bin_are_on_their_side(tmp_path: Path) -> None:
     async def beacon(node: Node) -> None:
         async for _ in node.gnss:
@@ -116,7 +114,6 @@ def test_times_on_the_edge_of_a_bin_are_on_their_side(tmp_path: Path) -> None:
     assert "20 to 20 a second" in radio_figures.outcomes(Source(tmp_path / "run")).caption
 
 
-@pytest.mark.slow
 def test_the_axis_of_distances_holds_all_frames_of_vehicles_that_drive(tmp_path: Path) -> None:
     async def beacon(node: Node) -> None:
         async for _ in node.gnss:

@@ -67,6 +67,7 @@ def asked(folder: Path, option: str) -> str:
     return arguments[arguments.index(option) + 1]
 
 
+@pytest.mark.slow
 def test_vehicles_are_where_sumo_drove_them(tmp_path: Path, sumo: Path) -> None:
     world = build_world(load(tmp_path))
     assert world.node_ids == ("a", "b")
@@ -85,6 +86,7 @@ def test_the_run_begins_where_the_configuration_does(tmp_path: Path, text: str, 
     assert read_begin_s(tmp_path / "town.sumocfg") == begin_s
 
 
+@pytest.mark.slow
 def test_or_where_the_scenario_says(tmp_path: Path, sumo: Path) -> None:
     world = build_world(load(tmp_path, "start_s = 1.0"))
     assert float(asked(sumo, "--end")) == pytest.approx(3.0, abs=0.2)
@@ -102,6 +104,7 @@ def test_what_sumo_reads_belongs_to_the_run(tmp_path: Path, sumo: Path) -> None:
         load_scenario(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drives", "says", "status", "named"),
     [

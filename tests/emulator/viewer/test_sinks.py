@@ -191,6 +191,7 @@ def _numbers(path: Path) -> dict[float, list[float]]:
     return dict(drawn["/line"].at["Scalars:scalars"]) if "/line" in drawn else {}
 
 
+@pytest.mark.slow
 def test_a_viewer_is_opened_on_what_is_served_and_outlives_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,6 +250,7 @@ def test_a_recording_whose_writer_was_killed_can_be_read_and_repaired(tmp_path: 
     assert len(_numbers(repaired)) >= 180
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [20, 100, 150, 600, 1400])
 def test_a_recording_of_nothing_but_its_name_is_not_shown(tmp_path: Path, left: int) -> None:
     path = tmp_path / "recording.rrd"

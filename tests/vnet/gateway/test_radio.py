@@ -36,6 +36,7 @@ def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive
     assert any("SampleKind.DELETE" in line for line in log(first))
 
 
+@pytest.mark.slow
 def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(drive: Drive) -> None:
     run = drive(
         """
@@ -64,6 +65,7 @@ def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(
     assert len(run.trace) == 1
 
 
+@pytest.mark.slow
 def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
     run = drive(
         """
@@ -109,6 +111,7 @@ def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
     assert lines[4].startswith("v0") or lines[4] == "Timeout"
 
 
+@pytest.mark.slow
 def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Drive) -> None:
     run = drive(
         """
@@ -140,6 +143,7 @@ def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Dr
     ]
 
 
+@pytest.mark.slow
 def test_large_sample_crosses_in_fragments(drive: Drive) -> None:
     run = drive(
         """
@@ -183,6 +187,7 @@ RECOVER = """
     """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recovery", ["heartbeat=True", "periodic_queries=0.2"])
 def test_advanced_subscriber_recovers_most_of_what_the_radio_loses_in_order(drive: Drive, recovery: str) -> None:
     # Zenoh gives up what lies before a query's end: queries over the radio must end before the next begins.
@@ -199,6 +204,7 @@ def test_advanced_subscriber_recovers_most_of_what_the_radio_loses_in_order(driv
     assert heard[0] < 5, "the history is there, up to what its frames have lost"
 
 
+@pytest.mark.slow
 def test_sample_miss_listener_reports_exactly_what_the_radio_has_lost(drive: Drive) -> None:
     run = drive(RECOVER.format(history=False, recovery=""), vehicles=2, loss=0.3, duration_s=4.0)
     heard = [int(line.split()[2]) for line in log(run, "v02") if line.startswith("heard")]
@@ -206,6 +212,7 @@ def test_sample_miss_listener_reports_exactly_what_the_radio_has_lost(drive: Dri
     assert missed == heard[-1] - heard[0] + 1 - len(heard) > 0
 
 
+@pytest.mark.slow
 def test_fixes_and_reports_go_by_own_keys(drive: Drive) -> None:
     run = drive(
         """
@@ -222,6 +229,7 @@ def test_fixes_and_reports_go_by_own_keys(drive: Drive) -> None:
     assert len(run.trace) == 0
 
 
+@pytest.mark.slow
 def test_callback_that_fails_is_told_and_zenoh_goes_on(drive: Drive) -> None:
     run = drive(
         """
@@ -272,6 +280,7 @@ ALL_KINDS = """
     """
 
 
+@pytest.mark.slow
 def test_nothing_is_raised_where_vehicles_are_killed_or_the_run_ends_in_the_middle(
     drive: Drive, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,6 +294,7 @@ def test_nothing_is_raised_where_vehicles_are_killed_or_the_run_ends_in_the_midd
     assert not re.search("ignored|Traceback|never", capfd.readouterr().err)
 
 
+@pytest.mark.slow
 def test_frames_that_a_fault_has_changed_are_dropped(drive: Drive) -> None:
     fault = {"kind": "corrupt", "at_s": 0.0, "duration_s": 2.0, "probability": 0.7}
     run = drive(ALL_KINDS, vehicles=2, fault=[fault])

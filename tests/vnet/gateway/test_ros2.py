@@ -144,6 +144,7 @@ def test_what_only_resembles_ros_2_is_no_part_of_it(key: str) -> None:
     assert parse_topic(key) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ros_type", [CLOCK_TYPE, FIX_TYPE])
 @pytest.mark.parametrize("distribution", [Stores.ROS2_JAZZY, Stores.LATEST])
 def test_hashes_of_published_types_are_those_of_their_definitions(ros_type: str, distribution: Stores) -> None:
@@ -151,6 +152,7 @@ def test_hashes_of_published_types_are_those_of_their_definitions(ros_type: str,
     assert pamoja.type_hash_digest(TYPE_HASHES[ros_type]) is not None
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**31 * 10**9 - 1))
 def test_a_clock_reads_as_written(time_ns: int) -> None:
     message: Any = STORE.deserialize_cdr(clock_message(time_ns), CLOCK_TYPE)
@@ -237,6 +239,7 @@ NODE = """
 """
 
 
+@pytest.mark.slow
 def test_rules_services_clock_and_fixes_hold_on_virtual_time(drive: Drive) -> None:
     run = drive(NODE, vehicles=2, radio={"profile": "ros2", "ros2": {"clock_hz": 4.0}})
     assert "answered yes" in log(run)
@@ -279,6 +282,7 @@ def test_two_clients_that_share_no_code_run_unmodified_on_virtual_time(tmp_path:
     assert seen == ["there", "gone", "there"]
 
 
+@pytest.mark.slow
 def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(drive: Drive) -> None:
     program = f"""
         import sys, zenoh
@@ -304,6 +308,7 @@ def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(d
     assert schemas == {"/v01/chatter": known, "/v01/old": known, "/v01/odd": None}
 
 
+@pytest.mark.slow
 def test_figures_are_by_topic_and_type_with_the_nodes_that_send(drive: Drive) -> None:
     run = drive(NODE, vehicles=2, radio={"profile": "ros2"})
     found = {(each.kind, each.key): each for each in key_figures(RecordedRun.open(run.folder))}

@@ -39,6 +39,7 @@ def members(declared: ast.ClassDef) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["zenoh", "zenoh.ext", "zenoh.handlers"])
 def test_each_public_name_and_member_is_there(module: str) -> None:
     missing = []

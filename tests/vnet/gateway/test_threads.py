@@ -4,7 +4,11 @@ import re
 import signal
 from pathlib import Path
 
+import pytest
+
 from tests.vnet.gateway.conftest import Drive, events, log
+
+pytestmark = pytest.mark.slow
 
 
 def test_threads_wait_on_emulated_time_for_queues_locks_events_and_each_other(drive: Drive) -> None:

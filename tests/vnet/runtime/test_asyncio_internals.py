@@ -238,6 +238,7 @@ def test_a_callback_has_the_context_in_which_it_was_set(loop: StandingLoop) -> N
     loop.run_until_complete(task)
 
 
+@pytest.mark.slow
 def test_an_abandoned_task_is_destroyed_in_silence(loop: StandingLoop) -> None:
     complaints: list[str] = []
     loop.set_exception_handler(lambda _, about: complaints.append(about["message"]))

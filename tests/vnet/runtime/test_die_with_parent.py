@@ -3,7 +3,11 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests.support.processes import has_ended
+
+pytestmark = pytest.mark.slow
 
 CHILD = "import os, sys, time; print(os.getpid(), flush=True); time.sleep(600)"
 PARENT = f"""

@@ -100,6 +100,7 @@ os.write(first, str(first).encode())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", ["1", "2", "12", "012"])
 def test_files_do_not_take_the_place_of_closed_standard_output(closed: str, tmp_path: Path) -> None:
     command = [sys.executable, "-c", CLOSED, OPENED, closed]

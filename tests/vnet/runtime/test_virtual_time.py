@@ -36,6 +36,7 @@ def run(loop: VirtualTimeLoop, program: Callable[[], Awaitable[Any]]) -> Any:
     return loop.run_until_complete(program())
 
 
+@pytest.mark.slow
 def test_a_fork_that_comes_back_to_the_loop_ends(loop: VirtualTimeLoop, capfd: pytest.CaptureFixture[str]) -> None:
     async def program() -> int:
         never = loop.create_future()

@@ -279,6 +279,7 @@ async def test_a_node_that_goes_before_the_start_is_awaited_again() -> None:
     assert stage.members.missing == ["v02"]
 
 
+@pytest.mark.slow
 def test_children_that_end_are_noticed_with_and_without_signals() -> None:
     async def run() -> None:
         stage = Stage()
