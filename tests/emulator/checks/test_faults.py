@@ -488,10 +488,17 @@ def test_where_the_machine_did_not_keep_up_silence_is_unknown() -> None:
 
 
 def test_a_death_that_a_fault_wanted_is_none() -> None:
-    recorded = with_fault("kill")
-    killed = recorded.node_ids[int(np.flatnonzero(recorded.plan[0].nodes)[0])]
-    for time_s, expected in ((2.1, Verdict.VALID), (1.9, Verdict.INVALID)):
-        died = Event(round(time_s * 1e9), "died", killed, {"how": "SIGKILL"})
+    recorded = with_fault("restart")
+    (planned,) = recorded.plan
+    killed = recorded.node_ids[int(np.flatnonzero(planned.nodes)[0])]
+    before_ns, within_ns, after_ns = planned.start_ns - 10**8, planned.start_ns + 10**8, planned.end_ns + 10**8
+    assert within_ns < planned.end_ns
+    for time_ns, expected in (
+        (before_ns, Verdict.INVALID),
+        (within_ns, Verdict.VALID),
+        (after_ns, Verdict.INVALID),
+    ):
+        died = Event(time_ns, "died", killed, {"how": "SIGKILL"})
         assert verdict(replace(recorded, events=[*recorded.events, died]), "agents_alive") is expected
 
 
