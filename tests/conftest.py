@@ -1,6 +1,7 @@
 """Fixtures for tests of all packages."""
 
 import gc
+import os
 import re
 import signal
 import sys
@@ -16,8 +17,8 @@ from vnet.runtime.environment import use_same_arithmetic
 use_same_arithmetic()  # as in the commands, whose results some tests compare with those of this process
 
 # The same examples in each run, so that it fails for what was changed, and however slow the machine.
-# Others: --hypothesis-profile=default.
-settings.register_profile("same", derandomize=True, deadline=None)
+# Others: --hypothesis-profile=default. Where time matters less, twice as many.
+settings.register_profile("same", derandomize=True, deadline=None, max_examples=100 if os.environ.get("CI") else 50)
 settings.load_profile("same")
 # For mutants: the first example that fails is enough, and looking for a smaller one takes minutes.
 settings.register_profile("first", settings.get_profile("same"), phases=[Phase.explicit, Phase.generate])

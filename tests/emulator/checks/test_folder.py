@@ -63,6 +63,7 @@ def test_a_run_as_it_was_written_is_valid_and_every_check_of_its_folder_judged_i
     } <= names
 
 
+@pytest.mark.slow
 def test_forging_nothing_changes_nothing(copy: Path) -> None:
     forge(copy)
     assert check_run(copy).verdict is Verdict.VALID
@@ -101,6 +102,7 @@ def reverse_events(folder: Path) -> None:
     path.write_text("".join(reversed(path.read_text().splitlines(keepends=True))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "name"),
     [
@@ -138,6 +140,7 @@ def test_a_folder_whose_manifest_is_gone_is_invalid_and_an_earlier_one_needs_non
     assert "files" in {left.name for left in judgement.not_exercised}
 
 
+@pytest.mark.slow
 def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_is_wrong(copy: Path) -> None:
     next(edit for edit in EDITS if edit.found_by == "truth").apply(copy)
     forge(copy)
@@ -147,6 +150,7 @@ def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_
     assert (broken(judgement), judgement.verdict) == (set(), Verdict.UNKNOWN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "nothing.parquet"])
 def test_a_manifest_names_files_of_the_folder_alone(copy: Path, name: str) -> None:
     path = copy / "manifest.json"
@@ -178,6 +182,7 @@ def test_a_busy_ratio_is_computed_again(tmp_path: Path) -> None:
     assert "outcomes" in broken(check_run(folder))
 
 
+@pytest.mark.slow
 def test_files_that_vnet_adds_to_a_finished_run_are_no_edit(copy: Path) -> None:
     (copy / "report.html").write_text("a report")
     (copy / "recording.rrd").write_text("a recording")
@@ -217,6 +222,7 @@ EVENTS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("event", EVENTS, ids=["kind", "node", "before", "after"])
 def test_an_event_that_cannot_be_is_told(copy: Path, event: dict[str, object]) -> None:
     with (copy / "events.jsonl").open("a") as file:
@@ -225,6 +231,7 @@ def test_an_event_that_cannot_be_is_told(copy: Path, event: dict[str, object]) -
     assert "row_order" in broken(check_run(copy))
 
 
+@pytest.mark.slow
 def test_a_log_that_the_manifest_lacks_is_told(copy: Path) -> None:
     (copy / "logs" / "v77.log").write_text("made up\n")
     assert broken(check_run(copy)) == {"files"}

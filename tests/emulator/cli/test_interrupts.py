@@ -10,9 +10,7 @@ import pytest
 
 from tests.support.paths import ROOT
 
-pytestmark = pytest.mark.slow
-
-pytestmark = pytest.mark.usefixtures("default_signals")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("default_signals")]
 
 BEACON = str(ROOT / "scenarios" / "beacon.toml")
 # Imported at the start of Python: presses Ctrl-C, twice, when a module is about to be imported.

@@ -18,6 +18,8 @@ from emulator.terminal.console import run_app
 from tests.support.multi_loop_driver import run_together, scenario_of
 from vnet.node import Node
 
+pytestmark = pytest.mark.slow
+
 
 async def counts(node: Node) -> None:
     number = 0
@@ -52,7 +54,6 @@ def trace(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0) 
     return [line.split("\t") for line in (captured.out or captured.err).splitlines()]
 
 
-@pytest.mark.slow
 def test_payloads_are_kept_and_change_no_hash(kept: Path) -> None:
     without, trace_sha256 = run_of(False)
     assert json.loads((kept / "verdict.json").read_text())["trace_sha256"] == trace_sha256
@@ -86,7 +87,6 @@ def test_a_function_decodes_and_may_fail(kept: Path, capsys: pytest.CaptureFixtu
     assert lines[-1][4].startswith("ff00 (UnicodeDecodeError: ")
 
 
-@pytest.mark.slow
 def test_a_function_is_named_by_its_file(
     kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -99,7 +99,6 @@ def test_a_function_is_named_by_its_file(
     assert line == "vnet: --decode gone.py:first: gone.py: no such file"
 
 
-@pytest.mark.slow
 def test_without_payloads_there_are_digests(bare: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = trace(capsys, str(bare), "--from", "0.2", "--to", "0.3")
     assert len(lines) == 4 and lines[1][4].startswith("digest ")

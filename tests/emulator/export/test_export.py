@@ -126,6 +126,7 @@ def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: O
     assert {options(body[8:])[9] for body in interfaces} == {b"\x09"}, "nanoseconds"
 
 
+@pytest.mark.slow
 def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
     capture: bytes, recorded: OpenedRun
 ) -> None:
@@ -145,6 +146,7 @@ def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
     assert outbound == sorted(emission[:2] for emission in sent)
 
 
+@pytest.mark.slow
 def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, recorded: OpenedRun) -> None:
     for packet in packets(capture):
         data = packet["bytes"]
@@ -208,6 +210,7 @@ def test_a_packet_has_the_bit_rate_of_its_own_frame(tmp_path: Path) -> None:
         assert packet["bytes"][9] / 2 == rates[seq]
 
 
+@pytest.mark.slow
 def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRun) -> None:
     for packet in packets(capture):
         fields = packet["comment"].split("; ")
@@ -227,6 +230,7 @@ def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRu
 # MCAP.
 
 
+@pytest.mark.slow
 def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> None:
     file = io.BytesIO()
     count = write_mcap(recorded, file)
@@ -257,6 +261,7 @@ def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> 
     assert attachment.name == "scenario.toml" and b"[network]" in attachment.data
 
 
+@pytest.mark.slow
 def test_mcap_shows_who_is_there_where_it_is(recorded: OpenedRun) -> None:
     file = io.BytesIO()
     write_mcap(recorded, file)
@@ -275,6 +280,7 @@ TOPICS = ("/tf", "/vehicles/fix")
 # CSV.
 
 
+@pytest.mark.slow
 def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: OpenedRun, tmp_path: Path) -> None:
     tables = {}
     for name in write_csv(recorded, tmp_path):
@@ -297,6 +303,7 @@ def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: OpenedRun, 
 RUNNER = CliRunner()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "begins"), [("x.pcapng", b"\x0a\x0d\x0d\x0a"), ("X.MCAP", b"\x89MCAP"), ("x", None)]
 )
@@ -308,6 +315,7 @@ def test_without_to_the_file_s_name_says_the_format(
     assert out.is_dir() if begins is None else out.read_bytes().startswith(begins)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -336,6 +344,7 @@ def test_an_export_goes_where_it_is_told_and_never_over_something_else(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"], "nothing half-written is left"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("every", "every_s"), [([], 1.0), (["--every", "0.5"], 0.5), (["--every", "0"], 0.0)])
 def test_the_links_of_a_run_are_what_the_file_says(
     folder: Path, recorded: OpenedRun, tmp_path: Path, every: list[str], every_s: float
@@ -375,6 +384,7 @@ def test_what_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
         assert done.exit_code == 2 and done.stderr.count("\n") == 1 and "not a run's folder" in done.stderr
 
 
+@pytest.mark.slow
 def test_radio_prints_its_figures_and_keeps_its_tables(folder: Path, tmp_path: Path) -> None:
     done = RUNNER.invoke(app, ["radio", str(folder), "--bin", "25", "--out", str(tmp_path / "tables")])
     assert done.exit_code == 0, done.stderr

@@ -175,6 +175,7 @@ def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.n
             assert close(told[link][name], expected), (link, name, told[link][name], expected)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(traces(), st.floats(5, 300), st.floats(0, 0.9))
 def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(

@@ -138,6 +138,7 @@ def test_busy_ratios_are_those_of_the_windows_that_ended_in_a_period() -> None:
     assert np.isnan(mean_busy([], 2, 0, 500 * ms)).all(), "no medium is shared"
 
 
+@pytest.mark.slow
 def test_what_was_told_is_worth_comparing(watched: Watched) -> None:
     """Each field says something at some time: two messages of nothing are equal as well."""
     told = watched.periods
@@ -153,6 +154,7 @@ def test_what_was_told_is_worth_comparing(watched: Watched) -> None:
     assert max(late) > 0, "delays take some over the last edge of the histogram"
 
 
+@pytest.mark.slow
 def test_a_fault_acts_in_the_periods_that_it_touches(watched: Watched) -> None:
     acting = [message["period"] for message in watched.periods if "kill-0" in message["faults"]]
     assert acting == list(range(9, 16))  # from 0.95 s to 1.6 s
@@ -162,6 +164,7 @@ def test_a_fault_acts_in_the_periods_that_it_touches(watched: Watched) -> None:
     assert (2_000_000_000, "fault_started") in kinds, "what happens as a period starts is told with it"
 
 
+@pytest.mark.slow
 def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
     """Against the trace, counted another way."""
     trace = pq.read_table(watched.folder / "trace.parquet")
@@ -197,6 +200,7 @@ def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
         ]
 
 
+@pytest.mark.slow
 def test_who_comes_late_is_told_of_whole_periods(watched: Watched, tmp_path: Path) -> None:
     scenario = Scenario.model_validate(
         {"run": {"duration_s": 1.0}, "network": {"vehicles": NODES}, "program": {"entry": "agents.beacon:main"}}
@@ -243,12 +247,14 @@ def test_a_folder_that_is_no_runs(tmp_path: Path) -> None:
     assert "not a run's folder" in refused(tmp_path / "nowhere")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trace", "states", "metrics"])
 def test_a_table_that_is_not_there(copied: Path, name: str) -> None:
     (copied / f"{name}.parquet").unlink()
     assert refused(copied).endswith(f"there is no {name}.parquet in it")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trace", "states", "metrics"])
 def test_a_table_that_is_none(copied: Path, name: str) -> None:
     path = copied / f"{name}.parquet"
@@ -304,6 +310,7 @@ def test_a_run_without_a_period_has_a_scene_and_an_end(tmp_path: Path) -> None:
     assert [stream for stream, _ in messages(emptied.folder)] == ["scene", "end"]
 
 
+@pytest.mark.slow
 def test_the_documentation_names_every_field_and_outcome(watched: Watched) -> None:
     text = (ROOT / "docs" / "messages.md").read_text()
     scene, period = watched.told[0][1], watched.periods[0]

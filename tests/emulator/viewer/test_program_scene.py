@@ -16,7 +16,7 @@ from tests.support.recorded import prepared
 from tests.support.recordings import Entity, read_back
 from vnet import Node
 
-pytestmark = pytest.mark.usefixtures("strict")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("strict")]
 
 
 async def program(node: Node) -> None:
@@ -56,7 +56,6 @@ def entities(path: Path) -> dict[str, Entity]:
     return read_back(path)
 
 
-@pytest.mark.slow
 def test_a_value_is_a_curve_of_mean_band_and_vehicle(entities: dict[str, Entity]) -> None:
     delay = entities["/program/curve/delay_ms"]
     numbers = list(delay.at["Scalars:scalars"].values())

@@ -118,16 +118,19 @@ def test_the_blueprint_has_four_tabs_and_shows_whatever_there_is(path: Path, ent
     assert empty == [], "no view is empty"
 
 
+@pytest.mark.slow
 def test_nothing_that_is_always_there_hides_what_comes_with_a_time(entities: dict[str, Entity]) -> None:
     hidden = {name: set(entity.static) & set(entity.at) for name, entity in entities.items()}
     assert {name: both for name, both in hidden.items() if both} == {}
 
 
+@pytest.mark.slow
 def test_there_is_no_time_but_the_emulated(path: Path) -> None:
     timelines = {name for chunk in RrdReader(str(path)).stream() for name in chunk.timeline_names}
     assert timelines == {"emulated time"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entity", "name", "relative_to"),
     [
@@ -150,6 +153,7 @@ def test_points_are_where_the_messages_say_with_north_up(
         np.testing.assert_allclose(drawn, wanted * [1, -1], rtol=1e-6, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entity", "figures"),
     [
@@ -171,6 +175,7 @@ def test_lines_have_the_figures_of_the_messages(
     assert len(entities[entity].static["SeriesLines:names"]) == len(drawn)
 
 
+@pytest.mark.slow
 def test_layers_of_the_stack_are_as_thick_as_there_were_frames(told: Told, entities: dict[str, Entity]) -> None:
     seen = set()
     for period in periods(told):
@@ -188,6 +193,7 @@ def test_layers_of_the_stack_are_as_thick_as_there_were_frames(told: Told, entit
     assert {Outcome.delivered, Outcome.lost, Outcome.peer_cap, Outcome.fault, Outcome.receiver_down} <= seen
 
 
+@pytest.mark.slow
 def test_links_are_halves_coloured_by_their_state(told: Told, entities: dict[str, Entity]) -> None:
     links = entities["/map/links"]
     seen = set()
@@ -203,6 +209,7 @@ def test_links_are_halves_coloured_by_their_state(told: Told, entities: dict[str
     assert {Outcome.delivered, Outcome.peer_cap, Outcome.fault, Outcome.receiver_down} <= seen
 
 
+@pytest.mark.slow
 def test_a_link_is_delivered_if_a_frame_got_through_and_else_what_befell_most(told: Told) -> None:
     rows = [
         (0, 1, Outcome.lost, 3),
@@ -215,6 +222,7 @@ def test_a_link_is_delivered_if_a_frame_got_through_and_else_what_befell_most(to
     assert list(zip(sender, receiver, state, strict=True)) == [(0, 1, Outcome.delivered), (1, 0, Outcome.peer_cap)]
 
 
+@pytest.mark.slow
 def test_faults_and_the_dead_have_their_spans(entities: dict[str, Entity]) -> None:
     spans = {name: entity.at["StateChange:state"] for name, entity in entities.items() if "/faults/" in name}
     assert spans == {
@@ -224,6 +232,7 @@ def test_faults_and_the_dead_have_their_spans(entities: dict[str, Entity]) -> No
     }
 
 
+@pytest.mark.slow
 def test_who_is_down_is_red_on_the_map(entities: dict[str, Entity]) -> None:
     colours = entities["/map/true"].at["Points2D:colors"]
     assert list(colours) == [0.0, 1.0, 2.0]
@@ -247,6 +256,7 @@ def test_a_vehicle_that_enters_is_not_red_any_more(told: Told, tmp_path: Path) -
     assert len(set(colours[0.5])) == 1, "it has entered, and nobody was down before or after"
 
 
+@pytest.mark.slow
 def test_events_are_told_at_their_time_and_those_after_the_last_period_too(
     told: Told, entities: dict[str, Entity]
 ) -> None:
@@ -256,6 +266,7 @@ def test_events_are_told_at_their_time_and_those_after_the_last_period_too(
     assert logged[1.2] == ["partition-1 started: v01, v02, v03, v04, v05, v06"]
 
 
+@pytest.mark.slow
 def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str, Entity]) -> None:
     number = {node: row for row, node in enumerate(told[0][1]["node_ids"])}
     matrix = np.full((6, 6), np.nan)
@@ -273,6 +284,7 @@ def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str
     assert compared >= 2
 
 
+@pytest.mark.slow
 def test_the_links_of_the_radio_are_shares_of_what_was_tried(told: Told, entities: dict[str, Entity]) -> None:
     times = list(entities["/radio/links"].at["Tensor:data"])
     before = [period for period in periods(told) if period.time_s <= times[-1]]
@@ -286,6 +298,7 @@ def test_the_links_of_the_radio_are_shares_of_what_was_tried(told: Told, entitie
     np.testing.assert_allclose(heard, 100 * delivered.sum(axis=1) / tried.sum(axis=1), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_ages_and_times_between_receptions_are_those_of_the_messages(
     told: Told, entities: dict[str, Entity]
 ) -> None:
@@ -319,6 +332,7 @@ def test_ages_and_times_between_receptions_are_those_of_the_messages(
     assert len(gaps_ms) > 100 and min(gaps_ms) < 150 < max(gaps_ms)
 
 
+@pytest.mark.slow
 def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dict[str, Entity]) -> None:
     times = list(entities["/radio/latency"].at["BarChart:values"])
     before = [period for period in periods(told) if period.time_s <= times[-1]]
@@ -335,6 +349,7 @@ def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dic
         np.testing.assert_allclose(drawn, rate, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, Entity]) -> None:
     period = next(period for period in periods(told) if period.time_s == LATE_S)
     position, estimate = (period.points(f"{name}_m")[2] for name in ("position", "estimate"))
@@ -383,6 +398,7 @@ def test_what_comes_before_the_scene_and_what_is_unknown_is_left_out(told: Told,
     assert min(times) == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_one_line(told: Told, tmp_path: Path) -> None:
     with pytest.raises(VnetError, match=r"nowhere/x\.rrd: cannot write the recording"):
         write(told, tmp_path / "nowhere" / "x.rrd")

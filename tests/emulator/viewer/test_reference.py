@@ -70,6 +70,7 @@ def test_it_says_nothing_where_nobody_speaks_of_a_common_error(tmp_path: Path) -
     assert steps(told) == [None] * 5
 
 
+@pytest.mark.slow
 def test_fixes_that_are_missing_and_periods_that_were_left_out_are_bridged(told: list[dict[str, Any]]) -> None:
     periods = [dict(period) for period in told[1:]]
     for number, period in enumerate(periods):
@@ -83,6 +84,7 @@ def test_fixes_that_are_missing_and_periods_that_were_left_out_are_bridged(told:
     assert late(found) < 2.0
 
 
+@pytest.mark.slow
 def test_each_component_has_a_filter_of_its_own(told: list[dict[str, Any]]) -> None:
     apart = {**told[0], "component": np.array([0] * 6 + [1] * 6, dtype="<i2").tobytes()}
     together, separate = steps(told), steps([apart, *told[1:]])

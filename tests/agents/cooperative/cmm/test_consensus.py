@@ -237,11 +237,13 @@ def test_averaging_without_loss_keeps_the_mean_and_finds_it(rule: str) -> None:
     assert states[-1] == pytest.approx(np.tile(inputs.mean(axis=0), (20, 1)), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_metropolis_needs_fewer_rounds_than_max_degree() -> None:
     spread = {rule: averaging(rule, 0.0)[1][20].std(axis=0).max() for rule in ("metropolis", "max-degree")}
     assert spread["metropolis"] < spread["max-degree"]
 
 
+@pytest.mark.slow
 def test_metropolis_averaging_is_the_linear_iteration() -> None:
     linked = graph(20, 4, 0.45)
     _, states = averaging("metropolis", 0.0)

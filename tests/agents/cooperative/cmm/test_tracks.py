@@ -116,7 +116,7 @@ class TracksMachine(RuleBasedStateMachine):
 
 
 TestTracks = TracksMachine.TestCase
-TestTracks.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestTracks.settings = settings(max_examples=30, stateful_step_count=30, deadline=None)
 
 
 @settings(max_examples=50, deadline=None)
