@@ -10,7 +10,6 @@ EXTRA_OF = {
     "asn1tools": "its",
     "cryptography": "tls",
     "cvxpy": "sdp",
-    "daqp": "cooperative",
     "distributed": "dask",
     "greenlet": "zenoh-sim",
     "gymnasium": "rl",

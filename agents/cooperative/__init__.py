@@ -23,5 +23,5 @@ def __getattr__(name: str) -> Any:
     """Return the program."""
     if name != "main":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    require("program.entry = 'agents.cooperative:main'", "scipy", "daqp", "osqp", error=ProgramError)
+    require("program.entry = 'agents.cooperative:main'", "scipy", "osqp", error=ProgramError)
     return import_module("agents.cooperative.program").main

@@ -330,17 +330,17 @@ class Estimator:
         """Mix the neighbours' particles; returns the estimate (2,) right afterwards."""
         weights = self._fusion_weights(frames)
         ids = [self._node_id, *(self._admission.ids[sender] for sender in frames)]
-        self.weights = dict(zip(ids, weights.tolist(), strict=True))
+        self.weights = dict(zip(ids, weights, strict=True))
         clouds = [Cloud(frame.cloud_m, _known(sender, frame)) for sender, frame in frames.items()]
-        fused_m, self.imported = fuse(self.rbpf, clouds, weights, self._rng)
+        fused_m, self.imported = fuse(self.rbpf, clouds, np.array(weights), self._rng)
         return fused_m
 
-    def _fusion_weights(self, frames: Mapping[str, CooperativeFrame]) -> Array:
+    def _fusion_weights(self, frames: Mapping[str, CooperativeFrame]) -> list[float]:
         """Fusion weights (1 + n,) of this vehicle and its neighbours, by the rule of the options."""
         degrees = [len(frame.heard) for frame in frames.values()]
         estimates_m, covariances_m2 = self._sent_estimates(frames)
         variances_m2 = covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1]
-        return self._rule.weights(estimates_m, variances_m2, self.consensus.mean_m, degrees)
+        return self._rule.weights(estimates_m.tolist(), variances_m2.tolist(), self.consensus.mean_m, degrees)
 
     def _sent_estimates(self, frames: Mapping[str, CooperativeFrame]) -> tuple[Array, Array]:
         """Estimates (1 + n, 2) and covariances (1 + n, 2, 2) as they were sent, the vehicle's own first."""

@@ -397,8 +397,7 @@ class InformationEstimator:
         """
         self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
         degrees = [len(frame.heard) for frame in frames.values()]
-        of_rule = self._rule.weights(np.array(means_m), np.array(variances_m2), self.mean_m, degrees)
-        weights: list[float] = of_rule.tolist()
+        weights = self._rule.weights(means_m, variances_m2, self.mean_m, degrees)
         if self._options.defence:
             leaning = leaning or [False] * len(frames)
             each = zip(weights[1:], self._prior_shares, leaning, strict=True)

@@ -76,8 +76,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Least weight of the vehicle itself, if `fusion = "optimized"`."""
     ridge_m2: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     """If positive, the ridge of the weights' quadratic program, in place of each estimate's own variance."""
-    solver: Literal["auto", "daqp", "osqp"] = "auto"
-    """Solver of the weights' quadratic program; `auto` is DAQP with `exchange = "information"` and OSQP else."""
+    solver: Literal["auto", "exact", "osqp"] = "auto"
+    """Solver of the weights' quadratic program; `auto` is `exact` with `exchange = "information"` and OSQP else."""
     fusion_interval_s: Positive = 0.2
     """Time between two fusions; not with `exchange = "information"`, which fuses in each period."""
     particles: Annotated[int, Meta(ge=0, le=100_000)] = 0
@@ -132,11 +132,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         return self.two_frames and self.exchange != "information"
 
     @property
-    def chosen_solver(self) -> Literal["daqp", "osqp"]:
+    def chosen_solver(self) -> Literal["exact", "osqp"]:
         """The solver of the weights: for `auto`, the faster one where results need not be those of before."""
         if self.solver != "auto":
             return self.solver
-        return "daqp" if self.exchange == "information" else "osqp"
+        return "exact" if self.exchange == "information" else "osqp"
 
     def own_config(self) -> OwnConfig:
         """Return the constants of the filter of a vehicle that exchanges information."""

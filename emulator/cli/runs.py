@@ -233,5 +233,5 @@ def demo(duration: DurationOption = None, out: OutOption = None) -> None:
     It is `vnet run quickstart --rerun save`.
     """
     with one_line_errors():
-        require("vnet demo", "rerun", "scipy", "daqp", "osqp")
+        require("vnet demo", "rerun", "scipy", "osqp")
     run(find_scenario("quickstart"), duration=duration, out=out, rerun=["save"])

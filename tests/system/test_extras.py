@@ -38,7 +38,7 @@ LACKING = {
     ("simulate", "80211p"): "scipy",
     ("simulate", "city"): "scipy",
     ("simulate", "quickstart"): "osqp",
-    ("run", "quickstart"): "daqp",
+    ("run", "quickstart"): "osqp",
     ("simulate", "beacon", "--program", "agents.centralized:main"): "scipy",
     ("analyze", "beacon"): "scipy",
     ("map", "city", "city.geojson"): "scipy",
@@ -112,7 +112,7 @@ def test_each_library_of_an_extra_names_it() -> None:
     ("libraries", "extras"),
     [
         (["scipy"], "scipy"),
-        (["scipy", "daqp", "osqp"], "cooperative"),
+        (["scipy", "osqp"], "cooperative"),
         (["osmium", "scipy"], "maps"),
         (["scipy", "mcap"], "scipy,export"),
     ],

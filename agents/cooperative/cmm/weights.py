@@ -10,19 +10,23 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 
-import daqp
 import numpy as np
 import osqp
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from agents.cooperative.cmm.information import inverted
 from vnet.errors import VnetError
 from vnet.types import Array
 
 RIDGE_FLOOR_M2 = 0.01
 """Least ridge (m²): an estimate that claims to be exact does not take all the weight."""
+MAX_ROUNDS = 15
+"""Number of rounds of Newton's method: of 20 000 random problems of 2 to 31 estimates none took more than 6."""
 MAX_SOLVERS = 64
 """Number of solvers that are kept, one for each number of neighbours: a flood of senders would need hundreds."""
+
+Points = Sequence[Sequence[float]]
 
 
 class OptimizedWeights:
@@ -46,18 +50,22 @@ class OptimizedWeights:
         Raises VnetError for a covariance that is not positive definite.
         """
         check_covariances(covariances_m2)
-        return self.solve_by_variance(estimates_m, covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1], mean_m)
+        variances_m2 = covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1]
+        return np.array(self.solve_by_variance(estimates_m.tolist(), variances_m2.tolist(), mean_m.tolist()))
 
-    def solve_by_variance(self, estimates_m: Array, variances_m2: Array, mean_m: Array) -> Array:
-        """Return the same for the sums (n,) of both variances of each, which are positive."""
+    def solve_by_variance(
+        self, estimates_m: Points, variances_m2: Sequence[float], mean_m: Sequence[float]
+    ) -> list[float]:
+        """Return the same as plain numbers for the sums (n,) of both variances of each, which are positive."""
         count = len(estimates_m)
         if count == 1:
-            return np.ones(1)
-        hessian = self._hessian(estimates_m, variances_m2, mean_m)
+            return [1.0]
+        hessian = self._hessian(np.array(estimates_m), np.array(variances_m2), np.array(mean_m))
         weights = self._minimize(hessian)
         weights = np.minimum(np.maximum(weights, 0.0), 1.0)
         total = float(np.add.reduce(weights))
-        return np.asarray(weights / total) if math.isfinite(total) and total > 0 else no_fusion_weights(count)
+        weights = weights / total if math.isfinite(total) and total > 0 else no_fusion_weights(count)
+        return list(weights.tolist())
 
     def _hessian(self, estimates_m: Array, variances_m2: Array, mean_m: Array) -> Array:
         count = len(estimates_m)
@@ -96,29 +104,54 @@ class OptimizedWeights:
         return self._solvers[count]
 
 
-class ActiveSetWeights(OptimizedWeights):
-    """The same weights by DAQP (Arnström, Bemporad and Axehill 2022), a dual active-set solver.
+class ExactWeights(OptimizedWeights):
+    """The same weights in closed form, in a third of the time.
 
-    It solves exactly, from scratch each time, and in a fifth of OSQP's time: 12 in place of 56 µs with 8 estimates,
-    26 in place of 133 µs with 31. The weights of OSQP differ by 10⁻⁵ at most.
+    The matrix is diagonal but for two rows of data. So weights that no bound holds are a_j = (μ − d_j·s) / λ_j with
+    d_j = x_j − x̄, and s = Σ a_j d_j and μ follow from sums over them. Newton's method changes which these are until
+    all agree (a semismooth one: Hintermüller, Ito and Kunisch 2003), mostly at once. Where it goes in circles,
+    as with some extreme problems, OSQP solves.
     """
 
-    def _minimize(self, hessian: Array) -> Array:
-        count = len(hessian)
-        linear, total, upper, lower, kinds = _simplex(count, self._self_floor)
-        return np.asarray(daqp.solve(hessian, linear, total, upper, lower, kinds)[0])
-
-
-_DAQP_EQUALITY = 5
-"""DAQP's code of an equality constraint."""
-
-
-@lru_cache(maxsize=256)
-def _simplex(count: int, self_floor: float) -> tuple[Array, Array, Array, Array, NDArray[np.int32]]:
-    """Return linear cost, constraint matrix, bounds and kinds: 0 ≤ a_j ≤ 1, a_0 ≥ floor, and Σ a_j = 1."""
-    lower, kinds = np.zeros(count + 1), np.zeros(count + 1, dtype=np.int32)
-    lower[0], lower[count], kinds[count] = self_floor, 1.0, _DAQP_EQUALITY
-    return np.zeros(count), np.ones((1, count)), np.ones(count + 1), lower, kinds
+    def solve_by_variance(
+        self, estimates_m: Points, variances_m2: Sequence[float], mean_m: Sequence[float]
+    ) -> list[float]:
+        """Return the weights (n,) for estimates (n,), as `OptimizedWeights` does."""
+        (first_x, first_y), (mean_x, mean_y), floor = estimates_m[0], mean_m, self._self_floor
+        if len(estimates_m) == 1 or floor == 1:
+            return list(no_fusion_weights(len(estimates_m)).tolist())
+        scale = [1 / (self._ridge_m2 or max(variance, RIDGE_FLOOR_M2)) for variance in variances_m2]
+        # Distances from the first are small also where the mean is far: that enters once.
+        each = [(x - first_x, y - first_y, w) for (x, y), w in zip(estimates_m, scale, strict=True)]
+        x_m, y_m = first_x - mean_x, first_y - mean_y
+        weights, free = [1.0] * len(each), each
+        for _ in range(MAX_ROUNDS):
+            total = 1.0 if weights[0] > floor else 1 - floor
+            sum_w = sum_x = sum_y = xx = xy = yy = 0.0
+            for x, y, w in free:
+                w_x, w_y = w * x, w * y
+                sum_w += w
+                sum_x += w_x
+                sum_y += w_y
+                xx += w_x * x
+                xy += w_x * y
+                yy += w_y * y
+            by_x, by_y = sum_x / sum_w, sum_y / sum_w
+            a, b, d = inverted(1 + xx - sum_x * by_x, xy - sum_x * by_y, 1 + yy - sum_y * by_y)
+            r_x, r_y = x_m + total * by_x, y_m + total * by_y
+            s_x, s_y = a * r_x + b * r_y, b * r_x + d * r_y
+            level = total / sum_w + by_x * s_x + by_y * s_y
+            weights = [max((level - x * s_x - y * s_y) * w, 0.0) for x, y, w in each]
+            now = [one for one, weight in zip(each, weights, strict=True) if weight > 0]
+            if not weights[0] > floor:
+                weights[0], now = floor, [one for one in now if one is not each[0]]
+            if now == free:
+                total = sum(weights)
+                return [weight / total for weight in weights]
+            if not now:
+                break
+            free = now
+        return super().solve_by_variance(estimates_m, variances_m2, mean_m)
 
 
 def no_fusion_weights(count: int) -> Array:

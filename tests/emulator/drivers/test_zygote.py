@@ -100,7 +100,7 @@ def test_what_a_program_imports_when_first_asked_for_is_imported_before_agents_a
     with closing(Zygote(["agents.cooperative"])) as zygote:
         zygote.start()
         wait_until(zygote.is_ready)
-        assert "/daqp" in Path(f"/proc/{zygote.pid}/maps").read_text()
+        assert "/osqp" in Path(f"/proc/{zygote.pid}/maps").read_text()
 
 
 def test_an_agent_that_gets_no_credentials_ends_and_does_nothing(zygote: Zygote, tmp_path: Path) -> None:

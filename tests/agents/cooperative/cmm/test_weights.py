@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from agents.cooperative.cmm.weights import (
-    ActiveSetWeights,
+    ExactWeights,
     OptimizedWeights,
     constant_weights,
     largest_remainder,
@@ -27,7 +27,7 @@ def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return estimates, covariances, rng.normal(size=2) * 0.3
 
 
-SOLVERS = [OptimizedWeights, ActiveSetWeights]
+SOLVERS = [OptimizedWeights, ExactWeights]
 
 
 @pytest.mark.slow
