@@ -7,11 +7,11 @@ send is judged where it is used.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Generic, Protocol, TypeVar
 
 from agents.cooperative.frame import FrameError, short_name
-from agents.cooperative.vehicle_cache import add_vehicle
+from agents.cooperative.vehicle_cache import VehicleCache, add_vehicle
 from vnet import Packet
 
 STALE_PERIODS = 3
@@ -60,7 +60,7 @@ class Admission(Generic[F]):
     ids: node ids of the senders by short name.
     """
 
-    def __init__(self, name: str, period_ns: int, decode: Callable[[bytes], F], several: bool = False) -> None:
+    def __init__(self, name: str, period_ns: int, decode: VehicleCache[[bytes], F], several: bool = False) -> None:
         """Frames are decoded by `decode`; with `several`, a sender may send several with the same fix."""
         add_vehicle(self)
         self._decode = decode
@@ -82,10 +82,10 @@ class Admission(Generic[F]):
         if now_ns - self._forgotten_ns >= FORGET_PERIODS * self._period_ns:
             self._forget(now_ns)
         waiting, self._early = self._early, {}
-        frames = list(waiting.values())
+        frames, decode = list(waiting.values()), self._decode.cached
         for packet in packets:
             try:
-                frames.append((packet.sender, self._decode(packet.payload)))
+                frames.append((packet.sender, decode(packet.payload)))
             except FrameError as error:
                 self.rejected[str(error)] += 1
         admitted = []

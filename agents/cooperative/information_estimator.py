@@ -22,7 +22,7 @@ from agents.cooperative.admission import Admission
 from agents.cooperative.cmm.consensus import Share, tracked_mean
 from agents.cooperative.cmm.information import Five, Information, plain_moments
 from agents.cooperative.cmm.lane_exchange import LaneExchange
-from agents.cooperative.cmm.lane_memory import information_of, is_of_lane, kind_of_increment
+from agents.cooperative.cmm.lane_memory import all_information_of, is_of_lane, kind_of_increment
 from agents.cooperative.cmm.own_vehicle import OwnVehicle, own_vehicle
 from agents.cooperative.cmm.plausibility import (
     INCREMENT_FACTOR,
@@ -38,7 +38,7 @@ from agents.cooperative.cmm.plausibility import (
     scaled_by,
     scaled_down,
     spread_limit_m,
-    trace_of,
+    traces_of,
     unless_most_disagree,
 )
 from agents.cooperative.cmm.rbpf import Observation
@@ -231,7 +231,7 @@ class InformationEstimator:
             middle_m = sum([x for x, _ in means_m]) / count, sum([y for _, y in means_m]) / count
             self.mean_m = tracked_mean(middle_m, self.mean_m, self.limit_m / SPREAD_GATE)
         limited, increments = self._limited(heard, priors)
-        variances_m2 = [own[2] + own[4], *[frame.moments[2] + frame.moments[4] for frame in heard]]
+        variances_m2 = [xx + yy for _, _, xx, _, yy in (own, *[frame.moments for frame in heard])]
         weights = self._weigh(frames, means_m, variances_m2, leaning)
         passed = self._passed_on(heard, weights[1:])
         self.imported = len(heard) + len(passed)
@@ -243,7 +243,7 @@ class InformationEstimator:
         self, weights: Sequence[float], priors: Sequence[Five], now: Sequence[Five], before: Sequence[Five]
     ) -> None:
         """Replace what is known of c by pooled `priors`, and increments of this period and the one before."""
-        about_c = [increment for increment in (*now, *before) if not is_of_lane(increment)]
+        about_c = [increment for increment in (*now, *before) if increment[2] >= 0]
         if not (self._lanes and self._lanes.has_joined):
             if self.imported:
                 self.own.absorb(_pooled(weights, priors, about_c))
@@ -260,7 +260,7 @@ class InformationEstimator:
         self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, is_before: bool
     ) -> list[float]:
         """Return the share (n,) of each increment (n,) of `codes` that is used; `belief` is the one about c."""
-        now_s, said = self._now_ns / NS_PER_S, [information_of(each) for each in increments]
+        now_s, said = self._now_ns / NS_PER_S, all_information_of(increments)
         if not (self._lanes and self._lanes.has_joined):
             return self._origins.shares(codes, said, belief, now_s)
         used = [0.0 if any(each) else 1.0 for each in said]
@@ -375,13 +375,13 @@ class InformationEstimator:
         if frames and min(self._used_shares) < 1:
             each = zip(increments[1:], self._used_shares, strict=True)
             increments[1:] = [scaled_by(increment, share) for increment, share in each]
-        own, largest = trace_of(self._increment), PRIOR_FACTOR * trace_of(self._prior)
-        traces = sorted(map(trace_of, increments))
+        own, largest = traces_of([self._increment, self._prior])
+        traces = sorted(traces_of(increments))
         usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
         self._largest_increment = max(usual, self.own.largest_increment)
         if traces[-1] > self._largest_increment:
             increments = scaled_down(increments, self._largest_increment)
-        return scaled_down(priors, largest), increments
+        return scaled_down(priors, PRIOR_FACTOR * largest), increments
 
     def _weigh(
         self,
@@ -415,9 +415,8 @@ class InformationEstimator:
         shares, forged = self._passing.shares(listed, weights, self._options.defence)
         self._reject("forged", forged)
         origins, increments = [], []
-        for record, share in shares.items():
+        for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):
             if share < 1:
-                code, increment = passed_increment(record)
                 if self._lanes and self._lanes.has_joined and not is_of_lane(increment):
                     continue  # c has moved since, which precise receivers see
                 part = 1.0 if is_of_lane(increment) else PASSED_SHARE

@@ -13,6 +13,7 @@ At each fix a vehicle
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import deque
 from typing import Any
 
@@ -132,7 +133,7 @@ def _report(node: Node, estimator: Estimator | InformationEstimator, fix: Fix, c
         values["cloud_m"] = estimator.sample(CLOUD_REPORT_PARTICLES)
         values |= {f"weight.{other}": weight for other, weight in estimator.weights.items()}
         values |= {f"rejected.{reason}": count for reason, count in estimator.rejected.items()}
-    if np.isfinite(position_m).all():
+    if math.isfinite(sum(position_m.tolist())):
         node.report(position_m, covariance_m2, **values)
     else:
         node.report(**values)
@@ -163,5 +164,5 @@ class GnssClock:
 
     async def sleep_until(self, time_ns: int) -> None:
         """Sleep until this GNSS time."""
-        if time_ns > self.now_ns:
-            await asyncio.sleep((time_ns - self.now_ns) / NS_PER_S)
+        if (left_ns := time_ns - self.now_ns) > 0:
+            await asyncio.sleep(left_ns / NS_PER_S)

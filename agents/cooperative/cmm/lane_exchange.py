@@ -126,7 +126,7 @@ class LaneExchange:
         if self.has_joined:
             return
         self._waited += self._waits
-        heard = [round(increment[4]) for increment in increments if kind_of_increment(increment)]
+        heard = [round(increment[4]) for increment in increments if increment[2] < 0]
         ages = sorted(age for age in heard if age >= 0)
         if ages:
             self._begin(ages[len(ages) // 2])

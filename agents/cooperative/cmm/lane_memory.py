@@ -110,6 +110,11 @@ def information_of(increment: Five) -> Five:
     return a_x * a_x, a_x * a_y, a_y * a_y, a_x * w, a_y * w
 
 
+def all_information_of(increments: Iterable[Five]) -> list[Five]:
+    """Return Λ and η of each increment."""
+    return [increment if increment[2] >= 0 else information_of(increment) for increment in increments]
+
+
 class LaneFilter:
     """The filter of the offset in one lane with gains that depend on age alone, and of what it makes of c.
 

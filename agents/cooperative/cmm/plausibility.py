@@ -7,7 +7,7 @@ period's lie may be small; so the deviations of each origin are summed up as wel
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 from agents.cooperative.cmm.information import Five, Information, Three, plain_moments
@@ -60,11 +60,10 @@ _NO_SUMS: Ten = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 def scaled_down(information: Sequence[Five], largest_trace: float) -> list[Five]:
     """Return pieces of information with traces of at most `largest_trace`; means stay."""
-    scaled = []
-    for numbers in information:
-        trace = trace_of(numbers)
-        scaled.append(numbers if trace <= largest_trace else scaled_by(numbers, largest_trace / trace))
-    return scaled
+    return [
+        numbers if trace <= largest_trace else scaled_by(numbers, largest_trace / trace)
+        for numbers, trace in zip(information, traces_of(information), strict=True)
+    ]
 
 
 def scaled_by(information: Five, factor: float) -> Five:
@@ -76,10 +75,9 @@ def scaled_by(information: Five, factor: float) -> Five:
     return factor * a, factor * b, factor * d, factor * x, factor * y
 
 
-def trace_of(information: Five) -> float:
-    """Return the trace of the matrix."""
-    a, b, d, *_ = information
-    return a + d if d >= 0 else a * a + b * b
+def traces_of(information: Iterable[Five]) -> list[float]:
+    """Return the traces (n,) of the matrices."""
+    return [a + d if d >= 0 else a * a + b * b for a, b, d, _, _ in information]
 
 
 def moved(information: Five, x_m: float, y_m: float) -> Five:
