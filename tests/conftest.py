@@ -24,6 +24,7 @@ settings.load_profile("same")
 settings.register_profile("first", settings.get_profile("same"), phases=[Phase.explicit, Phase.generate])
 
 
+gc.disable()  # while tests are collected: nothing of what is imported is garbage
 SLOW_FILE = re.compile(r"^pytestmark = \[?\s*pytest\.mark\.slow\b", re.MULTILINE)
 
 
@@ -36,6 +37,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_collection_finish() -> None:
     """Keep garbage collection from looking through all tests and modules again at the end of each simulation."""
+    gc.enable()
     gc.collect()
     gc.freeze()
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -63,29 +64,31 @@ def module_name(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
+IMPORT = re.compile(
+    r"^[ \t]*(from [\w.]+ import (?:\([^)]*\)|[^(\n]+)|import [\w., ]+)"
+    r"|\b((?:import_module|__import__)\([^)\n]+\))",
+    re.MULTILINE,
+)
+"""A statement at the beginning of a line, or a call: one tenth of the time that parsing all of the code takes."""
+
+
 def imported_names(code: str) -> Iterator[str]:
     """Yield the absolute names that some code imports, wherever in it; `import_module("x")` counts as well."""
-    tree = ast.parse(code)
-    calls = "import_module" in code or "__import__" in code
-    for node in ast.walk(tree) if calls else statements(tree):
-        match node:
-            case ast.Import(names=names):
-                yield from (alias.name for alias in names)
-            case ast.ImportFrom(module=str(module), names=names, level=0):
-                yield from (f"{module}.{alias.name}" for alias in names)
-            case ast.Call(
-                func=ast.Name(id="import_module" | "__import__") | ast.Attribute(attr="import_module"),
-                args=[ast.Constant(value=str(module)), *_],
-            ):
-                yield module
+    for statement, call in IMPORT.findall(code):
+        with suppress(SyntaxError):  # prose that begins like one
+            for node in ast.walk(ast.parse(statement or call)):
+                yield from _imported_by(node)
 
 
-def statements(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the statements within a node, without looking through their expressions."""
-    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
-        for child in getattr(node, name, []):
-            yield child
-            yield from statements(child)
+def _imported_by(node: ast.AST) -> list[str]:
+    match node:
+        case ast.Import(names=names):
+            return [alias.name for alias in names]
+        case ast.ImportFrom(module=str(module), names=names, level=0):
+            return [f"{module}.{alias.name}" for alias in names]
+        case ast.Call(args=[ast.Constant(value=str(module)), *_]):
+            return [module]
+    return []
 
 
 @cache

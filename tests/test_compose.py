@@ -44,6 +44,7 @@ def test_services_hang_together(name: str) -> None:
     assert named <= set(COMPOSE["volumes"])
 
 
+@pytest.mark.slow
 def test_it_starts_with_one_command() -> None:
     """The emulator makes the users: whoever needs them waits until they are there and the router listens."""
     assert set(SERVICES) == {"emulator", *CLIENTS}

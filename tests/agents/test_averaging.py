@@ -37,6 +37,7 @@ def test_a_frame_with_thirty_peers_fits() -> None:
     assert len(encode(Share(2**31, (1 / 3, 1 / 3, 1 / 3), peers, peers))) < 1400
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(st.binary(max_size=100))
 def test_arbitrary_bytes_are_refused_or_sane(payload: bytes) -> None:

@@ -21,6 +21,8 @@ from tests.docs.once import key_of, unless_passed
 from tests.docs.pages import Page, check_workflow, shows
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
@@ -49,7 +51,6 @@ def used_by(path: Path) -> list[Path]:
     return [path, *excerpts, *(file for used in (*USED, "tests/docs/*.py") for file in ROOT.glob(used))]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_page_is_what_it_says(path: Path, page: Page, pytestconfig: pytest.Config) -> None:
     name = str(path.relative_to(ROOT))
@@ -93,7 +94,6 @@ def test_what_has_passed_is_skipped_but_not_in_ci_nor_what_has_failed(
     assert ran == [failure, None, None]
 
 
-@pytest.mark.slow
 def test_there_are_pages_and_blocks() -> None:
     found = [block for path in PAGES for block in blocks(path.read_text(encoding="utf-8"), path.name)]
     assert len(PAGES) > 20
@@ -138,7 +138,6 @@ BROKEN = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_block_that_is_broken_fails(name: str, page: Page) -> None:
     text, complaint = BROKEN[name]

@@ -54,6 +54,7 @@ def test_a_warning_is_forwarded_to_vehicles_out_of_range(tmp_path: Path) -> None
     assert all(report.values["warned"] == 1 and report.values["malformed"] == 0 for report in reports.values())
 
 
+@pytest.mark.slow
 def test_a_vehicle_without_links_is_not_warned(tmp_path: Path) -> None:
     reports = last_reports(tmp_path / "run", [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
     assert [reports[node].values["warned"] for node in sorted(reports)] == [1, 1, 0]
@@ -66,6 +67,7 @@ def test_the_first_of_a_hundred_vehicles_warns_by_default(tmp_path: Path) -> Non
     assert [node for node in sorted(reports) if reports[node].values.get("hops") == 0] == ["v001"]
 
 
+@pytest.mark.slow
 def test_a_corrupted_warning_is_counted_and_dropped(tmp_path: Path) -> None:
     corrupt = {"kind": "corrupt", "at_s": 0.0, "duration_s": 1.0, "probability": 1.0, "flips": 1000}
     reports = last_reports(tmp_path / "run", [[0, 1], [1, 0]], [corrupt])
@@ -81,6 +83,7 @@ def test_what_only_looks_like_a_warning_is_none(altered: dict[str, Any]) -> None
     assert read_warning(msgpack.packb({**WARNING, **altered})) is None
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=40))
 def test_no_payload_does_harm(payload: bytes) -> None:
     assert read_warning(payload) is None

@@ -8,6 +8,8 @@ import pytest
 from docs.examples.intersection.crossing import PAST_M, Book, Request
 from docs.examples.intersection.figure import CRUISE_M_S, cross, measured
 
+pytestmark = pytest.mark.slow
+
 
 def test_one_road_at_a_time_has_the_crossing() -> None:
     book = Book(patience_s=8.0)
@@ -73,7 +75,6 @@ def test_who_never_comes_past_is_late_until_the_end() -> None:
     assert crossing.delay_s == pytest.approx(20 - (140 + 140 + 150 + 3 * 50) / CRUISE_M_S / 3)
 
 
-@pytest.mark.slow
 def test_vehicles_that_would_meet_take_turns_despite_packet_loss() -> None:
     places = [1360.0, 1350.0]
     small = {"network.vehicles": 2, "run.duration_s": 35.0, "radio.loss": 0.8}

@@ -27,6 +27,7 @@ def test_there_is_no_page_that_nothing_makes() -> None:
     assert {path.name for path in REFERENCE.glob("*.md")} == set(PAGES)
 
 
+@pytest.mark.slow
 def test_pages_do_not_depend_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = (REFERENCE / "commands.md").read_text(encoding="utf-8")
     for name, value in {"COLUMNS": "40", "TERMINAL_WIDTH": "40", "NO_COLOR": "1", "TERM": "dumb"}.items():
@@ -55,6 +56,7 @@ def test_a_column_without_a_text_is_refused() -> None:
         files.columns({**STATES.columns, "cloud_m": Column(STATES.schema.types[0], "")}, None)
 
 
+@pytest.mark.slow
 def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "free_space"}, "mac": {}}
     scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "radio": radio})

@@ -105,6 +105,7 @@ def test_simulate_works_inside_a_running_event_loop(tmp_path: Path) -> None:
     assert asyncio.run(main()).verdict == "valid"
 
 
+@pytest.mark.slow
 def test_a_function_that_no_command_can_import_runs_here_and_replay_is_not_warranted(tmp_path: Path) -> None:
     heard: list[str] = []
 

@@ -59,6 +59,7 @@ def test_where_all_hear_all_nothing_is_counted_twice_and_nothing_is_missing() ->
     np.testing.assert_allclose(pooled.covariance, flooded.covariance, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_each_hop_tells_more() -> None:
     found = world(line(6))
     claimed = [

@@ -10,6 +10,8 @@ from scipy import stats
 
 from studies.tables import holm, interval_95, paired_tests, shown_interval
 
+pytestmark = pytest.mark.slow
+
 
 def test_an_interval_is_students() -> None:
     values = [0.2, 0.25, 0.22, 0.31]

@@ -81,6 +81,7 @@ def test_a_sweep_leaves_a_table_and_a_page_and_goes_on(tmp_path: Path, in_this_p
     assert len(in_this_process) == 12 == len(again), "what it shares with the first is not run again"
 
 
+@pytest.mark.slow
 def test_a_run_of_a_program_that_crashes_is_a_row(tmp_path: Path, in_this_process: list[Cell]) -> None:
     del in_this_process
     program = "tests.emulator.cells.test_sweep:crash"

@@ -110,6 +110,7 @@ def test_a_campaign_has_its_column(tmp_path: Path) -> None:
     assert matrix["kill"]["frame_size"] == {Verdict.VALID: 1}
 
 
+@pytest.mark.slow
 def test_without_positions_each_check_is_treated_as_its_entry_says(tmp_path: Path) -> None:
     recorded = RecordedRun.open(simulated(tmp_path / "run", duration_s=0.05))
     assert not len(recorded.states)

@@ -8,12 +8,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from scipy.stats import binom
 
 from emulator.checks.judge import CheckResult, NotExercised, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
+from emulator.records.distributions import binomial_interval
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
@@ -103,6 +103,7 @@ def test_without_events_nothing_is_known_of_the_course_of_a_run(recorded: Record
     assert isinstance(told, CheckResult) and "refused: wrong number" in told.text and "hangs" not in told.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", ["states", "metrics"])
 def test_a_run_that_kept_half_its_periods_is_unknown(recorded: RecordedRun, table: str) -> None:
     rows = getattr(recorded, table)
@@ -110,6 +111,7 @@ def test_a_run_that_kept_half_its_periods_is_unknown(recorded: RecordedRun, tabl
     assert verdict(half, "progress") is Verdict.UNKNOWN
 
 
+@pytest.mark.slow
 def test_a_run_shorter_than_a_period_is_unknown_and_not_a_crash(tmp_path: Path) -> None:
     judgement = judge(run(tmp_path / "run", run={"duration_s": 0.05}))
     unknown = {check.name for check in judgement.checks if check.verdict is Verdict.UNKNOWN}
@@ -117,6 +119,7 @@ def test_a_run_shorter_than_a_period_is_unknown_and_not_a_crash(tmp_path: Path) 
     assert check_run(tmp_path / "run").exit_status == 3
 
 
+@pytest.mark.slow
 def test_one_vehicle_alone_has_no_radio_to_judge(tmp_path: Path) -> None:
     judgement = judge(run(tmp_path / "run", vehicles=1))
     assert judgement.verdict is Verdict.VALID
@@ -152,6 +155,7 @@ def test_a_trace_of_another_run_is_refused_in_one_line(recorded: RecordedRun) ->
         judge(replace(recorded, trace=with_names(recorded.trace, "receiver", 0, "ghost")))
 
 
+@pytest.mark.slow
 def test_deliveries_that_were_never_timed_leave_real_time_unknown(recorded: RecordedRun) -> None:
     settings = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
     scenario = recorded.scenario.model_copy(update={"run": settings})
@@ -275,7 +279,7 @@ def test_a_delivery_to_someone_out_of_range_breaks_range_and_conservation(line: 
 
 def test_the_loss_rate_is_valid_up_to_the_border_of_its_band_and_invalid_beyond(line: RecordedRun) -> None:
     drawn = int(line.outcome_is("lost", "delivered").sum())
-    low, high = (int(edge) for edge in binom.interval(0.999, drawn, 0.2))
+    low, high = binomial_interval(0.999, drawn, 0.2)
     assert damaged(line, with_lost(line, low)) == damaged(line, with_lost(line, high)) == {}
     for lost in (low - 1, high + 1):
         found = damaged(line, with_lost(line, lost))
@@ -374,6 +378,7 @@ def test_numbers_that_are_none_are_counted(tmp_path: Path) -> None:
     assert found.text == "10 reports with NaN or infinity: x of v2"
 
 
+@pytest.mark.slow
 def test_programs_that_report_nothing_have_nothing_to_be_finite(tmp_path: Path) -> None:
     recorded = four(tmp_path, f"{__name__}:dies_early")
     assert result(recorded, "finite") == NotExercised("finite", "the program reports nothing")

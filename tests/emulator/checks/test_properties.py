@@ -50,6 +50,7 @@ def braked(moment: Moment) -> bool:
     return moment.event == "braked"
 
 
+@pytest.mark.slow
 def test_always_and_never_ask_at_each_period_of_each_vehicle(run: Run) -> None:
     assert always(run, "counts", lambda m: m["count"] >= 0).verdict == "valid"
     assert never(run, "far", lambda m: np.abs(m["position_m"]).max() > 1e7).text == "false at 80 moments"

@@ -9,6 +9,8 @@ from emulator.cli import options as command_options
 from emulator.cli.commands import app
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 BEACON = str(ROOT / "scenarios" / "beacon.toml")
 REFUSED = [
     (["--debug", "v3"], "--debug v3: no such vehicle (did you mean v03?)"),
@@ -19,7 +21,6 @@ REFUSED = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "simulate"])
 @pytest.mark.parametrize(("options", "message"), REFUSED)
 def test_a_debugger_that_cannot_be_is_refused(

@@ -26,6 +26,7 @@ def vnet_map(*arguments: object) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.slow
 def test_show_says_how_long_roads_are_and_what_is_odd(town: Path) -> None:
     status, text = vnet_map("show", town, "--origin", "42.28,-83.74")
     assert status == 0
@@ -50,6 +51,7 @@ def test_show_a_part(town: Path) -> None:
     assert status == 2 and "no road within 0.1 km around --at 9000,0" in text
 
 
+@pytest.mark.slow
 def test_convert_writes_what_show_reads(town: Path, tmp_path: Path) -> None:
     assert vnet_map("convert", town, tmp_path / "town.npz") == (0, f"wrote {tmp_path / 'town.npz'}\n")
     assert read_roads(tmp_path / "town.npz").length_m.sum() == pytest.approx(550, abs=0.01)

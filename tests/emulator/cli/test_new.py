@@ -10,6 +10,8 @@ from emulator.cli.new import examples
 from emulator.scenario.loading import load_scenario
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 runner = CliRunner()
 
 
@@ -47,7 +49,6 @@ def test_a_name_that_would_hide_a_module_is_refused(tmp_path: Path, name: str) -
     assert not (tmp_path / name).exists()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("example", examples())
 def test_an_example_is_copied_so_that_it_stands_alone(example: str, tmp_path: Path) -> None:
     assert new(tmp_path / "mine", "--example", example)[0] == 0
@@ -60,14 +61,12 @@ def test_an_example_is_copied_so_that_it_stands_alone(example: str, tmp_path: Pa
         assert load_scenario(scenario).program.folders == (tmp_path / "mine",)
 
 
-@pytest.mark.slow
 def test_an_example_that_is_none_is_refused_with_those_there_are(tmp_path: Path) -> None:
     status, output = new(tmp_path / "mine", "--example", "platon")
     assert status == 2 and "no example (did you mean platoon?); there are brake_warning, cbf," in output
     assert new()[0] == 2 and not (tmp_path / "mine").exists()
 
 
-@pytest.mark.slow
 def test_all_pages_are_listed_and_printed_as_they_are() -> None:
     listed = [line.split()[0] for line in runner.invoke(app, ["docs"]).output.splitlines()]
     pages = [path for path in (ROOT / "docs").rglob("*.md") if "examples" not in path.parts]

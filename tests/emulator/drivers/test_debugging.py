@@ -130,12 +130,14 @@ def test_a_step_goes_on_in_who_awaits(debug: Debug) -> None:
     assert shown[-1] == f"{line_of('counted')})sends()", "the stack has no frame of what runs the program"
 
 
+@pytest.mark.slow
 def test_a_step_stops_nowhere_in_between(debug: Debug) -> None:
     _, said, _ = debug("sends", "v02", *["s"] * 30, "c")
     places = {line.partition("(")[0] for line in said if line.startswith("> ")}
     assert places == {f"> {THIS_FILE}"}
 
 
+@pytest.mark.slow
 def test_breakpoints_of_others_pass(debug: Debug) -> None:
     emulation, said, _ = debug("asks", "v03", *["c", "p node.id"] * 20, "c")
     assert "(Pdb) 'v03'" in said
@@ -143,6 +145,7 @@ def test_breakpoints_of_others_pass(debug: Debug) -> None:
     assert [event.kind for event in emulation.folder.events if event.node] == []
 
 
+@pytest.mark.slow
 def test_a_line_is_a_breakpoint_for_one_vehicle(debug: Debug) -> None:
     _, said, _ = debug(
         "sends",
@@ -157,6 +160,7 @@ def test_a_line_is_a_breakpoint_for_one_vehicle(debug: Debug) -> None:
     assert [line for line in said if "'v0" in line] == ["(Pdb) ('v02', 0)", "(Pdb) ('v02', 1)"]
 
 
+@pytest.mark.slow
 def test_clear_asks_where_the_debugger_does(debug: Debug) -> None:
     _, said, _ = debug("sends", f"v02:{THIS_FILE}:{line_of('counted')}", "clear", "y", "c")
     assert stops(said) == ["count += 1  # counted"]
@@ -171,6 +175,7 @@ def test_interact_asks_where_the_debugger_does(debug: Debug) -> None:
     assert (sys.stdin, sys.stdout, sys.stderr) == streams
 
 
+@pytest.mark.slow
 def test_a_crash_can_be_looked_at(debug: Debug) -> None:
     emulation, said, _ = debug("crashes", "v02", "c", "p node.id", "c")
     assert "v02 has crashed: ValueError: boom of v02" in "\n".join(said)
@@ -187,11 +192,13 @@ def test_quitting_ends_the_run(debug: Debug, commands: list[str]) -> None:
     assert len(stops(said)) == 2
 
 
+@pytest.mark.slow
 def test_it_lets_go_when_the_run_ends(debug: Debug) -> None:
     _, said, _ = debug("clears_up", "v02", "c")
     assert len(stops(said)) == 1, "not in a finally block after the end"
 
 
+@pytest.mark.slow
 def test_a_restarted_program_stops_again(debug: Debug) -> None:
     fault = {"kind": "restart", "at_s": 1.0, "duration_s": 0.2, "nodes": ["v02"]}
     _, said, _ = debug("sends", "v02", "c", "p node.incarnation", "c", faults=[fault])
@@ -199,6 +206,7 @@ def test_a_restarted_program_stops_again(debug: Debug) -> None:
     assert "(Pdb) 1" in said
 
 
+@pytest.mark.slow
 def test_it_cannot_be_started_again(debug: Debug) -> None:
     _, said, interrupted = debug("sends", "v02", "run", "c")
     assert "(Pdb) *** the run cannot be started again from here; q ends it" in said

@@ -67,6 +67,7 @@ async def keeps_nothing(node: Node) -> None:
         node.report(fix.position_m, fix.covariance_m2)
 
 
+@pytest.mark.slow
 def test_who_asks_for_no_disk_has_none() -> None:
     emulation = run_together(scenario_of([], f"{__name__}:keeps_nothing", vehicles=2))
     assert not emulation.folder.disks.exists()
@@ -79,6 +80,7 @@ async def fills_its_disk(node: Node) -> None:
     (node.folder / "small").write_text("kept")
 
 
+@pytest.mark.slow
 def test_what_is_too_much_is_told_in_an_event() -> None:
     emulation = run_together(scenario_of([], f"{__name__}:fills_its_disk", vehicles=2, run={"files_max_mb": 0.002}))
     concluded(emulation)

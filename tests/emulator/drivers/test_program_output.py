@@ -67,6 +67,7 @@ async def prints_a_beginning(node: Node) -> None:
     await asyncio.sleep(99)
 
 
+@pytest.mark.slow
 def test_a_line_without_an_end_is_written_when_the_run_ends() -> None:
     emulation = run_together(scenario_of([], f"{__name__}:prints_a_beginning", vehicles=2))
     assert log_of(emulation, "v01") == "begun\n"

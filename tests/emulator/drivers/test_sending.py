@@ -11,6 +11,8 @@ from emulator.drivers.emulation import Emulation
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 
+pytestmark = pytest.mark.slow
+
 RADIO: dict[str, Any] = {
     "path_loss": {"kind": "log_distance"},
     "fading": {},
@@ -104,7 +106,6 @@ def told(emulation: Emulation) -> list[tuple[str, int, str]]:
     return sorted((event.node or "", event.time_ns, str(event.details)) for event in events)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("entry", "latency_ms"), [(SENDS, 2.0), (FORGETS, 0.05)], ids=["awaits", "forgets"])
 def test_live_processes_are_told_what_their_simulation_is(entry: str, latency_ms: float) -> None:
     plan = scenario(entry, latency_ms=latency_ms, loss=0.3)
@@ -117,7 +118,6 @@ def test_live_processes_are_told_what_their_simulation_is(entry: str, latency_ms
         assert other.engine.trace.sha256() == together.engine.trace.sha256()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("nodes_per_process", [1, 2])
 def test_a_live_process_that_gives_up_a_send_goes_on(nodes_per_process: int) -> None:
     """Its result is an instant of the process all the same, for which it has to be granted."""
@@ -128,7 +128,6 @@ def test_a_live_process_that_gives_up_a_send_goes_on(nodes_per_process: int) -> 
     assert told(run_apart(plan)) == expected
 
 
-@pytest.mark.slow
 def test_a_result_is_that_of_the_trace() -> None:
     emulation = run_together(scenario(loss=0.3))
     rows = [row for row in emulation.engine.trace.to_table().to_pylist() if row["attempt"]]
@@ -162,7 +161,6 @@ def test_a_send_that_outlasts_the_run_is_dropped_without_a_word(caplog: pytest.L
     assert not [event for event in emulation.folder.events if event.kind == "unhandled"]
 
 
-@pytest.mark.slow
 def test_a_result_for_a_paused_vehicle_waits_and_the_run_goes_on() -> None:
     """With one sender only: when its result comes, nobody else has anything to do."""
     fault = {"kind": "pause", "nodes": {"ids": ["v01"]}, "at_s": 0.01, "duration_s": 0.1}

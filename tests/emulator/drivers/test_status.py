@@ -76,6 +76,7 @@ def test_the_speed_is_that_of_late(tmp_path: Path) -> None:
     assert course.snapshot().idle_s == pytest.approx(7.0)
 
 
+@pytest.mark.slow
 def test_frames_and_their_rates(shots: list[Snapshot]) -> None:
     for shot, earlier in zip(shots[11:], shots[1:], strict=False):
         before = {name: earlier.frames_by_outcome.get(name, 0) for name in shot.frames_per_s}

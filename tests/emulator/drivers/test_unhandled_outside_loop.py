@@ -18,6 +18,8 @@ from tests.emulator.drivers.test_unhandled import RUNS, exceptions, judged, plac
 from tests.support.multi_loop_driver import run_together, scenario_of
 from vnet.node import Node
 
+pytestmark = pytest.mark.slow
+
 Program = Callable[[Node], Awaitable[None]]
 
 
@@ -129,7 +131,6 @@ async def fails_its_own_way(node: Node) -> None:
     await [*TOLD][int(node.id[1:]) - 1](node)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("run", RUNS)
 def test_what_the_loop_never_sees_is_told_with_its_instant(run: str) -> None:
     emulation = run_all(entry(fails_its_own_way), len(TOLD), run)
@@ -156,7 +157,6 @@ async def submits_and_asks(node: Node) -> None:
     await sends(node)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("run", RUNS)
 def test_a_job_whose_end_somebody_asks_for_is_handled(run: str) -> None:
     assert exceptions(run_all(entry(submits_and_asks), 2, run)) == []
@@ -174,7 +174,6 @@ async def handles_it_by_a_hook(node: Node) -> None:
     await sends(node)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("program", [leaves_a_thread, handles_it_by_a_hook], ids=lambda program: program.__name__)
 def test_what_ends_a_thread_quietly_is_none(program: Program) -> None:
@@ -236,7 +235,6 @@ async def collects_what_fails(node: Node) -> None:
     await sends(node)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_what_the_collector_finds_is_left_to_python() -> None:
     emulation = run_together(scenario_of([], entry(collects_what_fails), vehicles=2))
@@ -276,7 +274,6 @@ async def fails_while_a_thread_collects(node: Node) -> None:
     await sends(node)
 
 
-@pytest.mark.slow
 def test_what_fails_while_another_thread_collects_is_told_at_once() -> None:
     """It counts although the vehicle is killed later; what a collection has found by then does not."""
     kill = {"kind": "kill", "at_s": 1.0, "duration_s": 9.0, "nodes": {"ids": ["v01"]}}
@@ -303,7 +300,6 @@ async def has_groups_in_tasks(node: Node) -> None:
     await asyncio.gather(*tasks)
 
 
-@pytest.mark.slow
 def test_what_is_left_of_a_killed_vehicle_is_discarded_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     ignored: list[str] = []
     monkeypatch.setattr(sys, "unraisablehook", lambda args: ignored.append(str(args.exc_value)))

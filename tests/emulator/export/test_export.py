@@ -25,6 +25,8 @@ from tests.emulator.checks.test_judge import run_scenario
 from tests.support.exchange_programs import COPYING, exchange_run
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
+pytestmark = pytest.mark.slow
+
 VEHICLES = {
     "v1": [(0, 5, along(0, 10))],
     "v2": [(0, 5, still(50))],
@@ -116,7 +118,6 @@ def capture(recorded: OpenedRun) -> bytes:
     return file.getvalue()
 
 
-@pytest.mark.slow
 def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: OpenedRun) -> None:
     (first, section), *rest = blocks(capture)
     assert first == 0x0A0D0D0A and struct.unpack_from("<IHH", section) == (0x1A2B3C4D, 1, 0)
@@ -126,7 +127,6 @@ def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: O
     assert {options(body[8:])[9] for body in interfaces} == {b"\x09"}, "nanoseconds"
 
 
-@pytest.mark.slow
 def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
     capture: bytes, recorded: OpenedRun
 ) -> None:
@@ -146,7 +146,6 @@ def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
     assert outbound == sorted(emission[:2] for emission in sent)
 
 
-@pytest.mark.slow
 def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, recorded: OpenedRun) -> None:
     for packet in packets(capture):
         data = packet["bytes"]
@@ -165,7 +164,6 @@ def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, 
         assert struct.unpack_from("<H", mac, 22)[0] >> 4 == int(seq.split()[0]) % 4096
 
 
-@pytest.mark.slow
 def test_a_frame_to_one_vehicle_has_its_address_retries_and_acknowledgements(tmp_path: Path) -> None:
     recorded = exchange_run(tmp_path, COPYING)
     file = io.BytesIO()
@@ -194,7 +192,6 @@ async def changes_its_rate(node: Any) -> None:
         await node.radio.broadcast(b"x", rate_mbps=27 if fix.time_ns % 200_000_000 else None)
 
 
-@pytest.mark.slow
 def test_a_packet_has_the_bit_rate_of_its_own_frame(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "free_space", "floor_dbm": -150.0}, "bitrate_mbps": 3.0}
     scenario = {"run": {"duration_s": 1.0, "settle_s": 0.1}, "network": {"vehicles": 2, "layout": "dense"}}
@@ -210,7 +207,6 @@ def test_a_packet_has_the_bit_rate_of_its_own_frame(tmp_path: Path) -> None:
         assert packet["bytes"][9] / 2 == rates[seq]
 
 
-@pytest.mark.slow
 def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRun) -> None:
     for packet in packets(capture):
         fields = packet["comment"].split("; ")
@@ -230,7 +226,6 @@ def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRu
 # MCAP.
 
 
-@pytest.mark.slow
 def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> None:
     file = io.BytesIO()
     count = write_mcap(recorded, file)
@@ -261,7 +256,6 @@ def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> 
     assert attachment.name == "scenario.toml" and b"[network]" in attachment.data
 
 
-@pytest.mark.slow
 def test_mcap_shows_who_is_there_where_it_is(recorded: OpenedRun) -> None:
     file = io.BytesIO()
     write_mcap(recorded, file)
@@ -280,7 +274,6 @@ TOPICS = ("/tf", "/vehicles/fix")
 # CSV.
 
 
-@pytest.mark.slow
 def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: OpenedRun, tmp_path: Path) -> None:
     tables = {}
     for name in write_csv(recorded, tmp_path):
@@ -303,7 +296,6 @@ def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: OpenedRun, 
 RUNNER = CliRunner()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "begins"), [("x.pcapng", b"\x0a\x0d\x0d\x0a"), ("X.MCAP", b"\x89MCAP"), ("x", None)]
 )
@@ -315,7 +307,6 @@ def test_without_to_the_file_s_name_says_the_format(
     assert out.is_dir() if begins is None else out.read_bytes().startswith(begins)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -329,7 +320,6 @@ def test_a_name_of_another_format_is_refused(folder: Path, options: list[str], m
     assert (done.exit_code, done.stderr) == (2, f"vnet: {message}\n")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("to", ["pcapng", "mcap", "csv", "links"])
 def test_an_export_goes_where_it_is_told_and_never_over_something_else(
     folder: Path, tmp_path: Path, to: str
@@ -344,7 +334,6 @@ def test_an_export_goes_where_it_is_told_and_never_over_something_else(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"], "nothing half-written is left"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("every", "every_s"), [([], 1.0), (["--every", "0.5"], 0.5), (["--every", "0"], 0.0)])
 def test_the_links_of_a_run_are_what_the_file_says(
     folder: Path, recorded: OpenedRun, tmp_path: Path, every: list[str], every_s: float
@@ -363,7 +352,6 @@ def test_the_links_of_a_run_are_what_the_file_says(
     assert expected.loss[before][-1] > 0
 
 
-@pytest.mark.slow
 def test_links_of_frames_to_one_vehicle_are_those_of_attempts_and_acknowledgements(tmp_path: Path) -> None:
     recorded = exchange_run(tmp_path, COPYING)
     table = measured_links(recorded, 10**9)
@@ -384,7 +372,6 @@ def test_what_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
         assert done.exit_code == 2 and done.stderr.count("\n") == 1 and "not a run's folder" in done.stderr
 
 
-@pytest.mark.slow
 def test_radio_prints_its_figures_and_keeps_its_tables(folder: Path, tmp_path: Path) -> None:
     done = RUNNER.invoke(app, ["radio", str(folder), "--bin", "25", "--out", str(tmp_path / "tables")])
     assert done.exit_code == 0, done.stderr

@@ -56,6 +56,7 @@ def test_the_place_of_a_denm_is_read_from_its_bits(
     assert (again.station, again.cause) == (station, EMERGENCY_BRAKE)
 
 
+@pytest.mark.slow
 @given(st.sampled_from([b"", b"\2\1", b"\2\2", b"\1\2"]), st.binary(max_size=80) | st.just(b"\xff" * 40))
 def test_no_bytes_are_too_strange(begin: bytes, rest: bytes) -> None:
     read = station_of(begin + rest)

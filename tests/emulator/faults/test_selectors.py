@@ -50,6 +50,7 @@ def test_a_vehicle_is_known_by_the_id_in_its_file_too() -> None:
         nodes.numbers(["flow#2"])
 
 
+@pytest.mark.slow
 @given(counts, seeds, st.floats(0, 1, exclude_min=True))
 def test_a_fraction_is_that_share_and_at_least_one(count: int, seed: int, fraction: float) -> None:
     number = len(chosen(some_nodes(count), seed, fraction=fraction))
@@ -57,11 +58,13 @@ def test_a_fraction_is_that_share_and_at_least_one(count: int, seed: int, fracti
     assert number == 1 or abs(number - fraction * count) <= 0.5
 
 
+@pytest.mark.slow
 @given(counts, seeds, st.integers(1, 30))
 def test_random_is_so_many_or_all(count: int, seed: int, number: int) -> None:
     assert len(chosen(some_nodes(count), seed, count=number)) == min(number, count)
 
 
+@pytest.mark.slow
 def test_everybody_is_drawn_as_often_as_the_others() -> None:
     nodes = some_nodes(8)
     drawn = np.bincount([n for seed in range(2000) for n in chosen(nodes, seed, count=2)], minlength=8)
@@ -69,6 +72,7 @@ def test_everybody_is_drawn_as_often_as_the_others() -> None:
     assert np.all(np.abs(drawn - 500) < 5 * math.sqrt(500)), drawn
 
 
+@pytest.mark.slow
 @given(seeds, st.floats(-100, 100), st.floats(-100, 100), st.floats(0.1, 200))
 def test_a_disc_holds_those_within_its_radius(seed: int, x: float, y: float, radius_m: float) -> None:
     nodes = some_nodes(20, seed % 1000)
@@ -173,6 +177,7 @@ def islands(severed: np.ndarray) -> list[int]:
     return sorted(map(len, groups))
 
 
+@pytest.mark.slow
 @given(st.integers(2, 25), seeds)
 def test_halves_differ_by_one_at_most_and_one_is_one(count: int, seed: int) -> None:
     assert islands(cut(count, seed, "halves")) == [count // 2, count - count // 2]
@@ -187,6 +192,7 @@ def test_groups_are_cut_from_each_other_and_from_those_whom_nobody_named() -> No
     assert not severed[5, 6]
 
 
+@pytest.mark.slow
 @given(st.integers(1, 30), seeds)
 def test_on_a_ring_each_hears_a_majority_and_no_two_the_same_one(count: int, seed: int) -> None:
     severed = cut(count, seed, "ring")

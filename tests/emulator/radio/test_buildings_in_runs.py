@@ -63,6 +63,7 @@ def test_the_house_takes_the_car_out_of_reach_while_it_is_behind_it(recorded: Op
     assert {"seen", "hidden", "car"} == {row["sender"] for row in recorded.trace.to_pylist()}
 
 
+@pytest.mark.slow
 def test_all_checks_agree_from_the_folder_alone(recorded: OpenedRun) -> None:
     verdicts = {check.name: check.verdict.value for check in judge(recorded).checks}
     assert {verdicts[name] for name in ("conservation", "range", "fading", "medium")} == {"valid"}, verdicts

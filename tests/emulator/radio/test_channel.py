@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.stats import binom
 
 from emulator.radio.engine import Engine
 from emulator.radio.faults import ActiveLinkFaults
@@ -17,6 +16,7 @@ from emulator.radio.mac import TransmitQueue
 from emulator.radio.outcomes import Outcome
 from emulator.radio.stages import LatencyStage, LossStage, in_range, peer_cap, sender_side
 from emulator.radio.topology import Disc, Topology
+from emulator.records.distributions import binomial_interval
 from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of
 from emulator.scenario.scenario import Radio
 
@@ -72,6 +72,7 @@ def queued(queue: TransmitQueue, seq: int, sender: int = 0, time_ns: int = 0, si
     return frame.end_ns if frame.sender_outcome == Outcome.pending else None
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(seeds, frames_of, st.integers(1, 40), st.lists(st.tuples(frames_of, st.integers(1, 9)), max_size=4))
 def test_draws_depend_on_the_frame_and_not_on_what_was_drawn_before(
@@ -270,17 +271,19 @@ def test_access_is_delayed_by_up_to_the_jitter_and_differently_each_time() -> No
     assert delays.max() > 4 * MS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.01, 0.1, 0.5, 0.93])
 @pytest.mark.parametrize("seed", [0, 1, 2**62])
 def test_loss_lies_in_its_band_for_the_run_and_for_each_receiver(loss: float, seed: int) -> None:
     stage, frames, receivers = LossStage(seed, loss), 400, 25
     lost = np.array([sent(stage, receivers, seq).outcome == Outcome.lost for seq in range(frames)])
-    low, high = binom.interval(0.999, frames * receivers, loss)
+    low, high = binomial_interval(0.999, frames * receivers, loss)
     assert low <= lost.sum() <= high
-    low, high = binom.interval(1 - 0.001 / receivers, frames, loss)
+    low, high = binomial_interval(1 - 0.001 / receivers, frames, loss)
     assert np.all((low <= lost.sum(axis=0)) & (lost.sum(axis=0) <= high))
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(seeds, st.floats(0, 1), st.floats(0, 1))
 def test_more_loss_loses_more_of_the_same_pairs(seed: int, one: float, other: float) -> None:
@@ -290,6 +293,7 @@ def test_more_loss_loses_more_of_the_same_pairs(seed: int, one: float, other: fl
     assert (sent(LossStage(seed, 1.0), 50).outcome == Outcome.lost).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(0, 5000), st.floats(0.001, 50), st.floats(0, 50), st.integers(0, 10**15))
 def test_latency_is_within_its_bounds_and_rounded_up_by_less_than_a_tick(

@@ -324,6 +324,7 @@ def test_a_full_queue_and_oversize_are_as_without_a_medium() -> None:
     assert [row["on_air_ns"] is None for row in rows(subject)] == [True, False, False, True, True]
 
 
+@pytest.mark.slow
 def test_a_throttled_sender_has_no_longer_a_queue_than_others() -> None:
     """Six want more than twice what the medium has room for; v0's frames come to it slowly, but not too slowly."""
     subject = engine(line(*range(0, 60, 10)), mac={}, path_loss={"kind": "free_space"}, queue_frames=4)

@@ -54,6 +54,7 @@ def test_faster_modes_need_more_and_all_improve_with_the_signal(rate: float, hal
     assert 10 * np.log10(snr[np.searchsorted(arrives, 0.5)]) == pytest.approx(half_db, abs=0.011)
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.integers(1, 1000), min_size=1, max_size=6), st.floats(0.1, 100), st.sampled_from([3.0, 6.0, 27.0])

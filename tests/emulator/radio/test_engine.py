@@ -39,6 +39,7 @@ def in_range(position_m: np.ndarray, range_m: float = 3000.0) -> np.ndarray:
     return (distance <= range_m) & ~np.eye(len(position_m), dtype=bool)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 12), seeds, st.floats(0, 1), st.lists(st.integers(0, 1600), min_size=1, max_size=8))
 def test_every_pair_has_exactly_one_outcome(count: int, seed: int, loss: float, sizes: list[int]) -> None:

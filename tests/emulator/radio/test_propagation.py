@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from emulator.radio.propagation import QUANTILES, Nakagami, ShadowField, loss_db
 from emulator.radio.topology import distances_m
@@ -71,7 +70,10 @@ def field() -> ShadowField:
     return ShadowField(Shadowing(sigma_db=4.0, decorrelation_m=25.0), seed=7)
 
 
+@pytest.mark.slow
 def test_shadowing_has_its_deviation(field: ShadowField) -> None:
+    from scipy import stats  # slow to import
+
     position_m = np.random.default_rng(1).uniform(0, 20_000, (500, 2))
     loss = field.between(position_m, distances_m(position_m))[np.triu_indices(500, 1)]
     assert loss.mean() == pytest.approx(0, abs=0.1)
@@ -117,8 +119,11 @@ def test_shadowing_of_neighbours_is_no_stronger_than_of_others(distance_m: float
 # Fading.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("m", [0.5, 0.75, 1.0, 1.5, 10.0])
 def test_factors_are_gamma_distributed_with_mean_one(m: float) -> None:
+    from scipy import stats  # slow to import
+
     nakagami = Nakagami(Fading(m=(m, 1.0), until_m=(1e6,)))
     shape = nakagami.shape(np.full(QUANTILES, 10.0))
     factors = nakagami.factor(shape, np.arange(QUANTILES))
@@ -126,7 +131,10 @@ def test_factors_are_gamma_distributed_with_mean_one(m: float) -> None:
     assert stats.kstest(factors, stats.gamma(m, scale=1 / m).cdf).statistic < 1e-4
 
 
+@pytest.mark.slow
 def test_each_stretch_has_its_shape() -> None:
+    from scipy import stats  # slow to import
+
     nakagami = Nakagami(Fading(m=(1.5, 0.75), until_m=(80.0,)))
     middle = np.full(3, QUANTILES // 2)
     near, edge, far = nakagami.factor(nakagami.shape(np.array([5.0, 80.0, 80.1])), middle)

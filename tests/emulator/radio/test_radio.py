@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
-from scipy.integrate import quad
 
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
@@ -125,6 +123,9 @@ def test_the_noise_decides_where_it_is_loud() -> None:
 @pytest.mark.slow
 def test_delivery_against_distance_is_the_integral_over_the_fading() -> None:
     """Twenty receivers, two thousand frames, without a medium: Monte Carlo against quadrature."""
+    from scipy import stats  # slow to import
+    from scipy.integrate import quad
+
     east_m = np.linspace(30, 900, 20)
     subject = engine(
         np.vstack([[[0.0, 0.0]], line(*east_m)]), path_loss={"kind": "log_distance"}, fading={}, max_peers=100

@@ -190,6 +190,7 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
 # Outcomes.
 
 
+@pytest.mark.slow
 def test_outcomes_in_their_order() -> None:
     """Near receivers hear; far ones do not detect; those that transmit in the slot hear nothing."""
     rows = beacons(engine(line(0, 50, 420, 800), **WINNER | {"mac": {"kind": "lte-mode4"}}), 2, 10.0)

@@ -174,6 +174,7 @@ def test_a_backoff_that_counts_stops_where_a_frame_is_read_and_not_sensed() -> N
     assert waited > 5
 
 
+@pytest.mark.slow
 def test_no_frame_overlaps_an_acknowledgement_where_all_can_read_its_frame() -> None:
     subject = engine(line(0, 30, 60, 90, 120), 5, **PHYSICAL)
     rng = np.random.default_rng(5)

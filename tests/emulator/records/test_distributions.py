@@ -13,6 +13,8 @@ from emulator.records.distributions import (
     student_quantile,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("trials", [1, 2, 7, 100, 12_345, 30_000_000])
 @pytest.mark.parametrize("probability", [0.0, 1e-6, 0.05, 0.3, 0.5, 0.999, 1.0])

@@ -50,6 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate_into(Scenario.model_validate(data), folder / "run")
 
 
+@pytest.mark.slow
 def test_figures_by_component_are_those_of_the_period_s_links(run: Path) -> None:
     deviation_m = RecordedRun.open(run).metrics["component_deviation_m"].to_pylist()
     assert deviation_m[:2] == [[0.0, 0.0, 0.0]] * 2, "everybody is alone"
@@ -57,6 +58,7 @@ def test_figures_by_component_are_those_of_the_period_s_links(run: Path) -> None
     assert deviation_m[7:] == [[0.5, 0.0]] * 8
 
 
+@pytest.mark.slow
 def test_the_bound_and_the_scene_have_those_in_one_component_that_ever_are_linked(run: Path) -> None:
     recorded = RecordedRun.open(run)
     assert reference_series(recorded)["component_rmse_m"].shape == (15, 1)

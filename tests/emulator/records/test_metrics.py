@@ -79,6 +79,7 @@ def anees(errors: np.ndarray, matrices: np.ndarray) -> float:
     return sum(squares) / len(squares) / 2
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
 def test_every_figure_is_the_one_that_its_definition_gives(seed: int, count: int) -> None:

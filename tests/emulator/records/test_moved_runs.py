@@ -132,6 +132,7 @@ def test_a_run_of_sumo_reads_the_same_where_sumo_is_not_installed(
     assert [name for name in before if before[name] != after[name]] == []
 
 
+@pytest.mark.slow
 def test_running_it_again_without_an_input_names_it(inputs: Path, tmp_path: Path) -> None:
     run_scenario(tmp_path / "run", with_files(inputs))
     (inputs / "links.csv").write_text(LINKS.replace("1", "0", 1))
@@ -153,6 +154,7 @@ def test_an_input_that_changes_during_a_run_is_recorded_as_it_was_read(inputs: P
 # Damage, and folders of other versions.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
@@ -172,6 +174,7 @@ def test_a_world_that_cannot_be_read_is_told_in_one_line(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_folder_of_a_later_format_is_refused(inputs: Path, tmp_path: Path) -> None:
     run_scenario(tmp_path / "run", with_files(inputs))
     path = tmp_path / "run" / "verdict.json"

@@ -28,10 +28,12 @@ def told(run: OpenedRun, parting: Parting) -> list[str]:
     return before(run.trace, run.events, parting.node, parting.time_ns)
 
 
+@pytest.mark.slow
 def test_runs_that_are_alike_do_not_part(tmp_path: Path) -> None:
     assert partings(simulated(tmp_path / "a"), simulated(tmp_path / "b")) == []
 
 
+@pytest.mark.slow
 def test_another_order_parts_from_fifo_at_a_decision_and_the_crash_names_its_line(tmp_path: Path) -> None:
     fifo = simulated(tmp_path / "a")
     shuffled = simulated(tmp_path / "b", run={"order": "shuffle", "duration_s": 1.0})
@@ -44,6 +46,7 @@ def test_another_order_parts_from_fifo_at_a_decision_and_the_crash_names_its_lin
     assert frame.first.startswith("frame ") and told(fifo, frame) == sorted(told(fifo, frame))
 
 
+@pytest.mark.slow
 def test_a_lost_frame_is_a_reception_and_what_follows_is_told(tmp_path: Path) -> None:
     """A block keeps v02 from hearing v01 for a while: no frame and no event differs before that."""
     run: dict[str, Any] = {"program": {"entry": "agents.beacon:main"}, "run": {"duration_s": 2.0, "settle_s": 0.5}}
@@ -74,6 +77,7 @@ def test_vehicles_of_one_run_alone_are_named_and_values_are_those_of_both(tmp_pa
     assert [each.second for each in partings(one, three) if each.kind == "vehicle"] == ["v02 and 1 more"]
 
 
+@pytest.mark.slow
 def test_a_shorter_run_parts_where_it_ends(tmp_path: Path) -> None:
     long, short = simulated(tmp_path / "a"), simulated(tmp_path / "b", run={"duration_s": 0.5})
     value = next((each for each in partings(long, short) if each.kind == "value"), None)

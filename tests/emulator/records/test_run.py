@@ -39,6 +39,7 @@ def test_a_folder_is_opened_as_a_run(folder: Path) -> None:
     assert repr(run) == f"<Run {str(folder)!r}: valid>"
 
 
+@pytest.mark.slow
 def test_positions_and_ranges_are_those_of_the_period_that_holds_the_instant(folder: Path) -> None:
     run = emulator.Run.open(folder)
     np.testing.assert_allclose(run.times_s, np.arange(10) / 10)

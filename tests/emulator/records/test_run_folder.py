@@ -127,6 +127,7 @@ event_list = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(event_list, st.data())
 def test_events_up_to_the_cut_survive_a_cut_anywhere(

@@ -212,6 +212,7 @@ def test_an_option_is_short_for_a_key_of_the_scenario(here: Path) -> None:
     assert (run.value("size") == 7).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["size", "=7"])
 def test_an_option_without_key_or_value_is_refused(here: Path, option: str) -> None:
     status, text = simulate("scenarios/own.toml", "--option", option)
@@ -219,7 +220,8 @@ def test_an_option_without_key_or_value_is_refused(here: Path, option: str) -> N
 
 
 def test_folders_are_searched_last_and_those_of_another_run_no_more(here: Path) -> None:
-    installed = list(sys.path)
+    search_programs_in([])  # those of earlier tests no more
+    installed = sys.path[:-1]
     search_programs_in([here / "a", here / "b"])
     assert sys.path == [*installed, str(here / "a"), str(here / "b"), str(Path.cwd())]
     search_programs_in([here / "b"])

@@ -16,6 +16,8 @@ from emulator.scenario.sections import first_problem
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 
+pytestmark = pytest.mark.slow
+
 WRONG: tuple[Any, ...] = (
     *(None, True, -1, 1.5, math.inf, math.nan, 10**30, "text", "", b"bytes", [], {}, [1], [[1, 2]], ["a", 5]),
     *({"a": 1}, [{}], {"kind": 5}, {"kind": "kill"}, ["x"] * 2000, "x" * 5000, object()),
@@ -62,7 +64,6 @@ def all_problems() -> Iterator[str]:
         yield problem({"fault": [{"kind": kind}]})
 
 
-@pytest.mark.slow
 def test_no_word_of_pydantic_s_is_shown() -> None:
     said = {text for text in all_problems() if text}
     assert len(said) > 500

@@ -298,6 +298,7 @@ def test_tables_that_do_not_fit_together(copied: Path, watched: Watched) -> None
     assert "its first period is not of the vehicles of world.npz" in refused(copied)
 
 
+@pytest.mark.slow
 def test_a_run_without_a_period_has_a_scene_and_an_end(tmp_path: Path) -> None:
     scenario = Scenario.model_validate(
         {

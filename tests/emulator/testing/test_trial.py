@@ -20,12 +20,14 @@ def scenario_with(check: str) -> Scenario:
     return Scenario.model_validate({"run": run, "network": {"vehicles": 2}, "program": program})
 
 
+@pytest.mark.slow
 def test_tables_that_a_check_looks_at_are_in_no_file(tmp_path: Path) -> None:
     trial = run_trial(scenario_with("reads_tables"), RunFolder.scratch(tmp_path))
     assert trial.verdicts[f"{PREFIX}tables"] is Verdict.VALID, trial.texts
     assert [path.name for path in tmp_path.iterdir()] == ["logs"]
 
 
+@pytest.mark.slow
 def test_files_that_a_check_asks_for_are_written(tmp_path: Path) -> None:
     trial = run_trial(scenario_with("reads_files"), RunFolder.scratch(tmp_path))
     assert trial.verdicts[f"{PREFIX}files"] is Verdict.VALID, trial.texts

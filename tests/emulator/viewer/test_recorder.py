@@ -29,7 +29,7 @@ from tests.support.recordings import Entity, read_back, rrd
 from vnet.errors import VnetError
 from vnet.transport import wire
 
-pytestmark = pytest.mark.usefixtures("strict")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("strict")]
 
 Told = list[tuple[str, dict[str, Any]]]
 LATE_S = 1.5
@@ -85,7 +85,6 @@ def periods(told: Told) -> list[PeriodArrays]:
     return [PeriodArrays(message, node_ids) for stream, message in told if stream == "period"]
 
 
-@pytest.mark.slow
 def test_the_file_is_whole_and_says_so(path: Path) -> None:
     assert is_closed(path)
     assert rrd("verify", str(path)).returncode == 0
@@ -107,7 +106,6 @@ def views(path: Path) -> tuple[list[str], list[str]]:
     return largest
 
 
-@pytest.mark.slow
 def test_the_blueprint_has_four_tabs_and_shows_whatever_there_is(path: Path, entities: dict[str, Entity]) -> None:
     names, origins = views(path)
     assert {"Overview", "Radio", "Vehicle v03", "Program"} <= set(names)
@@ -118,19 +116,16 @@ def test_the_blueprint_has_four_tabs_and_shows_whatever_there_is(path: Path, ent
     assert empty == [], "no view is empty"
 
 
-@pytest.mark.slow
 def test_nothing_that_is_always_there_hides_what_comes_with_a_time(entities: dict[str, Entity]) -> None:
     hidden = {name: set(entity.static) & set(entity.at) for name, entity in entities.items()}
     assert {name: both for name, both in hidden.items() if both} == {}
 
 
-@pytest.mark.slow
 def test_there_is_no_time_but_the_emulated(path: Path) -> None:
     timelines = {name for chunk in RrdReader(str(path)).stream() for name in chunk.timeline_names}
     assert timelines == {"emulated time"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entity", "name", "relative_to"),
     [
@@ -153,7 +148,6 @@ def test_points_are_where_the_messages_say_with_north_up(
         np.testing.assert_allclose(drawn, wanted * [1, -1], rtol=1e-6, atol=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entity", "figures"),
     [
@@ -175,7 +169,6 @@ def test_lines_have_the_figures_of_the_messages(
     assert len(entities[entity].static["SeriesLines:names"]) == len(drawn)
 
 
-@pytest.mark.slow
 def test_layers_of_the_stack_are_as_thick_as_there_were_frames(told: Told, entities: dict[str, Entity]) -> None:
     seen = set()
     for period in periods(told):
@@ -193,7 +186,6 @@ def test_layers_of_the_stack_are_as_thick_as_there_were_frames(told: Told, entit
     assert {Outcome.delivered, Outcome.lost, Outcome.peer_cap, Outcome.fault, Outcome.receiver_down} <= seen
 
 
-@pytest.mark.slow
 def test_links_are_halves_coloured_by_their_state(told: Told, entities: dict[str, Entity]) -> None:
     links = entities["/map/links"]
     seen = set()
@@ -209,7 +201,6 @@ def test_links_are_halves_coloured_by_their_state(told: Told, entities: dict[str
     assert {Outcome.delivered, Outcome.peer_cap, Outcome.fault, Outcome.receiver_down} <= seen
 
 
-@pytest.mark.slow
 def test_a_link_is_delivered_if_a_frame_got_through_and_else_what_befell_most(told: Told) -> None:
     rows = [
         (0, 1, Outcome.lost, 3),
@@ -222,7 +213,6 @@ def test_a_link_is_delivered_if_a_frame_got_through_and_else_what_befell_most(to
     assert list(zip(sender, receiver, state, strict=True)) == [(0, 1, Outcome.delivered), (1, 0, Outcome.peer_cap)]
 
 
-@pytest.mark.slow
 def test_faults_and_the_dead_have_their_spans(entities: dict[str, Entity]) -> None:
     spans = {name: entity.at["StateChange:state"] for name, entity in entities.items() if "/faults/" in name}
     assert spans == {
@@ -232,7 +222,6 @@ def test_faults_and_the_dead_have_their_spans(entities: dict[str, Entity]) -> No
     }
 
 
-@pytest.mark.slow
 def test_who_is_down_is_red_on_the_map(entities: dict[str, Entity]) -> None:
     colours = entities["/map/true"].at["Points2D:colors"]
     assert list(colours) == [0.0, 1.0, 2.0]
@@ -240,7 +229,6 @@ def test_who_is_down_is_red_on_the_map(entities: dict[str, Entity]) -> None:
     assert [number for number, colour in enumerate(colours[1.0]) if colour != colours[0.0][0]] == [1]
 
 
-@pytest.mark.slow
 def test_a_vehicle_that_enters_is_not_red_any_more(told: Told, tmp_path: Path) -> None:
     def without_v02(message: dict[str, Any], until_s: float) -> dict[str, Any]:
         if "up" not in message or message["time_ns"] >= until_s * 1e9:
@@ -256,7 +244,6 @@ def test_a_vehicle_that_enters_is_not_red_any_more(told: Told, tmp_path: Path) -
     assert len(set(colours[0.5])) == 1, "it has entered, and nobody was down before or after"
 
 
-@pytest.mark.slow
 def test_events_are_told_at_their_time_and_those_after_the_last_period_too(
     told: Told, entities: dict[str, Entity]
 ) -> None:
@@ -266,7 +253,6 @@ def test_events_are_told_at_their_time_and_those_after_the_last_period_too(
     assert logged[1.2] == ["partition-1 started: v01, v02, v03, v04, v05, v06"]
 
 
-@pytest.mark.slow
 def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str, Entity]) -> None:
     number = {node: row for row, node in enumerate(told[0][1]["node_ids"])}
     matrix = np.full((6, 6), np.nan)
@@ -284,7 +270,6 @@ def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str
     assert compared >= 2
 
 
-@pytest.mark.slow
 def test_the_links_of_the_radio_are_shares_of_what_was_tried(told: Told, entities: dict[str, Entity]) -> None:
     times = list(entities["/radio/links"].at["Tensor:data"])
     before = [period for period in periods(told) if period.time_s <= times[-1]]
@@ -298,7 +283,6 @@ def test_the_links_of_the_radio_are_shares_of_what_was_tried(told: Told, entitie
     np.testing.assert_allclose(heard, 100 * delivered.sum(axis=1) / tried.sum(axis=1), rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_ages_and_times_between_receptions_are_those_of_the_messages(
     told: Told, entities: dict[str, Entity]
 ) -> None:
@@ -332,7 +316,6 @@ def test_ages_and_times_between_receptions_are_those_of_the_messages(
     assert len(gaps_ms) > 100 and min(gaps_ms) < 150 < max(gaps_ms)
 
 
-@pytest.mark.slow
 def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dict[str, Entity]) -> None:
     times = list(entities["/radio/latency"].at["BarChart:values"])
     before = [period for period in periods(told) if period.time_s <= times[-1]]
@@ -349,7 +332,6 @@ def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dic
         np.testing.assert_allclose(drawn, rate, rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, Entity]) -> None:
     period = next(period for period in periods(told) if period.time_s == LATE_S)
     position, estimate = (period.points(f"{name}_m")[2] for name in ("position", "estimate"))
@@ -363,7 +345,6 @@ def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, E
     assert "| v03 (itself) |" in table
 
 
-@pytest.mark.slow
 def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path) -> None:
     def without_v03(message: dict[str, Any]) -> dict[str, Any]:
         if "up" not in message or message["time_ns"] < 1.5e9:
@@ -383,7 +364,6 @@ def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path)
         assert max(last) == pytest.approx(1.5) and len(last[max(last)]) == 0, name
 
 
-@pytest.mark.slow
 def test_missing_periods_are_counted_and_told(told: Told, tmp_path: Path) -> None:
     recorder = write([*told[:5], *told[9:]], tmp_path / "gap.rrd")
     assert recorder.missed == 4
@@ -391,14 +371,12 @@ def test_missing_periods_are_counted_and_told(told: Told, tmp_path: Path) -> Non
     assert logged == ["4 periods before this one are missing: the recording could not keep up"]
 
 
-@pytest.mark.slow
 def test_what_comes_before_the_scene_and_what_is_unknown_is_left_out(told: Told, tmp_path: Path) -> None:
     write([*told[1:3], ("weather", {}), told[0], told[0], *told[3:]], tmp_path / "late.rrd")
     times = read_back(tmp_path / "late.rrd")["/map/true"].at["Points2D:positions"]
     assert min(times) == pytest.approx(0.2)
 
 
-@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_one_line(told: Told, tmp_path: Path) -> None:
     with pytest.raises(VnetError, match=r"nowhere/x\.rrd: cannot write the recording"):
         write(told, tmp_path / "nowhere" / "x.rrd")

@@ -14,6 +14,8 @@ from emulator.viewer.overview_scene import DrawnReference
 from tests.support.recorded import prepared
 from vnet.node import Node
 
+pytestmark = pytest.mark.slow
+
 DECLARES = "agents.cooperative.declared"
 
 
@@ -53,14 +55,12 @@ def late(values: list[float | None]) -> float:
     return float(np.mean([value for value in values[-10:] if value is not None]))
 
 
-@pytest.mark.slow
 def test_it_finds_the_common_error_as_well_as_cooperation_does(told: list[dict[str, Any]]) -> None:
     rmse = late([period["figures"]["common_error_rmse_m"] for period in told[1:]])
     assert late(steps(told)) < 1.3 * rmse
     assert late(steps(told)) < 0.3 * late([period["figures"]["fix_rmse_m"] for period in told[1:]])
 
 
-@pytest.mark.slow
 def test_it_is_the_same_each_time(told: list[dict[str, Any]]) -> None:
     assert steps(told) == steps(told)
 
@@ -70,7 +70,6 @@ def test_it_says_nothing_where_nobody_speaks_of_a_common_error(tmp_path: Path) -
     assert steps(told) == [None] * 5
 
 
-@pytest.mark.slow
 def test_fixes_that_are_missing_and_periods_that_were_left_out_are_bridged(told: list[dict[str, Any]]) -> None:
     periods = [dict(period) for period in told[1:]]
     for number, period in enumerate(periods):
@@ -84,7 +83,6 @@ def test_fixes_that_are_missing_and_periods_that_were_left_out_are_bridged(told:
     assert late(found) < 2.0
 
 
-@pytest.mark.slow
 def test_each_component_has_a_filter_of_its_own(told: list[dict[str, Any]]) -> None:
     apart = {**told[0], "component": np.array([0] * 6 + [1] * 6, dtype="<i2").tobytes()}
     together, separate = steps(told), steps([apart, *told[1:]])

@@ -94,6 +94,7 @@ def test_a_freeze_at_the_instant_of_a_fix_repeats_the_one_before_and_at_the_star
         assert np.array_equal(fix.position_m, world.fix(last, 0).position_m)
 
 
+@pytest.mark.slow
 def test_random_positions_are_new_each_time_within_their_radius_and_fill_the_disc() -> None:
     gnss, world, _ = receivers(fault("RandomPos", at_s=0.0, duration_s=14.9, radius_m=50.0, nodes={}))
     away = np.concatenate([strayed(gnss, world, number, 149) for number in range(VEHICLES)])

@@ -131,6 +131,7 @@ def test_frames_take_the_links_of_the_time_at_which_they_are_sent(count: int, ma
     ]
 
 
+@pytest.mark.slow
 def test_a_link_loses_the_share_that_its_row_says() -> None:
     links = table((0, 0, 1, 0.2), (0, 0, 2, 0.7))
     subject = Engine(NAMES, Radio(access_jitter_ms=0, queue_frames=9999), 1, np.zeros((3, 2)), RadioInputs(links))

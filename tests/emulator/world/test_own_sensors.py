@@ -94,6 +94,7 @@ def test_programs_read_what_the_function_says_wherever_they_run() -> None:
         np.testing.assert_allclose(values[:2], emulation.world.position_m(9)[number])
 
 
+@pytest.mark.slow
 def test_a_function_cannot_change_the_truth() -> None:
     emulation = run_together(scenario("spoils"))
     assert {values[0] for *_, values in readings(emulation)} == {1.0}

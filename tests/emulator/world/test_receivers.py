@@ -72,6 +72,7 @@ def _accelerating(folder: Path) -> dict[str, Any]:
     return {"kind": "trips", "path": str(path)}
 
 
+@pytest.mark.slow
 def test_headings_are_the_noisier_the_slower_a_vehicle_drives(tmp_path: Path) -> None:
     gnss = {"heading_sigma_rad": 0.0, "heading_speed_sigma_mps": 0.2}
     errors = []
@@ -184,6 +185,7 @@ def test_a_gradient_is_zero_in_the_middle_and_grows_with_the_distance() -> None:
     assert 0.02 < 1000 * np.abs(matrix).max() < 1
 
 
+@pytest.mark.slow
 def test_without_them_fixes_are_as_before() -> None:
     assert np.array_equal(errors_m(world_of({})), errors_m(world_of({"multipath_tau_s": 5.0, "outlier_m": 9.0})))
 

@@ -153,6 +153,7 @@ def test_in_a_wide_lane_the_offset_is_stationary_and_forgets_at_its_rate() -> No
     assert np.abs(np.corrcoef(offsets_m.T) - np.eye(10)).max() < 0.4, "each vehicle strays by itself"
 
 
+@pytest.mark.slow
 def test_the_offset_is_stationary_from_the_first_period_on() -> None:
     world = build_world(scenario(run={"duration_s": 0.5}, network={"vehicles": 1000}))
     offsets_m = lateral_m(world)

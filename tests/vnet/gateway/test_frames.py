@@ -60,6 +60,7 @@ def test_a_message_arrives_as_it_was_if_all_its_frames_do_and_else_not_at_all(
     assert heard == expected
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=100))
 def test_bytes_of_anybody_are_refused_or_are_a_message(content: bytes) -> None:
     with contextlib.suppress(msgspec.MsgspecError, LookupError):

@@ -43,6 +43,8 @@ from vnet.gateway.ros2 import (
 )
 from vnet.node import Fix
 
+pytestmark = pytest.mark.slow
+
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 QOS = "::,7:,:,:,,"
@@ -71,7 +73,6 @@ def graph_tokens(draw: st.DrawFn) -> GraphToken:
     return GraphToken(*where, kind, "/", draw(st.just("/") | paths), draw(names), endpoint)  # type: ignore[arg-type]
 
 
-@pytest.mark.slow
 @given(topic_keys)
 def test_a_topics_key_reads_as_composed_and_others_compose_the_same(topic: TopicKey) -> None:
     assert parse_topic(topic.key) == topic
@@ -82,7 +83,6 @@ def test_a_topics_key_reads_as_composed_and_others_compose_the_same(topic: Topic
         assert pamoja.entity_key(topic.domain, topic.topic, topic.type, topic.type_hash) == topic.key
 
 
-@pytest.mark.slow
 @given(graph_tokens())
 def test_a_token_reads_as_composed_and_others_compose_the_same(token: GraphToken) -> None:
     assert parse_token(token.key) == token
@@ -98,7 +98,6 @@ def test_a_token_reads_as_composed_and_others_compose_the_same(token: GraphToken
         assert sdk_keys.node_liveliness_keyexpr(node) == token.key
 
 
-@pytest.mark.slow
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_an_attachment_reads_as_composed_and_others_compose_the_same(seq: int, time_ns: int, gid: bytes) -> None:
     content = Attachment(seq, time_ns, gid).to_bytes()
@@ -107,7 +106,6 @@ def test_an_attachment_reads_as_composed_and_others_compose_the_same(seq: int, t
     assert sdk_attachment.Attachment(seq, time_ns, gid).to_bytes() == content
 
 
-@pytest.mark.slow
 @given(st.text() | st.text("@ros2_lv/0aMPSNC%:").map("@ros2_lv/".__add__), st.binary(max_size=40))
 def test_no_text_and_no_bytes_fail_to_be_read(text: str, content: bytes) -> None:
     token = parse_token(text)
@@ -144,7 +142,6 @@ def test_what_only_resembles_ros_2_is_no_part_of_it(key: str) -> None:
     assert parse_topic(key) is None
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ros_type", [CLOCK_TYPE, FIX_TYPE])
 @pytest.mark.parametrize("distribution", [Stores.ROS2_JAZZY, Stores.LATEST])
 def test_hashes_of_published_types_are_those_of_their_definitions(ros_type: str, distribution: Stores) -> None:
@@ -152,7 +149,6 @@ def test_hashes_of_published_types_are_those_of_their_definitions(ros_type: str,
     assert pamoja.type_hash_digest(TYPE_HASHES[ros_type]) is not None
 
 
-@pytest.mark.slow
 @given(st.integers(0, 2**31 * 10**9 - 1))
 def test_a_clock_reads_as_written(time_ns: int) -> None:
     message: Any = STORE.deserialize_cdr(clock_message(time_ns), CLOCK_TYPE)
@@ -239,7 +235,6 @@ NODE = """
 """
 
 
-@pytest.mark.slow
 def test_rules_services_clock_and_fixes_hold_on_virtual_time(drive: Drive) -> None:
     run = drive(NODE, vehicles=2, radio={"profile": "ros2", "ros2": {"clock_hz": 4.0}})
     assert "answered yes" in log(run)
@@ -249,7 +244,6 @@ def test_rules_services_clock_and_fixes_hold_on_virtual_time(drive: Drive) -> No
     assert 5 <= sum(key.startswith("0/clock/") for key, *_ in heard) <= 7
 
 
-@pytest.mark.slow
 def test_two_clients_that_share_no_code_run_unmodified_on_virtual_time(tmp_path: Path) -> None:
     """All of it replays: who hears whom, who answers, and what is seen of the graph."""
     nodes = str(ROOT / "tests/system/ros2_nodes.py")
@@ -282,7 +276,6 @@ def test_two_clients_that_share_no_code_run_unmodified_on_virtual_time(tmp_path:
     assert seen == ["there", "gone", "there"]
 
 
-@pytest.mark.slow
 def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(drive: Drive) -> None:
     program = f"""
         import sys, zenoh
@@ -308,7 +301,6 @@ def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(d
     assert schemas == {"/v01/chatter": known, "/v01/old": known, "/v01/odd": None}
 
 
-@pytest.mark.slow
 def test_figures_are_by_topic_and_type_with_the_nodes_that_send(drive: Drive) -> None:
     run = drive(NODE, vehicles=2, radio={"profile": "ros2"})
     found = {(each.kind, each.key): each for each in key_figures(RecordedRun.open(run.folder))}

@@ -128,6 +128,7 @@ def test_what_a_program_tells_is_asked_for_at_once(
     assert asked_by(run, does) == [20 * MS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("does", [computes, forks, starts_a_thread])
 def test_what_nobody_could_notice_is_not_asked_for(
     run: Callable[[Program, Swap], wire.Traffic], does: Program

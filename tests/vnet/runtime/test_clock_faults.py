@@ -195,6 +195,7 @@ def test_a_packet_bears_the_time_that_the_clock_showed_when_it_came_and_not_when
         assert heard["v1"] == [t - 1.5 if 5 <= t < 10 else t for t in range(1, 16)]
 
 
+@pytest.mark.slow
 def test_no_clock_shows_a_time_before_the_start_of_the_run() -> None:
     seen = []
 
@@ -207,6 +208,7 @@ def test_no_clock_shows_a_time_before_the_start_of_the_run() -> None:
     assert seen[:6] == [(0, 0)] * 4 + [(S // 2, S // 2), (3 * S // 2, 3 * S // 2)]
 
 
+@pytest.mark.slow
 def test_two_nodes_of_one_process_have_clocks_of_their_own() -> None:
     woken: dict[str, list[int]] = {}
     shown: dict[str, list[int]] = {}

@@ -157,6 +157,7 @@ def test_who_stands_says_the_same_again_and_no_more() -> None:
     assert deviation[1] > 0.4, "the lane leaves ± 0.85 m"
 
 
+@pytest.mark.slow
 def test_parallel_lanes_stay_hypotheses_until_somebody_else_decides() -> None:
     alone = drive(PARALLEL, [straight(-200, 7.0, EAST, 12.0, 10)], COMMON_M)
     across = alone.common_m[1] @ alone.weight, np.sqrt(alone.estimate_covariance_m2[1, 1])
@@ -172,12 +173,14 @@ def test_one_on_a_parking_lot_does_not_outvote_those_on_roads() -> None:
     assert rbpf.estimate_m == pytest.approx(COMMON_M, abs=0.9)
 
 
+@pytest.mark.slow
 def test_far_from_every_road_roads_say_nothing() -> None:
     rbpf = drive(CROSSING, [straight(5000, 5000, EAST, 12.0, 5)], COMMON_M)
     assert np.isfinite(rbpf.estimate_m).all()
     assert np.sqrt(np.diag(rbpf.estimate_covariance_m2)) == pytest.approx([3.0, 3.0], abs=0.7)
 
 
+@pytest.mark.slow
 def test_vehicles_that_brake_and_turn_stay_inside_the_gate() -> None:
     """A full stop from 15 m/s at 3 m/s², and a turn at 3 m/s² across: their fixes are no outliers."""
     time_s = np.arange(0, 12, 0.1)
@@ -215,6 +218,7 @@ def test_lanes_may_have_any_numbers() -> None:
     assert sorted(lane.tolist()) == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
+@pytest.mark.slow
 def test_hypotheses_of_others_pay_for_a_road_that_was_left_as_ones_own_do() -> None:
     """Else, while a vehicle turns and is on no lane, every neighbour's cloud would outweigh one's own."""
     course, heading = straight(-200, 0.0, EAST, 12.0, 10)

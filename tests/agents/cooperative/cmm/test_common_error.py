@@ -33,6 +33,7 @@ def test_a_change_of_the_log_weights_changes_the_weights() -> None:
     assert subject.covariance_m2 == pytest.approx(np.full((2, 2), 0.1875))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(0.05, 0.5), min_size=1, max_size=40), st.floats(0.0, 1.2))
 def test_c_of_the_past_is_remembered_as_long_as_it_should_be(steps_s: list[float], age_s: float) -> None:

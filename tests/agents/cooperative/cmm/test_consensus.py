@@ -286,6 +286,7 @@ def agreed_without_the_first(net: Net) -> None:
         assert node.mean_m == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_false_sums_are_not_taken_and_who_says_them_is_left_out() -> None:
     def lie(turn: int, share: Share) -> Share:
         s_x, s_y, w = share.running_sum

@@ -30,6 +30,7 @@ def test_it_is_the_closed_form_near_and_far(offset_m: float, sigma_m: float) -> 
     assert value == pytest.approx(reference(offset_m, sigma_m), rel=1e-12 if far else 0.0, abs=0.0 if far else 2e-6)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.floats(-60, 60), st.integers(-REACH * STEPS, REACH * STEPS))
 def test_the_table_is_the_normal_distribution(anywhere: float, node: int) -> None:

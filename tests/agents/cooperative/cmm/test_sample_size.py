@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import chi2
 
 from agents.cooperative.cmm.information import Information
 from agents.cooperative.cmm.kalman_bound import LaneModel
@@ -18,9 +17,12 @@ TOLD = Information.of(np.array([1.0, -2.0]), 0.1**2 * np.eye(2))
 """Belief about c after what others say in a period."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_m", [0.1, 0.2, 0.5, 2.0])
 def test_it_is_the_quantile_of_the_divergence(sigma_m: float) -> None:
     """Twice the sample size times the divergence is distributed as χ² (Fox 2003)."""
+    from scipy.stats import chi2  # slow to import
+
     cells = math.pi * (ELLIPSE_SIGMAS * sigma_m / CELL_M) ** 2
     wanted = chi2.ppf(0.99, cells - 1) / (2 * DISTANCE)
     assert sample_size(sigma_m**2 * np.eye(2), 1, 10**9) == pytest.approx(wanted, rel=0.01)

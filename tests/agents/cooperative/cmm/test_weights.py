@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 
 from agents.cooperative.cmm.weights import (
     ExactWeights,
@@ -34,6 +33,8 @@ SOLVERS = [OptimizedWeights, ExactWeights]
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("seed", range(30))
 def test_optimized_weights_are_the_minimum(seed: int, solver: type[OptimizedWeights]) -> None:
+    from scipy.optimize import minimize  # slow to import
+
     estimates, covariances, mean = problem(seed)
     weights = solver().solve(estimates, covariances, mean)
     offset = estimates - mean

@@ -88,6 +88,7 @@ def test_vehicles_that_cross_one_after_the_other_do_not_collide(tmp_path: Path) 
     assert world.vehicles.along_m.tolist() == [260, 250]
 
 
+@pytest.mark.slow
 def test_vehicles_leave_where_their_route_ends(tmp_path: Path) -> None:
     world = world_on(write_map(tmp_path, *CROSS), 2, {"routes": [EAST, NORTH], "start_m": [360, 200]})
     drive(world, 50)
@@ -121,6 +122,7 @@ def test_a_turn_is_driven_on_an_arc_from_lane_to_lane(tmp_path: Path) -> None:
     assert turn.sum() == pytest.approx(-np.pi / 2)
 
 
+@pytest.mark.slow
 def test_who_turns_off_is_ahead_until_it_has_left_the_road(tmp_path: Path) -> None:
     keys = {"start_m": [275, 245, 30], "start_lanes": [0, 0, 1], "speed_mps": (8.0, 8.0, 8.0)}
     world = turn_of(tmp_path, ["edge 0", "edge 2"], **keys)
@@ -237,6 +239,7 @@ NET = """<net>
 </net>"""
 
 
+@pytest.mark.slow
 def test_routes_in_a_network_of_sumo_need_not_name_the_inside_of_intersections(tmp_path: Path) -> None:
     path = tmp_path / "cross.net.xml"
     path.write_text(NET)
