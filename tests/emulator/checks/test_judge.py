@@ -103,7 +103,6 @@ def test_without_events_nothing_is_known_of_the_course_of_a_run(recorded: Record
     assert isinstance(told, CheckResult) and "refused: wrong number" in told.text and "hangs" not in told.text
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("table", ["states", "metrics"])
 def test_a_run_that_kept_half_its_periods_is_unknown(recorded: RecordedRun, table: str) -> None:
     rows = getattr(recorded, table)
@@ -155,7 +154,6 @@ def test_a_trace_of_another_run_is_refused_in_one_line(recorded: RecordedRun) ->
         judge(replace(recorded, trace=with_names(recorded.trace, "receiver", 0, "ghost")))
 
 
-@pytest.mark.slow
 def test_deliveries_that_were_never_timed_leave_real_time_unknown(recorded: RecordedRun) -> None:
     settings = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
     scenario = recorded.scenario.model_copy(update={"run": settings})

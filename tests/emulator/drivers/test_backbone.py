@@ -97,7 +97,6 @@ def test_units_hear_the_same_together_apart_and_without_windows() -> None:
     assert together.backbone.table() == apart.backbone.table() == without.backbone.table()
 
 
-@pytest.mark.slow
 def test_a_unit_that_is_down_hears_nothing_and_goes_on_afterwards() -> None:
     fault = {"kind": "kill", "nodes": {"ids": ["rsu02"]}, "at_s": 0.5, "duration_s": 0.5}
     emulation = run_together(scenario(2, fault=[fault], backbone={"latency_ms": 30.0}))

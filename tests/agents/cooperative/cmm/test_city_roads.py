@@ -127,7 +127,6 @@ def straight(x: float, y: float, heading: float, speed_m_s: float, seconds: floa
 COMMON_M = np.array([2.0, -3.0])
 
 
-@pytest.mark.slow
 def test_two_who_drive_across_each_other_find_the_common_error() -> None:
     courses = [straight(-200, 0.3, EAST, 12.0, 20), straight(-0.3, -200, NORTH, 12.0, 20)]
     rbpf = drive(CROSSING, courses, COMMON_M)
