@@ -89,6 +89,7 @@ class Admission(Generic[F]):
             except FrameError as error:
                 self.rejected[str(error)] += 1
         admitted = []
+        newest_ns, first_sender = self._newest_ns, self._first_sender
         period_ns, late_ns = now_ns - now_ns % self._period_ns, STALE_PERIODS * self._period_ns
         largest_epoch = EPOCH_MARGIN + now_ns // self._period_ns
         for node, frame in frames:
@@ -99,28 +100,25 @@ class Admission(Generic[F]):
                 self.rejected["stale"] += 1
             elif frame.epoch > largest_epoch:
                 self.rejected["absurd"] += 1
-            elif reason := self._objection(sender, frame, time_ns):
-                self.rejected[reason] += 1
+            elif sender not in newest_ns and len(newest_ns) + len(self._early) >= MAX_SENDERS:
+                self.rejected["too_many_senders"] += 1
+            elif not self._several and (
+                newest_ns.get(sender, -1) >= time_ns or (self._early and (sender, time_ns) in self._early)
+            ):
+                self.rejected["duplicate"] += 1
+            elif first_sender.setdefault((time_ns, frame.fingerprint), sender) != sender:
+                self.rejected["replayed"] += 1
             elif time_ns > period_ns:
                 self._early[sender, time_ns] = node, frame
             else:
                 self.ids[sender] = node
-                self._newest_ns[sender] = time_ns
+                newest_ns[sender] = time_ns
                 admitted.append((sender, frame))
         return admitted
 
-    def _objection(self, sender: str, frame: F, time_ns: int) -> str | None:
-        """Return the reason to reject the frame for what was sent before, if there is one."""
-        if len(self._newest_ns) + len(self._early) >= MAX_SENDERS and sender not in self._newest_ns:
-            return "too_many_senders"
-        known = self._newest_ns.get(sender, -1) >= time_ns or (self._early and (sender, time_ns) in self._early)
-        if known and not self._several:
-            return "duplicate"
-        return None if self.claim(sender, time_ns, frame.fingerprint) else "replayed"
-
-    def claim(self, sender: str, time_ns: int, fingerprint: bytes) -> bool:
-        """Tell whether `sender` is the first with what comes from a fix: no two receivers' noise is the same."""
-        return self._first_sender.setdefault((time_ns, fingerprint), sender) == sender
+    def claim(self, sender: str, time_ns: int, fingerprint: bytes) -> None:
+        """Note that `sender` is the first with what comes from a fix: no two receivers' noise is the same."""
+        self._first_sender.setdefault((time_ns, fingerprint), sender)
 
     def _forget(self, now_ns: int) -> None:
         """Forget senders and fixes that no frame can concern that is not stale."""

@@ -414,14 +414,14 @@ class InformationEstimator:
         listed = [frame.passed_records for frame in frames]
         shares, forged = self._passing.shares(listed, weights, self._options.defence)
         self._reject("forged", forged)
-        origins, increments = [], []
+        origins, increments, has_joined = [], [], self._lanes is not None and self._lanes.has_joined
         for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):
             if share < 1:
-                if self._lanes and self._lanes.has_joined and not is_of_lane(increment):
+                is_about_c = increment[2] >= 0
+                if is_about_c and has_joined:
                     continue  # c has moved since, which precise receivers see
-                part = 1.0 if is_of_lane(increment) else PASSED_SHARE
                 origins.append(code)
-                increments.append(scaled_by(increment, part * (1 - share)))
+                increments.append(scaled_by(increment, (PASSED_SHARE if is_about_c else 1.0) * (1 - share)))
         if not origins or not self._options.defence:
             return increments
         x, y, p, q, r = self.own.plain_moments
