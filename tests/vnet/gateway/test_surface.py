@@ -40,7 +40,7 @@ def members(declared: ast.ClassDef) -> set[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["zenoh", "zenoh.ext", "zenoh.handlers"])
+@pytest.mark.parametrize("module", ["zenoh", "zenoh.ext", "zenoh.handlers", "zenoh.shm"])
 def test_each_public_name_and_member_is_there(module: str) -> None:
     missing = []
     for name, each in public(module).items():

@@ -366,3 +366,14 @@ def test_a_command_is_told_an_endpoint_which_its_sessions_do_not_need(drive: Dri
     )
     run = drive(program={"command": ["python", "-c", text, "{id}", "{endpoint}", "{port}"]}, duration_s=0.2)
     assert log(run)[0] == "v01 True True"
+
+
+def test_the_words_of_a_command_are_read_by_the_standard_library_too(drive: Drive) -> None:
+    text = """
+        import argparse, fileinput, optparse
+        parser = argparse.ArgumentParser()
+        parser.add_argument("name")
+        print(parser.prog, parser.parse_args().name, optparse.OptionParser().parse_args()[1])
+        print(fileinput.input().__dict__["_files"])
+        """
+    assert log(drive(text))[:2] == ["program0.py v01 ['v01']", "('v01',)"]

@@ -50,13 +50,16 @@ CORES = 4
 """Cores that a program sees: the size of a pool of threads may not depend on the machine."""
 _OWN_COPIES = (
     "_threading_local",
+    "argparse",
     "concurrent",
     "concurrent.futures",
     "concurrent.futures._base",
     "concurrent.futures.thread",
+    "fileinput",
     "logging",
     "logging.config",
     "logging.handlers",
+    "optparse",
     "queue",
     "random",
     "sched",
@@ -65,7 +68,8 @@ _OWN_COPIES = (
     "threading",
     "uuid",
 )
-"""Modules of the standard library of which each program has its own, as they block, draw or keep such objects."""
+"""Modules of the standard library of which each program has its own: they block, draw, keep such objects, or read
+the words of the command."""
 _ABSENT = ("_queue",)
 """Accelerators whose Python version is taken, as they block in C."""
 _SHARED = ("vnet", "agents", "emulator", "greenlet")

@@ -10,6 +10,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 import zenoh.handlers
+import zenoh.shm
 
 from vnet.errors import ProgramError
 from vnet.gateway.emulated import advanced, queries, sessions, values
@@ -94,12 +95,13 @@ def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, 
         __path__=[],
         ext=ext,
         handlers=handlers,
+        shm=zenoh.shm,
         open=open_session,
         scout=scout,
         try_init_log_from_env=lambda: None,
         init_log_from_env_or=lambda level: None,
     )
-    return {"zenoh": package, "zenoh.ext": ext, "zenoh.handlers": handlers}
+    return {"zenoh": package, "zenoh.ext": ext, "zenoh.handlers": handlers, "zenoh.shm": zenoh.shm}
 
 
 async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
