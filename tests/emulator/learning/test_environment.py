@@ -17,8 +17,6 @@ from emulator import Moment
 from vnet import Fix, Node, Packet
 from vnet.errors import VnetError
 
-pytestmark = pytest.mark.slow
-
 ROAD = {"road": "ring", "length_m": 1000.0, "gap_m": 40.0, "speed_mps": 10.0}
 
 
@@ -65,6 +63,7 @@ def play(env: Any, acceleration: float = 1.0, seed: int = 1) -> list[Any]:
     return steps
 
 
+@pytest.mark.slow
 def test_it_passes_pettingzoo_s_test_of_parallel_environments(capsys: pytest.CaptureFixture[str]) -> None:
     env = make()
     parallel_api_test(env, num_cycles=40)
@@ -73,6 +72,7 @@ def test_it_passes_pettingzoo_s_test_of_parallel_environments(capsys: pytest.Cap
     assert threads() == 0
 
 
+@pytest.mark.slow
 def test_it_passes_pettingzoo_s_test_of_seeds() -> None:
     parallel_seed_test(make, num_cycles=30)
 
@@ -89,6 +89,7 @@ def test_actions_drive_vehicles_and_frames_are_heard() -> None:
         assert (terminated[agent], truncated[agent], infos[agent]) == (False, True, {})
 
 
+@pytest.mark.slow
 def test_an_agent_without_an_action_does_nothing() -> None:
     env = make()
     env.reset(seed=1)
@@ -100,6 +101,7 @@ def test_an_agent_without_an_action_does_nothing() -> None:
     assert observed["v01"][1] == 0
 
 
+@pytest.mark.slow
 def test_each_episode_has_the_next_seed() -> None:
     env = make()
     first, second, third = (env.reset(seed=seed)[0]["v01"].tolist() for seed in (5, None, 5))
@@ -109,6 +111,7 @@ def test_each_episode_has_the_next_seed() -> None:
     other.close()
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_leaves_is_terminated() -> None:
     road = {"road": "straight", "length_m": 200.0, "start_m": [195.0, 100.0, 60.0, 20.0]}
     steps = play(make(road), acceleration=0.0)
@@ -118,6 +121,7 @@ def test_a_vehicle_that_leaves_is_terminated() -> None:
     assert all(steps[-1][3][agent] for agent in ("v02", "v03", "v04"))
 
 
+@pytest.mark.slow
 def test_a_killed_program_s_agent_is_terminated_and_not_revived() -> None:
     fault = {"kind": "kill", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}
     steps = play(make(sections={"fault": [fault]}))
@@ -149,6 +153,7 @@ def collided(agent: str, moment: Moment) -> bool:
     return any(event.kind == "collision" and event.node == agent for event in moment.events)
 
 
+@pytest.mark.slow
 def test_nothing_is_kept_but_in_the_folder_that_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     play(make())
@@ -175,6 +180,7 @@ def test_an_error_of_the_user_s_function_is_raised_and_ends_the_episode() -> Non
         env.step({})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [3, 5], ids=["on the way", "at the end"])
 @pytest.mark.parametrize("which", ["reward", "terminated"])
 def test_an_error_in_a_reward_ends_the_episode_too(which: str, step: int) -> None:

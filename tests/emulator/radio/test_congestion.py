@@ -49,7 +49,7 @@ def windows(control: ReactiveControl | LimericControl, *ratios: float, first: in
 def pause_ms(control: ReactiveControl | LimericControl) -> int:
     """Return the pause of the first sender in ms at the present channel busy ratio."""
     control.record_transmission(0, 0, 448_000)
-    return next(ms for ms in range(300) if control.next_poll_ns(0, ms * MS) == ms * MS)
+    return next(ms for ms in range(2000) if control.next_poll_ns(0, ms * MS) == ms * MS)
 
 
 def test_the_reactive_states_are_reached_one_after_the_other() -> None:
@@ -92,10 +92,10 @@ def test_senders_measure_each_on_its_own_clock() -> None:
 
 def test_limeric_takes_the_mean_of_two_windows() -> None:
     steady, by_turns = (LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1)) for _ in range(2))
-    for first in range(2000):
+    for first in range(300):
         windows(steady, 0.5, first=first)
         windows(by_turns, float(first % 2), first=first)
-    assert by_turns.share[0] == pytest.approx(steady.share[0], rel=1e-4)
+    assert by_turns.share[0] == pytest.approx(steady.share[0], rel=1e-3)
 
 
 @pytest.mark.slow
