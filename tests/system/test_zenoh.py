@@ -96,6 +96,25 @@ def test_faults_end_pause_and_start_the_commands_with_their_vehicle(vnet: Vnet, 
     assert not {"v01", "v02"} & set(silent)
 
 
+def test_what_programs_say_before_the_start_is_sent_then(vnet: Vnet, tmp_path: Path) -> None:
+    """A program that puts once, or asks once, may do so as soon as it has connected."""
+    does = (
+        "told = lambda sample: print('told', sample.key_expr, sample.payload.to_string()); "
+        "answer = lambda query: query.reply('asked/' + name, 'yes'); "
+        "kept = session.declare_subscriber('once/**', told), session.declare_queryable('asked/' + name, answer); "
+        "[session.put('once/' + name, text) for text in ('first', 'last')]; "
+        "[print('answered', reply.ok.key_expr) for reply in session.get('asked/**')]"
+    )
+    changes = ("loss = 0.1", "loss = 0.0"), ("duration_s = 8.0", "duration_s = 4.0")
+    done = vnet("run", scenario(tmp_path, command(does), *changes))
+    assert done.status in SLOW
+    for node in ("v01", "v02", "v03", "v04"):
+        log = (done.folder / f"logs/{node}.log").read_text()
+        others = [other for other in ("v01", "v02", "v03", "v04") if other != node]
+        assert {f"once/{other} last" for other in others} <= set(re.findall(r"told (.*)", log))
+        assert {f"asked/{other}" for other in others} <= set(re.findall(r"answered (.*)", log))
+
+
 def test_a_command_that_fails_is_a_crash_of_its_vehicle_alone(vnet: Vnet, tmp_path: Path) -> None:
     fails = command("time.sleep(1); sys.exit(3 if name == 'v02' else 0)")
     done = vnet("run", scenario(tmp_path, fails, ("duration_s = 8.0", "duration_s = 4.0")))

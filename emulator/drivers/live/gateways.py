@@ -65,7 +65,9 @@ class _Vehicle:
     is_ready: bool = False
     is_paused: bool = False
     on_air: bool = False
-    """True from time 0, or from its return, on: what programs put before stays in the vehicle."""
+    """True from time 0, or from its return, on."""
+    early: dict[object, tuple[str, Any]] = field(default_factory=dict)
+    """Queries of its programs and the latest sample of each key, which wait until then."""
     outbox: list[SentFrame] = field(default_factory=list)
     reports: list[Report] = field(default_factory=list)
     notes: list[wire.Note] = field(default_factory=list)
@@ -370,8 +372,11 @@ class Gateways:
                 self._note(vehicle, "debug", f"a frame of {packet.sender} is no sample: {error}")
 
     def _go_on_air(self, vehicle: _Vehicle) -> None:
-        """Begin to send what the programs put, and their tokens, and to acknowledge once a second."""
+        """Begin to send what the programs put and have put, and their tokens, and to acknowledge once a second."""
         vehicle.on_air = True
+        for what, told in vehicle.early.values():
+            self.take(what, (vehicle.gateway, told))
+        vehicle.early.clear()
         self._acknowledge(vehicle)
         self._renew_tokens(vehicle)
         self._tell_clock(vehicle)
@@ -417,8 +422,9 @@ class Gateways:
             return
         if what == "report":
             self._take_report(vehicle, told)
-        elif what == "query" and not vehicle.on_air:
-            told.drop()
+        elif what in ("query", "message") and not vehicle.on_air:
+            vehicle.early.pop(key := getattr(told, "key", told), None)
+            vehicle.early[key] = what, told
         elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
             self._transmit(vehicle, message)
         elif what == "session":
