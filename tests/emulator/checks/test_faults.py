@@ -20,8 +20,6 @@ from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
 from vnet.node import Node
 
-pytestmark = pytest.mark.slow
-
 NEEDED: dict[str, dict[str, Any]] = {
     "loss": {"probability": 0.5},
     "delay": {"delay_ms": 200.0},
@@ -131,6 +129,7 @@ def some(recorded: RecordedRun, *outcomes: str, cause: str = "", copies: bool = 
     return np.flatnonzero(recorded.outcome_is(*outcomes) & named & ((recorded.copy > 0) == copies))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_with_a_fault_of_any_kind_is_valid_and_the_fault_took_effect(kind: str) -> None:
     recorded = with_fault(kind)
@@ -140,6 +139,7 @@ def test_a_run_with_a_fault_of_any_kind_is_valid_and_the_fault_took_effect(kind:
     assert isinstance(effect, NotExercised if cannot_show else CheckResult)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["skew", "drift"])
 def test_a_bent_clock_shows_where_a_program_sends_by_its_clock(kind: str) -> None:
     recorded = simulated(fault(kind), program=f"{__name__}:sends_by_the_clock")
@@ -154,6 +154,7 @@ async def sends_by_the_clock(node: Node) -> None:
         await node.radio.broadcast(b"tick")
 
 
+@pytest.mark.slow
 def test_many_faults_at_once_are_told_apart() -> None:
     kinds: tuple[str, ...] = (
         "partition",
@@ -174,6 +175,7 @@ def test_many_faults_at_once_are_told_apart() -> None:
     assert invalid == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("queue_frames", [2, 64])
 def test_what_a_throttle_left_waiting_does_not_make_later_frames_too_early(queue_frames: int) -> None:
     slow = [fault("throttle", bitrate_mbps=0.0005), fault("throttle", bitrate_mbps=0.002, at_s=4.0, duration_s=1.0)]
@@ -181,6 +183,7 @@ def test_what_a_throttle_left_waiting_does_not_make_later_frames_too_early(queue
     assert not_valid(recorded) == {}
 
 
+@pytest.mark.slow
 def test_stale_frames_that_were_cut_tell_nothing_of_what_was_said() -> None:
     faults = [fault("StaleMessages", at_s=1.0, duration_s=3.0), fault("DataReplay", at_s=2.0), fault("block")]
     everybody = [{**described, "nodes": {}, "senders": {}} for described in faults[2:]]
@@ -189,12 +192,14 @@ def test_stale_frames_that_were_cut_tell_nothing_of_what_was_said() -> None:
     assert Verdict.INVALID not in not_valid(simulated(*faults[:2], *everybody)).values()
 
 
+@pytest.mark.slow
 def test_a_fault_that_was_healed_before_it_began_leaves_nothing_to_see() -> None:
     recorded = simulated(fault("kill", duration_s=1e-10))
     assert not_valid(recorded) == {}
     assert result(recorded, "effect:kill-0") == NotExercised("effect:kill-0", "it was healed before it began")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "holding"), [("DoS", "kill"), ("Sybil", "pause"), ("DataReplay", "pause"), ("StaleMessages", "kill")]
 )
@@ -224,6 +229,7 @@ def test_a_pair_that_no_fault_explains_is_found(cause: str) -> None:
     assert set(damaged(recorded, with_cells(recorded.trace, "cause", row, cause))) == {"causes"}
 
 
+@pytest.mark.slow
 def test_a_fault_outside_its_time_or_its_links_is_found() -> None:
     recorded = with_fault("block")
     outside = some(recorded, "lost")[0]
@@ -238,6 +244,7 @@ def test_a_fault_outside_its_time_or_its_links_is_found() -> None:
     assert set(damaged(recorded, forged)) == {"causes"}
 
 
+@pytest.mark.slow
 def test_without_faults_nothing_may_be_their_doing() -> None:
     recorded = simulated()
     assert isinstance(result(recorded, "causes"), NotExercised)
@@ -284,6 +291,7 @@ def test_a_fix_in_an_outage_or_none_without_is_found(seconds: float) -> None:
     assert len(checked(moved, "outage_respected").figures["rows"]) == 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["loss", "burst_loss"])
 def test_a_fault_that_loses_too_little_or_too_much_is_found(kind: str) -> None:
     recorded = with_fault(kind)
@@ -298,6 +306,7 @@ def test_a_fault_that_loses_too_little_or_too_much_is_found(kind: str) -> None:
     assert f"loss_rate:{label}" in damaged(recorded, more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_ms", [0.5, 40.0])
 @pytest.mark.parametrize("kind", ["gnss_jump", "delay", "throttle"])
 def test_an_arrival_that_is_too_early_or_too_late_is_found(kind: str, late_ms: float) -> None:
@@ -309,6 +318,7 @@ def test_an_arrival_that_is_too_early_or_too_late_is_found(kind: str, late_ms: f
     assert len(found["latency"].figures["rows"]) == 1
 
 
+@pytest.mark.slow
 def test_latencies_that_are_all_possible_and_together_are_not() -> None:
     recorded = with_fault("gnss_jump")
     arrived = np.flatnonzero(recorded.arrived)
@@ -325,6 +335,7 @@ def test_a_delay_that_a_fault_owed_is_missed() -> None:
     assert found == {"latency": Verdict.INVALID, "fault_events": Verdict.INVALID}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gnss_jump", "duplicate", "DoS", "DataReplay"])
 def test_other_bytes_than_were_sent_are_found(kind: str) -> None:
     recorded = with_fault(kind)
@@ -333,6 +344,7 @@ def test_other_bytes_than_were_sent_are_found(kind: str) -> None:
     assert set(damaged(recorded, with_cells(recorded.trace, "payload_digest", row, 12345))) == {"isolation"}
 
 
+@pytest.mark.slow
 def test_a_stale_frame_of_another_age_is_found() -> None:
     recorded = with_fault("StaleMessages")
     label = "StaleMessages-0"
@@ -342,6 +354,7 @@ def test_a_stale_frame_of_another_age_is_found() -> None:
     assert set(damaged(recorded, with_cells(recorded.trace, "payload_digest", same, 12345))) == {"isolation"}
 
 
+@pytest.mark.slow
 def test_a_program_that_heard_more_than_arrived_is_found() -> None:
     recorded = with_fault("partition")
     rows = recorded.states.to_pylist()
@@ -359,6 +372,7 @@ def test_copies_without_a_cause_or_with_a_number_missing_break_conservation() ->
     assert set(damaged(recorded, kept)) == {"conservation", "copies"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["DoS", "Sybil"])
 def test_a_frame_that_was_not_sent_as_often_as_it_should_be_is_found(kind: str) -> None:
     recorded = with_fault(kind)
@@ -382,6 +396,7 @@ def test_a_frame_that_was_sent_more_often_or_later_than_planned_is_found(
     assert not_valid(replace(with_fault(kind), scenario=other)) == {"copies": Verdict.INVALID}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "key"), [("gnss_jump", "offset_m"), ("gnss_ramp", "rate_m_s")])
 def test_fixes_that_stray_otherwise_than_they_should_are_found(kind: str, key: str) -> None:
     recorded = with_fault(kind)
@@ -400,6 +415,7 @@ def test_a_receiver_that_is_too_good_or_too_bad_is_found() -> None:
         assert not_valid(forged) == {"gnss": Verdict.INVALID}
 
 
+@pytest.mark.slow
 def test_bytes_that_a_corruption_left_alone_show_none() -> None:
     recorded = with_fault("corrupt")
     rows = some(recorded, "delivered", cause="corrupt-0")
@@ -428,6 +444,7 @@ def test_an_arrival_before_the_sending_or_without_a_time_breaks_conservation() -
         assert found["conservation"].figures["mistimed"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in (*RESTARTS, "skew", "drift", "partition")])
 def test_a_fault_that_acts_on_nobody_is_unknown(kind: str) -> None:
     nowhere = {"disc": [1e7, 1e7, 1.0]}
@@ -437,12 +454,14 @@ def test_a_fault_that_acts_on_nobody_is_unknown(kind: str) -> None:
     assert Verdict.INVALID not in found.values()
 
 
+@pytest.mark.slow
 def test_a_fault_that_the_run_did_not_come_to_is_unknown() -> None:
     recorded = with_fault("loss")
     cut = replace(recorded, events=[*recorded.events, Event(1_500_000_000, "interrupted", None, {})])
     assert verdict(cut, "effect:loss-0") is Verdict.UNKNOWN
 
 
+@pytest.mark.slow
 def test_restarts_of_the_router_need_an_event_where_there_is_a_router() -> None:
     recorded = with_fault("router_restart")
     live = [Event(0, "started", None, {"start_up_s": 2.0}), *recorded.events[1:]]
@@ -451,6 +470,7 @@ def test_restarts_of_the_router_need_an_event_where_there_is_a_router() -> None:
     assert verdict(replace(recorded, events=told), "effect:router_restart-0") is Verdict.VALID
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["kill", "loss"])
 def test_a_node_that_falls_silent_after_the_last_fault_is_found(kind: str) -> None:
     recorded = with_fault(kind)
