@@ -3,13 +3,13 @@
 Each vehicle is an interface, with the frames that it sent (outbound, at the time they were enqueued or, with
 `[radio.mac]`, went on air) and those delivered to it (inbound, at their arrival). A packet consists of radiotap, a
 QoS data frame of 802.11 outside a BSS (as in 802.11p), LLC and SNAP with the ethertype 0x88B5 for local
-experiments, and the payload; a CAM or DENM may have the headers and the ethertype that it has on air. A frame to
-one vehicle asks for an acknowledgement, which is a packet of its own; retries have the retry bit. Payloads that the
-run has not kept, or that a fault has altered, are truncated (captured length < length); the digest is in the
-packet's comment. Frames without a node in range have no rows in the trace and are missing. Times are nanoseconds
-from the start of the run.
+experiments, and the payload; a CAM or DENM may have the headers and the ethertype that it has on air. With C-V2X
+the header is Ethernet's in place of 802.11's. A frame to one vehicle asks for an acknowledgement, which is a packet
+of its own; retries have the retry bit. Payloads that the run has not kept, or that a fault has altered, are
+truncated (captured length < length); the digest is in the packet's comment. Frames without a node in range have no
+rows in the trace and are missing. Times are nanoseconds from the start of the run.
 
-Formats: draft-ietf-opsawg-pcapng; radiotap.org. Link type 127 is 802.11 with radiotap.
+Formats: draft-ietf-opsawg-pcapng; radiotap.org. Link type 127 is 802.11 with radiotap, 1 is Ethernet.
 
 A program broadcasts a CAM or a DENM (release 1, in unaligned PER) as it is. On air such a message follows BTP-B
 (EN 302 636-5-1) and GeoNetworking (EN 302 636-4-1 V1.4.1): a CAM as a single-hop broadcast, a DENM as a broadcast
@@ -151,8 +151,8 @@ def _long_position(sender: int, time_ns: int, station: Station) -> bytes:
     return address + place + struct.pack(">HH", 0x8000 | min(station.speed, 0x3FFF), station.heading)
 
 
-LINKTYPE_RADIOTAP = 127
-"""Link type of the interfaces: 802.11 with radiotap."""
+LINKTYPE_ETHERNET, LINKTYPE_RADIOTAP = 1, 127
+"""Link types of the interfaces: of C-V2X, and of 802.11."""
 ETHERTYPE = 0x88B5
 """Ethertype for local experiments."""
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
@@ -199,11 +199,12 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
         raise VnetError("--payloads its: the run has kept no payloads; run it with --set run.keep_payloads=true")
     routers = Router() if as_its else None
     file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + _option(_APPLICATION, b"vnet")))
+    headers, comments = _Headers(recorded), _Comments(recorded)
+    link_type = LINKTYPE_ETHERNET if headers.are_ethernets else LINKTYPE_RADIOTAP
     for node in recorded.node_ids:
         described = _option(_NAME, node.encode()) + _option(_DESCRIPTION, f"vehicle {node}".encode())
-        body = struct.pack("<HHI", LINKTYPE_RADIOTAP, 0, 0) + described + _option(_RESOLUTION, b"\x09")
+        body = struct.pack("<HHI", link_type, 0, 0) + described + _option(_RESOLUTION, b"\x09")
         file.write(_block(_INTERFACE, body))
-    headers, comments = _Headers(recorded), _Comments(recorded)
     columns = [recorded.sender, recorded.seq, recorded.column("size_bytes")]
     count = 0
     for packet in _packets(recorded):
@@ -317,16 +318,20 @@ def _radiotap(bitrate_mbps: float) -> bytes:
 
 
 class _Headers:
-    """Radiotap and 802.11 headers of the packets of a run."""
+    """Headers of the packets of a run: radiotap and 802.11, or Ethernet on a sidelink."""
 
     def __init__(self, recorded: RecordedRun) -> None:
         self._recorded = recorded
         rates = np.unique(recorded.bitrate_mbps).tolist()
         self._radiotaps = {rate: _radiotap(rate) for rate in (*rates, *BASIC_RATES_MBPS)}
+        self.are_ethernets = recorded.scenario.radio.sidelink is not None
+        """True for the headers of Ethernet."""
 
     def of_frame(self, row: int, ethertype: int) -> bytes:
-        """Return the headers of the frame of a row: radiotap, QoS data outside a BSS, LLC, SNAP."""
+        """Return the headers of the frame of a row: radiotap, QoS data outside a BSS, LLC, SNAP; or Ethernet."""
         recorded = self._recorded
+        if self.are_ethernets:
+            return _BROADCAST + _address(int(recorded.sender[row])) + struct.pack(">H", ethertype)
         rate, attempt = float(recorded.bitrate_mbps[row]), int(recorded.attempt[row])
         control, duration_us, receiver, qos = _QOS_DATA, 0, _BROADCAST, _NO_ACK
         if attempt:

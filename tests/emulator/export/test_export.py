@@ -207,6 +207,23 @@ def test_a_packet_has_the_bit_rate_of_its_own_frame(tmp_path: Path) -> None:
         assert packet["bytes"][9] / 2 == rates[seq]
 
 
+def test_a_frame_of_c_v2x_has_an_ethernet_header(tmp_path: Path) -> None:
+    radio = {"path_loss": {"kind": "winner_b1", "floor_dbm": -150.0}, "mac": {"kind": "lte-mode4"}}
+    run = {"duration_s": 1.0, "settle_s": 0.1, "keep_payloads": True}
+    scenario = {"run": run, "network": {"vehicles": 2, "layout": "dense"}, "radio": radio}
+    program = {"entry": "agents.beacon:main"}
+    run_scenario(tmp_path / "run", Scenario.model_validate({**scenario, "program": program}))
+    recorded, file = OpenedRun.open(tmp_path / "run"), io.BytesIO()
+    write_pcapng(recorded, file)
+    assert {struct.unpack_from("<H", body)[0] for kind, body in blocks(file.getvalue()) if kind == 1} == {1}
+    found = packets(file.getvalue())
+    assert {packet["interface"] for packet in found} == {0, 1}
+    for packet in found:
+        sender = recorded.node_ids.index(packet["comment"].split(" ")[0])
+        header = b"\xff" * 6 + bytes([2, 0, 0, 0, 0, sender + 1]) + b"\x88\xb5"
+        assert packet["bytes"].startswith(header) and packet["length"] == len(packet["bytes"]) > len(header)
+
+
 def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRun) -> None:
     for packet in packets(capture):
         fields = packet["comment"].split("; ")
