@@ -105,7 +105,13 @@ def test_what_programs_say_before_the_start_is_sent_then(vnet: Vnet, tmp_path: P
         "[session.put('once/' + name, text) for text in ('first', 'last')]; "
         "[print('answered', reply.ok.key_expr) for reply in session.get('asked/**')]"
     )
-    changes = ("loss = 0.1", "loss = 0.0"), ("duration_s = 8.0", "duration_s = 4.0")
+    patient = 'kind = "zenoh"', 'kind = "zenoh"\nzenoh = { query_s = 6.0 }'
+    changes = (
+        patient,
+        ("loss = 0.1", "loss = 0.0"),
+        ("at_s = 3.0", "at_s = 7.0"),
+        ("duration_s = 2.0", "duration_s = 0.5"),
+    )
     done = vnet("run", scenario(tmp_path, command(does), *changes))
     assert done.status in SLOW
     for node in ("v01", "v02", "v03", "v04"):
