@@ -243,7 +243,7 @@ class InformationEstimator:
         self, weights: Sequence[float], priors: Sequence[Five], now: Sequence[Five], before: Sequence[Five]
     ) -> None:
         """Replace what is known of c by pooled `priors`, and increments of this period and the one before."""
-        about_c = [increment for increment in (*now, *before) if increment[2] >= 0]
+        about_c = [increment for increment in (*now, *before) if not is_of_lane(increment)]
         if not (self._lanes and self._lanes.has_joined):
             if self.imported:
                 self.own.absorb(_pooled(weights, priors, about_c))
@@ -417,11 +417,11 @@ class InformationEstimator:
         origins, increments, has_joined = [], [], self._lanes is not None and self._lanes.has_joined
         for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):
             if share < 1:
-                is_about_c = increment[2] >= 0
-                if is_about_c and has_joined:
+                of_lane = is_of_lane(increment)
+                if has_joined and not of_lane:
                     continue  # c has moved since, which precise receivers see
                 origins.append(code)
-                increments.append(scaled_by(increment, (PASSED_SHARE if is_about_c else 1.0) * (1 - share)))
+                increments.append(scaled_by(increment, (1.0 if of_lane else PASSED_SHARE) * (1 - share)))
         if not origins or not self._options.defence:
             return increments
         x, y, p, q, r = self.own.plain_moments

@@ -205,7 +205,8 @@ def decode(payload: bytes) -> InformationFrame:
     _check(prior, increment, running_sum)
     heard, out_neighbours, names_heard = _heard(payload[_HEADER.size : flags_end], heard_count)
     records = tuple(dict.fromkeys(chain.from_iterable(_AS_BYTES.iter_unpack(payload[flags_end:end]))))
-    _ = [*map(passed_increment.cached, records)]  # raises FrameError
+    for record in records:
+        passed_increment.cached(record)
     frame = InformationFrame(
         name=name_of_code(name),
         fix_time_ns=fix_time_ns,

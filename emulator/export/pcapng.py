@@ -200,10 +200,9 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
     routers = Router() if as_its else None
     file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + _option(_APPLICATION, b"vnet")))
     headers, comments = _Headers(recorded), _Comments(recorded)
-    link_type = LINKTYPE_ETHERNET if headers.are_ethernets else LINKTYPE_RADIOTAP
     for node in recorded.node_ids:
         described = _option(_NAME, node.encode()) + _option(_DESCRIPTION, f"vehicle {node}".encode())
-        body = struct.pack("<HHI", link_type, 0, 0) + described + _option(_RESOLUTION, b"\x09")
+        body = struct.pack("<HHI", headers.link_type, 0, 0) + described + _option(_RESOLUTION, b"\x09")
         file.write(_block(_INTERFACE, body))
     columns = [recorded.sender, recorded.seq, recorded.column("size_bytes")]
     count = 0
@@ -324,13 +323,12 @@ class _Headers:
         self._recorded = recorded
         rates = np.unique(recorded.bitrate_mbps).tolist()
         self._radiotaps = {rate: _radiotap(rate) for rate in (*rates, *BASIC_RATES_MBPS)}
-        self.are_ethernets = recorded.scenario.radio.sidelink is not None
-        """True for the headers of Ethernet."""
+        self.link_type = LINKTYPE_RADIOTAP if recorded.scenario.radio.sidelink is None else LINKTYPE_ETHERNET
 
     def of_frame(self, row: int, ethertype: int) -> bytes:
         """Return the headers of the frame of a row: radiotap, QoS data outside a BSS, LLC, SNAP; or Ethernet."""
         recorded = self._recorded
-        if self.are_ethernets:
+        if self.link_type == LINKTYPE_ETHERNET:
             return _BROADCAST + _address(int(recorded.sender[row])) + struct.pack(">H", ethertype)
         rate, attempt = float(recorded.bitrate_mbps[row]), int(recorded.attempt[row])
         control, duration_us, receiver, qos = _QOS_DATA, 0, _BROADCAST, _NO_ACK

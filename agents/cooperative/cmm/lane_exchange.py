@@ -11,6 +11,7 @@ from agents.cooperative.cmm.lane_memory import (
     LaneFilter,
     Moments,
     information_of,
+    is_of_lane,
     kind_of_increment,
     summed,
 )
@@ -126,7 +127,7 @@ class LaneExchange:
         if self.has_joined:
             return
         self._waited += self._waits
-        heard = [round(increment[4]) for increment in increments if increment[2] < 0]
+        heard = [round(increment[4]) for increment in increments if is_of_lane(increment)]
         ages = sorted(age for age in heard if age >= 0)
         if ages:
             self._begin(ages[len(ages) // 2])

@@ -135,7 +135,7 @@ class Gateways:
     def _check(self, node_ids: Sequence[str]) -> None:
         """Raise ProgramError for what is no command, and for vehicles without a port, before anything starts."""
         for words in self._program.all_commands if self._starts else ():
-            _found(words)
+            _located(words)
         port = int(self._settings.listen.rpartition(":")[2])
         if port and port + len(node_ids) - 1 > HIGHEST_PORT:
             raise ProgramError(
@@ -345,7 +345,7 @@ class Gateways:
         try:
             for number, words in enumerate(commands, start=1):
                 name = node if number == 1 else f"{node}~{number}"
-                words = filled_in(_found(words), node, endpoint)
+                words = filled_in(_located(words), node, endpoint)
                 self._launcher.start_command(name, words, environment, vehicle.nice)
                 vehicle.names.append(name)
                 self._vehicle_of[name] = node
@@ -423,7 +423,8 @@ class Gateways:
         if what == "report":
             self._take_report(vehicle, told)
         elif what in ("query", "message") and not vehicle.on_air:
-            vehicle.early.pop(key := getattr(told, "key", told), None)
+            key = getattr(told, "key", told)  # each query is kept
+            vehicle.early.pop(key, None)
             vehicle.early[key] = what, told
         elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
             self._transmit(vehicle, message)
@@ -545,7 +546,7 @@ class Gateways:
         )
 
 
-def _found(words: Sequence[str]) -> list[str]:
+def _located(words: Sequence[str]) -> list[str]:
     """Return the words of a command with the path of its first. Raises ProgramError if there is no such command."""
     found = sys.executable if words[0] in PYTHON else shutil.which(words[0])
     if found is None:
