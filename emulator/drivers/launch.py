@@ -34,6 +34,8 @@ LOG_TAIL_LINES = 12
 LOWEST_PRIORITY = 19
 STARVED = 0.1
 """Share of a processor below which a process that wants to run has got none: its machine keeps it from ending."""
+STARVED_LOOKS = 10
+STARVED_LOOK_S = 0.02
 MOST_ZYGOTES = 3
 """Attempts to fork an agent: a zygote that has ended is started again."""
 
@@ -375,12 +377,25 @@ class Launcher:
 
 
 def _is_starved(pid: int, before_ns: int, wall_s: float) -> bool:
-    """Return whether a process wants to run, or waits for a disk, and has had less than a tenth of a processor."""
+    """Return whether a process wants to run, or waits for a disk, and has had less than a tenth of a processor.
+
+    One that sleeps again and again may want to run at one look: it is starved if it wants to at each of several.
+    """
+    if (cpu_time_ns(pid) or 0) - before_ns >= STARVED * wall_s * NS_PER_S:
+        return False
+    for _ in range(STARVED_LOOKS):
+        if _state_of(pid) not in "RD":
+            return False
+        time.sleep(STARVED_LOOK_S)
+    return True
+
+
+def _state_of(pid: int) -> str:
+    """Return the letter of proc_pid_stat(5) for a process; R if it has just ended, or this system does not say."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:  # it has just ended, or this system does not say
-        return True
-    return state in "RD" and (cpu_time_ns(pid) or 0) - before_ns < STARVED * wall_s * NS_PER_S
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return "R"
 
 
 def _cannot_start(name: str, reason: str | None) -> VnetError:

@@ -48,11 +48,7 @@ async def exits_at_exit(node: Node) -> None:
 async def never_ends(node: Node) -> None:
     """Sleeps for ever, in v02."""
 
-    def sleep() -> None:
-        while True:
-            time.sleep(0.1)
-
-    await _runs(node, sleep)
+    await _runs(node, lambda: time.sleep(3600))
 
 
 async def handles_at_the_end(node: Node) -> None:

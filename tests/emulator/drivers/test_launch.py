@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from emulator.drivers import launch
 from emulator.drivers.launch import Launcher
 from tests.support.processes import has_ended
 from vnet.transport.access import Access
@@ -30,6 +31,20 @@ def test_what_must_not_starve_has_a_session_of_its_own(tmp_path: Path) -> None:
     launcher.wait_for("recorder", 60.0)
     launcher.stop()
     assert launcher.log_tail("recorder").split() == [str(pid), "True"]
+
+
+@pytest.mark.parametrize(("states", "is_told"), [("R" * 50, False), ("RRDRRRS", True), ("S", True)])
+def test_an_end_is_overdue_unless_the_process_wants_to_run_at_each_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, states: str, is_told: bool
+) -> None:
+    """One that sleeps again and again was once taken for one that gets no processor."""
+    seen = iter(states)
+    monkeypatch.setattr(launch, "_state_of", lambda _: next(seen))
+    launcher = Launcher(tmp_path)
+    launcher.start("v1", ["-c", "import time; time.sleep(600)"], None, {})
+    monkeypatch.setattr(launch, "cpu_time_ns", lambda _: 0)
+    ends = launcher.stop(0.01)
+    assert [end.how for end in ends.values()] == (["did not end within 0.01 s"] if is_told else [])
 
 
 FORKS = "import os, sys, time; child = os.fork(); child or time.sleep(600); print(child, flush=True)"
