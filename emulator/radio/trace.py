@@ -246,6 +246,12 @@ class Trace:
             rows["payload_digest"][i] = self._altered[int(number[i])]
         return rows
 
+    def _column(self, name: str, index: NDArray[np.intp] | slice) -> NDArray[Any]:
+        """Return a column of the rows at `index`; digests are those of the payloads that were sent."""
+        if name in (_RECEPTION.fields or ()):
+            return np.asarray(self._receptions.records[name][index])
+        return np.asarray(self._frames.records[name][self._receptions.records["frame"][index]])
+
     def to_table(self) -> pa.Table:
         """Return the trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
 
@@ -257,38 +263,41 @@ class Trace:
         acknowledgement (null without one), and `acked`, whether the sender received that. Where the machine
         delivered late, in real time, there is `late_ns`, its part of the latency.
         """
-        rows = self.rows(slice(None))
-        order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
-        rows = rows[order]
-        outcome_names = [outcome.name for outcome in Outcome]
+        receptions, frames, powers = self._receptions.records, self._frames.records, self._powers.records
+        keys = ("copy", "receiver", "seq", "sender", "sent_ns")
+        order = np.lexsort([self._column(name, slice(None)) for name in keys])
+        digest = self._column("payload_digest", order)
+        for i in np.flatnonzero(receptions["altered"][order]).tolist():
+            digest[i] = self._altered[int(order[i])]
 
         def named(column: str, names: Sequence[str]) -> pa.DictionaryArray:
-            return pa.DictionaryArray.from_arrays(
-                pa.array(rows[column].astype(np.int32)), pa.array(list(names), pa.string())
-            )
+            codes = pa.array(self._column(column, order).astype(np.int32))
+            return pa.DictionaryArray.from_arrays(codes, pa.array(list(names), pa.string()))
 
-        times = ("arrival_ns", "on_air_ns")
-        chosen = self._frames.records[self._receptions.records["frame"][order]] if self.chooses else None
-        exchanged = self._frames.records[self._receptions.records["frame"][order]] if self.acknowledges else None
-        powers = self._powers.records[order] if self.knows_power else None
-        arrival, on_air = (pa.array(rows[name], mask=rows[name] == NOT_ARRIVING) for name in times)
+        def plain(column: str) -> pa.Array:
+            return pa.array(self._column(column, order))
+
+        def optional(column: str) -> pa.Array:
+            values = self._column(column, order)
+            return pa.array(values, mask=values == NOT_ARRIVING)
+
         return pa.table(
             {
-                "sent_ns": pa.array(rows["sent_ns"]),
+                "sent_ns": plain("sent_ns"),
                 "sender": named("sender", self._node_ids),
-                "seq": pa.array(rows["seq"]),
+                "seq": plain("seq"),
                 "receiver": named("receiver", self._node_ids),
-                "size_bytes": pa.array(rows["size_bytes"]),
-                "payload_digest": pa.array(rows["payload_digest"]),
-                "outcome": named("outcome", outcome_names),
+                "size_bytes": plain("size_bytes"),
+                "payload_digest": pa.array(digest),
+                "outcome": named("outcome", [outcome.name for outcome in Outcome]),
                 "cause": named("cause", self._causes).cast(pa.string()),
-                "arrival_ns": arrival,
-                "copy": pa.array(rows["copy"]),
-                **({"on_air_ns": on_air, "left_ns": pa.array(rows["left_ns"])} if self._knows_air else {}),
-                **({} if chosen is None else {name: pa.array(chosen[name]) for name in CHOSEN}),
-                **({} if exchanged is None else _exchanges(exchanged)),
+                "arrival_ns": optional("arrival_ns"),
+                "copy": plain("copy"),
+                **({"on_air_ns": optional("on_air_ns"), "left_ns": plain("left_ns")} if self._knows_air else {}),
+                **({name: plain(name) for name in CHOSEN} if self.chooses else {}),
+                **(_exchanges(frames[receptions["frame"][order]]) if self.acknowledges else {}),
                 **({LATE: pa.array(self._late(order))} if self._late_ns else {}),
-                **({} if powers is None else {name: _in_db(powers[name]) for name in UNHASHED}),
+                **({name: _in_db(powers[name][order]) for name in UNHASHED} if self.knows_power else {}),
             }
         )
 

@@ -273,7 +273,7 @@ class RecordedRun:
     def _chosen(self, name: str, default: float) -> Array:
         """Return a column that the trace has where programs choose, or else the default."""
         if name not in self.trace.column_names:
-            return np.full(len(self.trace), default)
+            return np.broadcast_to(default, len(self.trace))
         return np.asarray(self.trace[name].to_numpy(), dtype=np.float64)
 
     @cached_property
@@ -294,7 +294,7 @@ class RecordedRun:
     def _optional(self, name: str, default: int) -> IntArray:
         """Return a column that only some traces have, or else the default."""
         if name not in self.trace.column_names:
-            return np.full(len(self.trace), default)
+            return np.broadcast_to(default, len(self.trace))
         return np.asarray(pc.fill_null(self.trace[name].cast(pa.int64()), default).to_numpy(), np.int64)
 
     @cached_property
@@ -313,13 +313,13 @@ class RecordedRun:
         return np.asarray(self.trace["payload_digest"].to_numpy(), dtype=np.uint64)
 
     @cached_property
-    def outcome(self) -> IntArray:
+    def outcome(self) -> NDArray[np.int8]:
         """Number of each row's outcome. Raises VnetError for one that there is not."""
         code, known = self._outcome
         number = {each.name: each.value for each in Outcome}
         if strange := [name for name in known[:-1] if name not in number]:
             raise VnetError(f"outcome {strange[0]!r} in the trace: there is no such outcome")
-        return np.array([*(number[str(name)] for name in known[:-1]), Outcome.pending], dtype=np.int64)[code]
+        return np.array([*(number[str(name)] for name in known[:-1]), Outcome.pending], dtype=np.int8)[code]
 
     @cached_property
     def arrived(self) -> Mask:
@@ -332,14 +332,14 @@ class RecordedRun:
         return np.asarray(np.array([name in names for name in known])[code], dtype=bool)
 
     @cached_property
-    def _outcome(self) -> tuple[NDArray[np.intp], list[str | None]]:
+    def _outcome(self) -> tuple[NDArray[np.int32], list[str | None]]:
         """The outcome of each row as a code, and the outcomes that the codes stand for."""
         column = self.trace["outcome"].combine_chunks()
         if not pa.types.is_dictionary(column.type):
             column = column.dictionary_encode()
         names = [*column.dictionary.to_pylist(), None]
         code = pc.fill_null(column.indices, len(names) - 1) if column.null_count else column.indices
-        return np.asarray(code.to_numpy(), dtype=np.intp), names
+        return np.asarray(code.to_numpy()), names
 
     @cached_property
     def placed(self) -> Mask:
@@ -562,12 +562,12 @@ class RecordedRun:
     # Faults.
 
     @cached_property
-    def cause(self) -> IntArray:
+    def cause(self) -> NDArray[np.int32]:
         """The number of the fault that a row names; NO_FAULT, or UNHEARD_OF for a name that no fault has."""
         number = {planned.label: planned.number for planned in self.plan} | {"": NO_FAULT}
         column = self.trace["cause"].cast(pa.string()).combine_chunks().dictionary_encode()
-        code = np.array([number.get(name, UNHEARD_OF) for name in column.dictionary.to_pylist()], dtype=np.int64)
-        return np.asarray(code[column.indices.to_numpy()] if len(column) else np.zeros(0), dtype=np.int64)
+        code = np.array([number.get(name, UNHEARD_OF) for name in column.dictionary.to_pylist()], dtype=np.int32)
+        return np.asarray(code[column.indices.to_numpy()] if len(column) else np.zeros(0, np.int32))
 
     def caused_by(self, *kinds: str) -> Mask:
         """Mask of the rows that name a fault of one of these kinds."""
