@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 FILLED_IN = ("{id}", "{endpoint}", "{port}")
 """Words of a command that vnet fills in."""
@@ -15,3 +18,34 @@ def filled_in(words: Sequence[str], node: str, endpoint: str) -> list[str]:
     for name, value in zip(FILLED_IN, values, strict=True):
         filled = [word.replace(name, value) for word in filled]
     return filled
+
+
+def client_config(endpoint: str) -> dict[str, Any]:
+    """Return the configuration of a session that connects to its vehicle's endpoint alone."""
+    return {
+        "mode": "client",
+        "connect": {"endpoints": [endpoint]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+    }
+
+
+def session_variables(node: str, endpoint: str, config: Mapping[str, Any], path: Path) -> dict[str, str]:
+    """Return the variables by which a program finds its endpoint; `path` is a file that has `config`.
+
+    `ZENOH_CONFIG` is read by `Config.from_env`, and `ZENOH_CONFIG_OVERRIDE` by rmw_zenoh and its clients.
+    """
+    return {
+        "ZENOH_CONFIG": str(path),
+        "ZENOH_CONFIG_OVERRIDE": ";".join(f"{key}={json.dumps(value)}" for key, value in _leaves(config)),
+        "VNET_ENDPOINT": endpoint,
+        "VNET_NODE": node,
+    }
+
+
+def _leaves(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
+    """Return the values of a nested table, with keys as Zenoh writes them, `connect/endpoints`."""
+    leaves: list[tuple[str, Any]] = []
+    for key, value in table.items():
+        name = f"{path}/{key}" if path else key
+        leaves += _leaves(value, name) if isinstance(value, dict) else [(name, value)]
+    return leaves

@@ -22,6 +22,7 @@ import zenoh
 
 from emulator.drivers.agent_keys import Hear
 from emulator.scenario.program import ZenohSessions
+from vnet.gateway import client_config, session_variables
 from vnet.gateway.frames import (
     CrossingQuery,
     CrossingReply,
@@ -338,14 +339,9 @@ def session_environment(
 ) -> dict[str, str]:
     """Return the environment in which an unmodified program connects to its vehicle's router alone.
 
-    `ZENOH_CONFIG`, a file in `folder`, is read by `Config.from_env`, and `ZENOH_CONFIG_OVERRIDE` by rmw_zenoh
-    and its clients.
+    Its configuration becomes a file in `folder`, which has passwords and is for this account alone.
     """
-    client: dict[str, Any] = {
-        "mode": "client",
-        "connect": {"endpoints": [endpoint]},
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-    }
+    client = client_config(endpoint)
     transport: dict[str, Any] = {}
     if settings.authority is not None:
         transport["link"] = {"tls": {"root_ca_certificate": str(settings.authority)}}
@@ -354,21 +350,10 @@ def session_environment(
         transport["auth"] = {"usrpwd": {"user": user, "password": password}}
     if transport:
         client["transport"] = transport
-    config = folder / f"{node}.json5"
-    config.write_text(json.dumps(client))
-    config.chmod(0o600)
-    override = ";".join(f"{key}={json.dumps(value)}" for key, value in _leaves(client))
-    own = {"ZENOH_CONFIG": str(config), "ZENOH_CONFIG_OVERRIDE": override, "VNET_ENDPOINT": endpoint}
-    return {**inherited, **own, "VNET_NODE": node}
-
-
-def _leaves(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    """Return the values of a nested table, with keys as Zenoh writes them, `connect/endpoints`."""
-    leaves: list[tuple[str, Any]] = []
-    for key, value in table.items():
-        name = f"{path}/{key}" if path else key
-        leaves += _leaves(value, name) if isinstance(value, dict) else [(name, value)]
-    return leaves
+    path = folder / f"{node}.json5"
+    path.write_text(json.dumps(client))
+    path.chmod(0o600)
+    return {**inherited, **session_variables(node, endpoint, client, path)}
 
 
 def _options(sample: CrossingSample) -> dict[str, Any]:

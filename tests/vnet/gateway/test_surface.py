@@ -14,7 +14,10 @@ from tests.support.paths import ROOT
 from vnet.gateway.emulated.programs import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
-MODULES = zenoh_modules(cast(Any, SimpleNamespace(due=None)), count().__next__)
+MODULES = zenoh_modules(
+    cast(Any, SimpleNamespace(due=None)),
+    cast(Any, SimpleNamespace(threads=SimpleNamespace(new_number=count().__next__), environ={})),
+)
 
 
 def declared(module: str) -> Iterator[ast.stmt]:

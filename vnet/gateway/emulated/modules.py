@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import builtins
-import dataclasses
 import datetime
 import importlib
 import importlib.util
@@ -19,7 +18,6 @@ import random
 import signal
 import sys
 import time
-import typing
 from collections.abc import Callable, Coroutine, Iterable, Sequence
 from concurrent import futures
 from contextvars import ContextVar
@@ -27,11 +25,13 @@ from functools import cache, partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from itertools import dropwhile
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import ModuleType
 from typing import Any, NoReturn
 from weakref import WeakKeyDictionary
 
 from vnet.errors import ProgramError, shown
+from vnet.gateway import client_config, session_variables
+from vnet.gateway.emulated.shown import hide, import_shared, show
 from vnet.gateway.emulated.strands import Threads, block_on, current_strand, run_strand, sleep
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Task
@@ -40,6 +40,8 @@ from vnet.units import NS_PER_S
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Endpoint that programs are told. Sessions here have no transport, and connect to nothing."""
+CLIENT_CONFIG = Path(__file__).with_name("client.json5")
+"""File of a client's configuration for that endpoint, as a gateway gives one."""
 EPOCH_NS = 1_735_689_600 * NS_PER_S
 """The wall clock of programs at the start of a run: 2025-01-01T00:00:00Z."""
 FLAGS = frozenset(["-u", "-B", "-E", "-I", "-O", "-OO", "-s", "-S", "-P", "-q"])
@@ -94,6 +96,25 @@ class Facade(ModuleType):
         return getattr(self.__real, name)
 
 
+class OwnModules(dict[str, ModuleType]):
+    """The modules of a program by name. Its own are found by it wherever its code runs, until `close`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown: set[str] = set()
+
+    def __setitem__(self, name: str, module: ModuleType) -> None:
+        super().__setitem__(name, module)
+        if name not in _OWN_COPIES and name not in self._shown and show(name, _present_module):
+            self._shown.add(name)
+
+    def close(self) -> None:
+        """Have none of them found any more."""
+        for name in self._shown:
+            hide(name)
+        self._shown.clear()
+
+
 class ProgramModules:
     """The modules of one program of a vehicle, as `sys.modules` has them."""
 
@@ -103,8 +124,12 @@ class ProgramModules:
         self.at_exit: list[Callable[[], object]] = []
         self.path: list[str] = []
         self.argv: list[str] = []
+        own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)
+        self.environ = {**os.environ, **own}
+        if "ros2" in node.options:
+            self.environ["ROS_DOMAIN_ID"] = str(node.options["ros2"]["domain"])
         self._random = random.Random(int.from_bytes(node.rng.bytes(16)))
-        self.modules: dict[str, ModuleType] = {}
+        self.modules = OwnModules()
         self._builtins = {**vars(builtins), "__import__": self._import, "input": _no_input}
         self.coroutines: WeakKeyDictionary[asyncio.Task[Any], object] = WeakKeyDictionary()
         """Tasks of the program, and the call of `asyncio.run` within which each was made."""
@@ -112,14 +137,12 @@ class ProgramModules:
             "_thread": self.threads.module,
             "asyncio": self._asyncio,
             "atexit": self._atexit,
-            "dataclasses": partial(self._rebound, dataclasses),
             "datetime": self._datetime,
             "importlib": lambda: Facade(importlib, import_module=self._import_module, __import__=self._import),
             "os": self._os,
             "signal": self._signal,
             "sys": self._sys,
             "time": self._time,
-            "typing": partial(self._rebound, typing, "get_type_hints"),
         }
 
     # Running.
@@ -130,8 +153,9 @@ class ProgramModules:
         self.load("threading")  # whose main thread is that which imports it
         main = ModuleType("__main__")
         self.modules["__main__"] = main
-        code, file, package = self._find_main(words)
-        vars(main).update(__builtins__=self._builtins, __file__=file, __package__=package)
+        code, file, spec = self._find_main(words)
+        vars(main).update(__builtins__=self._builtins, __file__=file, __spec__=spec)
+        main.__package__ = None if spec is None else spec.parent
         leave: SystemExit | None = None
         try:
             exec(code, vars(main))
@@ -143,8 +167,8 @@ class ProgramModules:
         if leave is not None:
             raise leave
 
-    def _find_main(self, words: Sequence[str]) -> tuple[Any, str, str | None]:
-        """Return code, file and package of the program, and set `sys.argv` and `sys.path` for it."""
+    def _find_main(self, words: Sequence[str]) -> tuple[Any, str, ModuleSpec | None]:
+        """Return code, file and specification of the program, and set `sys.argv` and `sys.path` for it."""
         here = str(Path.cwd())
         words = [words[0], *dropwhile(FLAGS.__contains__, words[1:])]
         if words[1:2] == ["-m"] and len(words) > 2:
@@ -152,7 +176,7 @@ class ProgramModules:
             spec = self._find_module(words[2])
             self.argv[:] = [spec.origin or "", *words[3:]]
             assert isinstance(spec.loader, SourceFileLoader)
-            return spec.loader.get_code(spec.name), spec.origin or "", spec.parent
+            return spec.loader.get_code(spec.name), spec.origin or "", spec
         if words[1:2] == ["-c"] and len(words) > 2:
             self.path[:] = [here, *sys.path]
             self.argv[:] = ["-c", *words[3:]]
@@ -209,7 +233,7 @@ class ProgramModules:
             if spec is None:
                 raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         if spec is None or not _is_python(spec) or (name not in _OWN_COPIES and self._is_compiled(top)):
-            module = self.modules[name] = importlib.import_module(name)
+            module = self.modules[name] = import_shared(name)
             return module
         return self._execute(spec)
 
@@ -274,30 +298,14 @@ class ProgramModules:
 
     # Modules of which the program has others.
 
-    def _rebound(self, real: ModuleType, *only: str) -> ModuleType:
-        """Return a module whose functions find the program's own modules in `sys.modules`; all else is shared."""
-        facade = Facade(real, sys=self.load("sys"))
-        for name, value in list(vars(facade).items()):
-            if isinstance(value, FunctionType) and value.__globals__ is vars(real) and name in (only or (name,)):
-                again = FunctionType(
-                    value.__code__, vars(facade), value.__name__, value.__defaults__, value.__closure__
-                )
-                again.__kwdefaults__ = value.__kwdefaults__
-                again.__dict__.update(vars(value))
-                vars(facade)[name] = again
-        return facade
-
     def _sys(self) -> ModuleType:
         return Facade(sys, argv=self.argv, path=self.path, modules=self.modules, stdin=io.StringIO())
 
     def _os(self) -> ModuleType:
-        environ = {**os.environ, "VNET_NODE": self.node.id, "VNET_ENDPOINT": ENDPOINT}
-        if "ros2" in self.node.options:
-            environ["ROS_DOMAIN_ID"] = str(self.node.options["ros2"]["domain"])
         return Facade(
             os,
-            environ=environ,
-            getenv=environ.get,
+            environ=self.environ,
+            getenv=self.environ.get,
             urandom=self._random.randbytes,
             getpid=lambda: 1,
             cpu_count=lambda: CORES,
@@ -480,6 +488,12 @@ class ProgramModules:
 
         task.add_done_callback(done)
         return result  # type: ignore[no-any-return]
+
+
+def _present_module(name: str) -> ModuleType | None:
+    """Return the module of this name of the program whose code runs."""
+    program = _present.get()
+    return None if program is None else program.modules.get(name)
 
 
 def _new_task(loop: Any, coroutine: Any, **options: Any) -> asyncio.Task[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -72,9 +72,10 @@ def _own_names(real: ModuleType) -> dict[str, Any]:
     return found
 
 
-def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, ModuleType]:
+def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, ModuleType]:
     """Return the package `zenoh` of a program, by the names of its modules."""
-    outlet = Outlet(vehicle.due, new_number)
+    outlet = Outlet(vehicle.due, program.threads.new_number)
+    config = type("Config", (values.Config,), {"environ": program.environ})
 
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
         if timestamp_callback is not None:
@@ -96,6 +97,7 @@ def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, 
         ext=ext,
         handlers=handlers,
         shm=zenoh.shm,
+        Config=config,
         open=open_session,
         scout=scout,
         try_init_log_from_env=lambda: None,
@@ -107,9 +109,11 @@ def zenoh_modules(vehicle: Vehicle, new_number: Callable[[], int]) -> dict[str, 
 async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
     """Run a program of a vehicle to its end. Raises what ends it, ProgramError for a status other than 0."""
     modules = ProgramModules(vehicle.node)
-    modules.modules.update(zenoh_modules(vehicle, modules.threads.new_number))
+    modules.modules.update(zenoh_modules(vehicle, modules))
     try:
         await run_strand(modules.threads.strand(partial(modules.run, words)))
     except SystemExit as leave:
         if leave.code not in (None, 0):
             raise ProgramError(f"{' '.join(words)} ended with {leave.code!r}") from leave
+    finally:
+        modules.modules.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, NoReturn
@@ -128,7 +128,10 @@ class _ConfigType(type):
 
 
 class Config(metaclass=_ConfigType):
-    """Zenoh's own configuration; that of the environment is a client's, as that which a gateway gives."""
+    """Zenoh's own configuration; that of the environment is found by the variables of the program."""
+
+    environ: ClassVar[Mapping[str, str]] = {}
+    DEFAULT_CONFIG_PATH_ENV = "ZENOH_CONFIG"
 
     def __new__(cls) -> zenoh.Config:  # type: ignore[misc]
         return zenoh.Config()
@@ -140,8 +143,11 @@ class Config(metaclass=_ConfigType):
 
     @classmethod
     def from_env(cls) -> zenoh.Config:
-        """Return the configuration that the vehicle gives its programs."""
-        return zenoh.Config.from_json5('{"mode": "client"}')
+        """Return the configuration in the file that the program's environment names. Raises ZError."""
+        path = cls.environ.get(cls.DEFAULT_CONFIG_PATH_ENV)
+        if path is None:
+            raise zenoh.ZError("environment variable not found")
+        return zenoh.Config.from_file(path)
 
 
 def refused(name: str, reason: str) -> type:

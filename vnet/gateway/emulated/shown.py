@@ -1,0 +1,82 @@
+"""Modules of which each program has its own, as `sys.modules` has them: for what finds a module there by its name.
+
+`pickle` finds classes so, and `pydantic` and others the names of annotations. What stands here in `sys.modules` is,
+to the code of a program, that program's own module, and to all other code what was there before.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+
+class _Proxy(ModuleType):
+    """Stands for the modules of one name."""
+
+    def __getattribute__(self, attribute: str) -> Any:
+        name = object.__getattribute__(self, "__name__")
+        entry = _shown[name]
+        module = entry.present(name) or entry.real
+        if module is None:
+            raise AttributeError(f"module {name!r} is a program's, and none runs")
+        return getattr(module, attribute)
+
+
+@dataclass
+class _Entry:
+    """A name that is shown."""
+
+    proxy: ModuleType
+    real: ModuleType | None
+    """The shared module of that name, which was there before."""
+    present: Callable[[str], ModuleType | None]
+    """Returns the module of the program whose code runs, if one does."""
+    programs: int = 0
+
+
+_shown: dict[str, _Entry] = {}
+
+
+def show(name: str, present: Callable[[str], ModuleType | None]) -> bool:
+    """Have a module of a program found by its name, until `hide`; a shared module of that name goes before."""
+    entry = _shown.get(name)
+    if entry is None:
+        real = sys.modules.get(name)
+        if name != "__main__" and real is not None:
+            return False
+        entry = _shown[name] = _Entry(_Proxy(name), real, present)
+        sys.modules[name] = entry.proxy
+    entry.programs += 1
+    return True
+
+
+def hide(name: str) -> None:
+    """Take back what one program has shown; the last one leaves `sys.modules` as it was before."""
+    entry = _shown[name]
+    entry.programs -= 1
+    if entry.programs:
+        return
+    del _shown[name]
+    if sys.modules.get(name) is entry.proxy:
+        if entry.real is None:
+            del sys.modules[name]
+        else:
+            sys.modules[name] = entry.real
+
+
+def import_shared(name: str) -> ModuleType:
+    """Import a module that all programs share; it finds shared modules alone while it is loaded."""
+    if name in sys.modules and name not in _shown:
+        return importlib.import_module(name)
+    for each, entry in _shown.items():
+        if sys.modules.get(each) is entry.proxy and entry.real is None:
+            del sys.modules[each]
+    try:
+        return importlib.import_module(name)
+    finally:
+        for each, entry in _shown.items():
+            sys.modules.setdefault(each, entry.proxy)
