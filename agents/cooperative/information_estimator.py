@@ -228,7 +228,7 @@ class InformationEstimator:
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
             count = len(means_m)
-            middle_m = sum([x for x, _ in means_m]) / count, sum([y for _, y in means_m]) / count
+            middle_m = math.fsum([x for x, _ in means_m]) / count, math.fsum([y for _, y in means_m]) / count
             self.mean_m = tracked_mean(middle_m, self.mean_m, self.limit_m / SPREAD_GATE)
         limited, increments = self._limited(heard, priors)
         variances_m2 = [xx + yy for _, _, xx, _, yy in (own, *[frame.moments for frame in heard])]
@@ -402,7 +402,7 @@ class InformationEstimator:
             leaning = leaning or [False] * len(frames)
             each = zip(weights[1:], self._prior_shares, leaning, strict=True)
             others = [0.0 if leans else (1 - SELF_SHARE) * share * weight for weight, share, leans in each]
-            weights = [1 - sum(others), *others]
+            weights = [1 - math.fsum(others), *others]
         self._weights = weights
         self._weighed = list(frames)
         return weights

@@ -146,7 +146,7 @@ class ExactWeights(OptimizedWeights):
             if not weights[0] > floor:
                 weights[0], now = floor, [one for one in now if one is not each[0]]
             if now == free:
-                total = sum(weights)
+                total = math.fsum(weights)
                 return [weight / total for weight in weights]
             if not now:
                 break
@@ -182,7 +182,7 @@ def metropolis_weights(degree: int, neighbour_degrees: Sequence[int]) -> Array:
     Doubly stochastic on an undirected graph (Xiao and Boyd 2004).
     """
     others = [1 / (1 + max(degree, other)) for other in neighbour_degrees]
-    return np.array([1 - sum(others), *others])
+    return np.array([1 - math.fsum(others), *others])
 
 
 def max_degree_weights(count: int, max_degree: int) -> Array:
