@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.vnet.gateway.conftest import Drive, log
+from tests.vnet.gateway.conftest import Drive, events, log
 from vnet.gateway import client_config
 from vnet.gateway.emulated.modules import CLIENT_CONFIG, ENDPOINT
 
@@ -96,3 +96,171 @@ def test_configuration_is_where_a_gateway_gives_it(drive: Drive) -> None:
     )
     assert log(run)[:-1] == [f'"client" ["{ENDPOINT}"]'] * 3 + ["refused"]
     assert json.loads(CLIENT_CONFIG.read_text()) == client_config(ENDPOINT)
+
+
+def test_chance_of_numpy_is_the_vehicles_own(drive: Drive) -> None:
+    text = """
+        import numpy as np, sys
+        from numpy.random import default_rng, normal
+        print(np.random.rand(), normal(), default_rng().random(), np.random.RandomState().rand())
+        print(np.random.SeedSequence().entropy, np.random.Generator(np.random.PCG64()).random())
+        np.random.seed(3)
+        print(np.random.rand(), default_rng(3).random(), np.random.RandomState(3).rand(), np.random.get_state()[0])
+        print(isinstance(default_rng(), np.random.Generator), np.asarray([1.0]).dtype, sys.modules["numpy"] is np)
+        """
+    first, again = (drive(text, vehicles=2) for _ in range(2))
+    lines, other = log(first), log(first, "v02")
+    assert lines == log(again)
+    assert all(mine != its for mine, its in zip(lines[:2], other[:2], strict=True))
+    assert lines[2] == other[2] == "0.5507979025745755 0.08564916714362436 0.5507979025745755 MT19937"
+    assert lines[3] == "True float64 True"
+
+
+@pytest.mark.parametrize(
+    "waits",
+    [
+        "while samples.try_recv() is None: pass",
+        "while not came.is_set(): pass",
+        "while items.empty(): pass",
+        """while True:
+            try:
+                items.get_nowait()
+                break
+            except queue.Empty:
+                pass""",
+    ],
+)
+def test_a_program_that_polls_without_a_pause_comes_to_its_time(drive: Drive, waits: str) -> None:
+    run = drive(f"""
+        import queue, threading, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        samples, came, items = session.declare_subscriber("a"), threading.Event(), queue.Queue()
+        def put():
+            time.sleep(0.5)
+            session.put("a", "b")
+            came.set()
+            items.put(1)
+        threading.Thread(target=put).start()
+        {waits}
+        print(f"{{time.monotonic():.2f}}")
+        """)
+    assert log(run)[0] == "0.50"
+
+
+def test_signals_to_itself_and_hard_exits_end_a_program_alone(drive: Drive) -> None:
+    """They are of the whole process to Python, which has all vehicles and the emulator."""
+    run = drive(
+        """
+        import os, signal, sys, threading, time
+        def stop(number, frame):
+            print("stop", number == signal.SIGTERM)
+        signal.signal(signal.SIGTERM, stop)
+        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        os.kill(os.getpid(), 0)
+        signal.alarm(1)
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            print("interrupted")
+        threading.Timer(0.5, os.kill, [os.getpid(), signal.SIGINT]).start()
+        try:
+            time.sleep(100)
+        except KeyboardInterrupt:
+            print(f"interrupted {time.monotonic():.1f}")
+        for call in (os.fork, lambda: os.execv("/bin/true", ["true"])):
+            try:
+                call()
+            except OSError as error:
+                print("refused", error.errno is not None)
+        try:
+            if sys.argv[1] == "v01":
+                os._exit(0)
+            if sys.argv[1] == "v02":
+                threading.Timer(0.5, os._exit, [3]).start()
+            else:
+                os.kill(os.getpid(), signal.SIGKILL)
+            time.sleep(100)
+        finally:
+            print("never")
+        """,
+        vehicles=3,
+        duration_s=4.0,
+    )
+    common = ["stop True"] * 2 + ["interrupted", "interrupted 0.5", "refused True", "refused True"]
+    for node, ends in (("v01", "v01 finished"), ("v02", "v02 crashed"), ("v03", "v03 crashed")):
+        assert log(run, node)[:7] == [*common, ends]
+        assert "never" not in log(run, node)
+    crashes = {event["node"]: event["error"] for event in events(run, "crashed")}
+    assert "3" in crashes["v02"]
+    assert "-9" in crashes["v03"]
+
+
+def test_output_that_a_program_takes_for_itself_is_its_own(drive: Drive) -> None:
+    run = drive(
+        """
+        import contextlib, io, sys, time
+        def hook(kind, error, trace):
+            print("hook", kind.__name__)
+        sys.excepthook = hook
+        taken = io.StringIO()
+        with contextlib.redirect_stdout(taken):
+            print("taken", sys.argv[1])
+            time.sleep(0.1)
+            sys.stdout.write("too")
+        sys.stdout = io.StringIO()
+        print("swallowed")
+        sys.stdout = sys.__stdout__
+        print(repr(taken.getvalue()))
+        1 / 0
+        """,
+        vehicles=2,
+    )
+    for node in ("v01", "v02"):
+        assert log(run, node)[:2] == [f"'taken {node}\\ntoo'", "hook ZeroDivisionError"]
+
+
+def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Drive) -> None:
+    run = drive(
+        """
+        import multiprocessing, os, subprocess, time
+        from concurrent.futures import ProcessPoolExecutor, as_completed
+        def work(number):
+            time.sleep(0.01)
+            return number * number
+        def tell(end):
+            time.sleep(0.01)
+            end.send(work(3))
+        ours, theirs = multiprocessing.Pipe()
+        child = multiprocessing.get_context("fork").Process(target=tell, args=(theirs,))
+        child.start()
+        print(ours.recv(), time.monotonic())
+        child.join()
+        os.environ["OWN"] = "own"
+        print(subprocess.check_output("echo $OWN $VNET_NODE", shell=True), subprocess.Popen(["true"]).wait())
+        with ProcessPoolExecutor(2) as pool:
+            jobs = [pool.submit(work, 4)]
+            print(list(pool.map(work, range(3))), [job.result() for job in as_completed(jobs)])
+        """
+    )
+    assert log(run)[:-1] == ["9 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]"]
+
+
+def test_a_program_that_ignores_its_end_is_ended(drive: Drive) -> None:
+    run = drive(
+        """
+        import queue, sys, threading, time, zenoh
+        session, items = zenoh.open(zenoh.Config()), queue.Queue()
+        def work(wait):
+            while True:
+                try:
+                    session.put("a", "b")
+                    wait()
+                except:
+                    pass
+        for wait in (lambda: time.sleep(0.1), lambda: items.get(timeout=0.1), session.declare_subscriber("b").recv):
+            threading.Thread(target=work, args=(wait,)).start()
+        """
+    )
+    assert run.verdict == "valid"

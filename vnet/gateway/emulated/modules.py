@@ -16,6 +16,7 @@ import io
 import os
 import random
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Coroutine, Iterable, Sequence
@@ -31,8 +32,11 @@ from weakref import WeakKeyDictionary
 
 from vnet.errors import ProgramError, shown
 from vnet.gateway import client_config, session_variables
+from vnet.gateway.emulated.chance import numpy_random, prepare_random, prepare_uuid
+from vnet.gateway.emulated.facade import Facade
+from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
 from vnet.gateway.emulated.shown import hide, import_shared, show
-from vnet.gateway.emulated.strands import Threads, block_on, current_strand, run_strand, sleep
+from vnet.gateway.emulated.strands import Threads, block_on, current_strand, look, run_strand, sleep
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -46,8 +50,6 @@ EPOCH_NS = 1_735_689_600 * NS_PER_S
 """The wall clock of programs at the start of a run: 2025-01-01T00:00:00Z."""
 FLAGS = frozenset(["-u", "-B", "-E", "-I", "-O", "-OO", "-s", "-S", "-P", "-q"])
 """Options of Python's command line that change nothing here."""
-MOST_LOOKS, BUSY_WAIT_S = 1000, 0.001
-"""Looks of a program at its clock at one instant after which it waits busily: it is let wait so long."""
 CORES = 4
 """Cores that a program sees: the size of a pool of threads may not depend on the machine."""
 _OWN_COPIES = (
@@ -57,6 +59,7 @@ _OWN_COPIES = (
     "concurrent.futures",
     "concurrent.futures._base",
     "concurrent.futures.thread",
+    "contextlib",
     "fileinput",
     "logging",
     "logging.config",
@@ -79,21 +82,6 @@ _SHARED = ("vnet", "agents", "emulator", "greenlet")
 
 _present: ContextVar[ProgramModules | None] = ContextVar("vnet_zenoh_program", default=None)
 _present_run: ContextVar[object] = ContextVar("vnet_asyncio_run", default=None)
-
-
-class Facade(ModuleType):
-    """Stands for a module of which some names are others."""
-
-    def __init__(self, real: ModuleType, **own: Any) -> None:
-        super().__init__(real.__name__, real.__doc__)
-        names = {
-            name: value for name, value in vars(real).items() if not name.startswith("__") or name == "__all__"
-        }
-        vars(self).update(names, **own)
-        self.__real = real
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.__real, name)
 
 
 class OwnModules(dict[str, ModuleType]):
@@ -121,6 +109,8 @@ class ProgramModules:
     def __init__(self, node: Node) -> None:
         self.node = node
         self.threads = Threads()
+        self.process = OwnProcess(self.threads)
+        self.threads.on_interrupt = partial(self.process.send, signal.SIGINT)
         self.at_exit: list[Callable[[], object]] = []
         self.path: list[str] = []
         self.argv: list[str] = []
@@ -140,9 +130,18 @@ class ProgramModules:
             "datetime": self._datetime,
             "importlib": lambda: Facade(importlib, import_module=self._import_module, __import__=self._import),
             "os": self._os,
-            "signal": self._signal,
+            "numpy": self._numpy,
+            "signal": lambda: Facade(signal, **self.process.signal_functions()),
+            "subprocess": lambda: Facade(subprocess, **subprocess_functions(self.environ)),
             "sys": self._sys,
             "time": self._time,
+        }
+        self._preparations: dict[str, Callable[[Any], None]] = {
+            "concurrent.futures": self._prepare_futures,
+            "queue": self._prepare_queue,
+            "random": lambda module: prepare_random(module, self._random),
+            "threading": self._prepare_threading,
+            "uuid": lambda module: prepare_uuid(module, self._random),
         }
 
     # Running.
@@ -150,6 +149,7 @@ class ProgramModules:
     def run(self, words: Sequence[str]) -> None:
         """Run a program by the words of its command to its end, in the present strand. Raises what ends it."""
         _present.set(self)
+        take_output(self._builtins, self.load("sys"))
         self.load("threading")  # whose main thread is that which imports it
         main = ModuleType("__main__")
         self.modules["__main__"] = main
@@ -161,6 +161,15 @@ class ProgramModules:
             exec(code, vars(main))
         except SystemExit as raised:
             leave = raised
+        except KeyboardInterrupt as interrupt:
+            if interrupt is not self.process.interrupt:  # of the whole process
+                raise
+            leave = SystemExit(INTERRUPTED)
+        except Exception as error:
+            hook: Any = vars(self.load("sys"))["excepthook"]
+            if hook is not sys.excepthook:
+                hook(type(error), error, error.__traceback__)
+            raise
         self.load("threading")._shutdown()
         for function in reversed(self.at_exit):
             function()
@@ -261,7 +270,7 @@ class ProgramModules:
         except BaseException:
             self.modules.pop(name, None)
             raise
-        if (prepare := getattr(self, f"_prepare_{name}", None)) is not None:
+        if (prepare := self._preparations.get(name)) is not None:
             prepare(module)
         return self.modules.get(name, module)
 
@@ -299,7 +308,8 @@ class ProgramModules:
     # Modules of which the program has others.
 
     def _sys(self) -> ModuleType:
-        return Facade(sys, argv=self.argv, path=self.path, modules=self.modules, stdin=io.StringIO())
+        own = {"argv": self.argv, "path": self.path, "modules": self.modules, "stdin": io.StringIO()}
+        return Facade(sys, **own, __stdout__=sys.stdout, __stderr__=sys.stderr)
 
     def _os(self) -> ModuleType:
         return Facade(
@@ -307,25 +317,19 @@ class ProgramModules:
             environ=self.environ,
             getenv=self.environ.get,
             urandom=self._random.randbytes,
-            getpid=lambda: 1,
             cpu_count=lambda: CORES,
             process_cpu_count=lambda: CORES,
             register_at_fork=lambda **hooks: None,
             sched_yield=partial(sleep, 0.0),
+            **self.process.os_functions(),
         )
 
     def _time(self) -> ModuleType:
         node = self.node
-        looked_ns, looks = -1, 0
 
         def ns() -> int:
-            nonlocal looked_ns, looks
-            now_ns = node.now_ns
-            looked_ns, looks = now_ns, looks + 1 if now_ns == looked_ns else 1
-            if looks > MOST_LOOKS and current_strand() is not None:  # it waits for the time to come
-                sleep(BUSY_WAIT_S)
-                return node.now_ns
-            return now_ns
+            look()
+            return node.now_ns
 
         def seconds() -> float:
             return ns() / NS_PER_S
@@ -411,41 +415,44 @@ class ProgramModules:
         vars(module).update(register=register, unregister=unregister)
         return module
 
-    def _signal(self) -> ModuleType:
-        """Return a `signal` by which a program may ask for what never comes."""
-        handlers: dict[int, Any] = {}
+    def _numpy(self) -> ModuleType:
+        import numpy
 
-        def set_handler(number: int, handler: Any) -> Any:
-            before = handlers.get(number, signal.SIG_DFL)
-            handlers[number] = handler
-            return before
-
-        return Facade(
-            signal,
-            signal=set_handler,
-            getsignal=lambda number: handlers.get(number, signal.SIG_DFL),
-            pause=lambda: block_on(asyncio.get_running_loop().create_future()),
-            set_wakeup_fd=lambda *args, **kwargs: -1,
-            siginterrupt=lambda *args: None,
-        )
-
-    def _prepare_random(self, module: Any) -> None:
-        """Have generators without a seed draw one of the vehicle's, where Python asks the system in C."""
-        given = module.Random.seed
-
-        def seed(generator: Any, a: Any = None, version: int = 2) -> None:
-            given(generator, int.from_bytes(self._random.randbytes(16)) if a is None else a, version)
-
-        module.Random.seed = seed
-        module.seed = module._inst.seed
-        module.seed()
+        random_module = self.modules["numpy.random"] = numpy_random(self._random)
+        return Facade(numpy, random=random_module)
 
     def _prepare_threading(self, module: Any) -> None:
         module.local = self.load("_threading_local").local
 
-    def _prepare_uuid(self, module: Any) -> None:
-        module._node = self._random.getrandbits(48) | 1 << 40
-        module._generate_time_safe = module._UuidCreate = None
+        given = module.Event.is_set
+
+        def is_set(event: Any) -> bool:
+            if not given(event):
+                look()
+            return bool(given(event))
+
+        module.Event.is_set = module.Event.isSet = is_set
+
+    def _prepare_queue(self, module: Any) -> None:
+        """Have what finds a queue empty count as a look at it."""
+        for kind in (module.Queue, module._PySimpleQueue):
+            kind.get = _looking_get(kind.get, module.Empty)
+            kind.empty = _looking_empty(kind.empty)
+
+    def _prepare_futures(self, module: Any) -> None:
+        """Have jobs of processes run in threads: a child process has a time of its own."""
+
+        class ProcessPoolExecutor(module.ThreadPoolExecutor):  # type: ignore[misc]
+            def __init__(
+                self, max_workers: Any = None, mp_context: Any = None, *initializer: Any, **options: Any
+            ) -> None:
+                options.pop("max_tasks_per_child", None)
+                super().__init__(max_workers, "process", *initializer, **options)
+
+            def map(self, function: Any, *iterables: Any, timeout: Any = None, chunksize: int = 1) -> Any:
+                return super().map(function, *iterables, timeout=timeout)
+
+        module.ProcessPoolExecutor = ProcessPoolExecutor
 
     # asyncio: coroutines of the program run on the node's loop, in strands of their own.
 
@@ -455,11 +462,17 @@ class ProgramModules:
         loop.set_task_factory(_new_task)
         loop.run_jobs_by(_run_job)
         program_loop = ProgramLoop(loop, self)
+
+        def new_event_loop() -> ProgramLoop:
+            nonlocal program_loop
+            program_loop = ProgramLoop(loop, self)
+            return program_loop
+
         return Facade(
             asyncio,
             run=lambda main, *, debug=None, loop_factory=None: program_loop.run(main),
-            Runner=partial(Runner, program_loop),
-            new_event_loop=lambda: program_loop,
+            Runner=lambda **options: Runner(program_loop),
+            new_event_loop=new_event_loop,
             set_event_loop=lambda loop: None,
             get_event_loop=lambda: loop if _in_coroutine() else program_loop,
             get_running_loop=lambda: loop if _in_coroutine() else _no_loop(),
@@ -556,6 +569,7 @@ class ProgramLoop:
         self._loop = loop
         self._program = program
         self._stopped: asyncio.Future[None] | None = None
+        self._is_closed = False
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._loop, name)
@@ -568,12 +582,16 @@ class ProgramLoop:
         try:
             return self.run_until_complete(main)
         finally:
-            left = self._program.living_tasks()
-            for task in left:
-                task.cancel()
-            if left:
-                block_on(asyncio.wait(left))
+            self.cancel_tasks()
             _present_run.reset(outer)
+
+    def cancel_tasks(self) -> None:
+        """Cancel the tasks of the present run, and wait for them."""
+        left = self._program.living_tasks()
+        for task in left:
+            task.cancel()
+        if left:
+            block_on(asyncio.wait(left))
 
     def run_until_complete(self, future: Any) -> Any:
         """Do as the loop's."""
@@ -591,7 +609,12 @@ class ProgramLoop:
             self._stopped.set_result(None)
 
     def close(self) -> None:
-        """Do nothing: the loop is the node's."""
+        """Take note of it: the loop is the node's."""
+        self._is_closed = True
+
+    def is_closed(self) -> bool:
+        """Return whether it was closed."""
+        return self._is_closed
 
     def is_running(self) -> bool:
         """Return whether a coroutine runs."""
@@ -606,14 +629,15 @@ class ProgramLoop:
 class Runner:
     """`asyncio.Runner` on the node's loop."""
 
-    def __init__(self, loop: ProgramLoop, *, debug: Any = None, loop_factory: Any = None) -> None:
+    def __init__(self, loop: ProgramLoop) -> None:
         self._loop = loop
+        self._outer: Any = _present_run.set(object())
 
     def __enter__(self) -> Runner:
         return self
 
     def __exit__(self, *_: object) -> None:
-        pass
+        self.close()
 
     def run(self, main: Coroutine[Any, Any, Any], *, context: Any = None) -> Any:
         """Run a coroutine."""
@@ -624,7 +648,31 @@ class Runner:
         return self._loop
 
     def close(self) -> None:
-        """Do nothing."""
+        """Cancel the tasks that are left."""
+        if self._outer is not None:
+            self._loop.cancel_tasks()
+            _present_run.reset(self._outer)
+            self._outer = None
+
+
+def _looking_get(get: Callable[..., Any], empty: type[Exception]) -> Callable[..., Any]:
+    def looking(queue: Any, block: bool = True, timeout: float | None = None) -> Any:
+        try:
+            return get(queue, block, timeout)
+        except empty:
+            look()
+            raise
+
+    return looking
+
+
+def _looking_empty(is_empty: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    def looking(queue: Any) -> bool:
+        if is_empty(queue):
+            look()
+        return is_empty(queue)
+
+    return looking
 
 
 def _is_python(spec: ModuleSpec) -> bool:

@@ -15,7 +15,6 @@ import zenoh.shm
 from vnet.errors import ProgramError
 from vnet.gateway.emulated import advanced, queries, sessions, values
 from vnet.gateway.emulated.modules import ProgramModules
-from vnet.gateway.emulated.strands import run_strand
 from vnet.gateway.emulated.values import Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
 
@@ -111,7 +110,7 @@ async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
     modules = ProgramModules(vehicle.node)
     modules.modules.update(zenoh_modules(vehicle, modules))
     try:
-        await run_strand(modules.threads.strand(partial(modules.run, words)))
+        await modules.threads.run_main(partial(modules.run, words))
     except SystemExit as leave:
         if leave.code not in (None, 0):
             raise ProgramError(f"{' '.join(words)} ended with {leave.code!r}") from leave

@@ -11,6 +11,7 @@ import msgspec
 import zenoh
 
 from vnet.gateway.emulated.queries import ANY_KEY, Asking, Entity
+from vnet.gateway.emulated.strands import go_no_further_if_ended
 from vnet.gateway.emulated.values import (
     DELETE,
     NO_ENCODING,
@@ -399,6 +400,7 @@ class Session:
 
     def check_open(self) -> None:
         """Raise ZError if it has been closed."""
+        go_no_further_if_ended()
         if self._is_closed:
             raise zenoh.ZError("session closed")
 

@@ -8,8 +8,10 @@ result. One strand runs at a time, until it blocks.
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 import threading
+import time
 import traceback
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
@@ -29,11 +31,27 @@ T = TypeVar("T")
 
 MOST_EXITS = 10
 """Times that a strand is told to end which blocks in answer, or goes on."""
+MOST_LOOKS, BUSY_WAIT_S = 1000, 0.001
+"""Looks of a thread, at one instant, at what only time or others change, and how long it is let wait then."""
 LONGEST_WAIT_S = 1e9
 """Largest timeout of a lock in seconds, as `threading.TIMEOUT_MAX`."""
 
 _unending: list[greenlet] = []
 """Strands that did not end when they were told to: held, as to discard one is to tell it again."""
+_is_child = False
+"""True in a process that a program has forked, where time is real."""
+
+
+def _note_child() -> None:
+    global _is_child
+    _is_child = current_strand() is not None
+
+
+os.register_at_fork(after_in_child=_note_child)
+
+
+class HardExit(SystemExit):
+    """The end of a program of which nothing runs any more, its `finally` blocks neither."""
 
 
 class Strand(greenlet):
@@ -46,6 +64,13 @@ class Strand(greenlet):
         self.number = number
         self.is_task = is_task
         self.at_end: list[Callable[[], object]] = []
+        self.interrupt: BaseException | None = None
+        """Exception that it is to raise where it waits."""
+        self.is_ended = False
+        """True once its coroutine is closed: what it waits for does not come."""
+        self.is_gone = False
+        """True once it shall not run any more."""
+        self.looked_s, self.looks = -1.0, 0
         self.gr_context = copy_context() if context is None else context
 
     def begin(self) -> Any:
@@ -59,18 +84,36 @@ def drive(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
     """Run a strand that waits for `item` to its end, and return its result."""
     note_greenlet(strand)
     while not strand.dead and item is not IDLE:
+        if isinstance(item, HardExit):
+            _unending.append(strand)
+            raise item
         try:
             value = yield item
         except GeneratorExit:
             _end(strand)
             raise
         except BaseException as error:
-            item = strand.throw(error)
+            item = _thrown(strand, error)
         else:
             item = strand.switch(value)
     if isinstance(item, GreenletExit):
         raise asyncio.CancelledError
     return item
+
+
+def _thrown(strand: Strand, error: BaseException) -> Any:
+    """Have a strand raise what its task was ended with, or what it is interrupted by; returns what it waits for."""
+    if strand.is_gone:
+        _unending.append(strand)
+        raise error
+    if strand.interrupt is not None:
+        error, strand.interrupt = strand.interrupt, None
+        task = asyncio.current_task()
+        assert task is not None
+        task.uncancel()
+        if isinstance(error, HardExit):
+            return error
+    return strand.throw(error)
 
 
 IDLE = object()
@@ -91,6 +134,10 @@ async def run_strand(strand: Strand) -> Any:
 
 def _end(strand: Strand) -> None:
     """End a strand whose task is closed, whatever it does in answer."""
+    if strand.is_gone:
+        _unending.append(strand)
+        return
+    strand.is_ended = True
     for _ in range(MOST_EXITS):
         if strand.dead:
             return
@@ -109,6 +156,35 @@ def current_strand() -> Strand | None:
     return strand if isinstance(strand, Strand) else None
 
 
+def go_no_further_if_ended() -> None:
+    """Raise GreenletExit whenever the present strand goes on, if it is ended, so that no loop of it is endless."""
+    strand = current_strand()
+    while strand is not None and strand.is_ended:
+        assert strand.parent is not None
+        strand.parent.switch(None)
+
+
+def leave_hard(leave: HardExit | None) -> None:
+    """Have the present strand run no more; `leave` ends its task, too."""
+    strand = current_strand()
+    assert strand is not None and strand.parent is not None
+    strand.is_gone = True
+    while True:
+        strand.parent.switch(leave or next(asyncio.get_running_loop().create_future().__await__()))
+
+
+def look() -> None:
+    """Take note that the present strand looks at what others change; one that does nothing else is let wait."""
+    strand = current_strand()
+    if strand is None:
+        return
+    now_s = asyncio.get_running_loop().time()
+    strand.looks = strand.looks + 1 if now_s == strand.looked_s else 1
+    strand.looked_s = now_s
+    if strand.looks > MOST_LOOKS:
+        sleep(BUSY_WAIT_S)
+
+
 def block_on(awaitable: Awaitable[T]) -> T:
     """Block the present strand until `awaitable` is done. Raises RuntimeError outside of strands."""
     strand = getcurrent()
@@ -117,6 +193,7 @@ def block_on(awaitable: Awaitable[T]) -> T:
             "a call that blocks, in a callback of the event loop or in a finalizer: on virtual time it can wait in "
             "a thread or in a coroutine alone"
         )
+    go_no_further_if_ended()
     assert strand.parent is not None
     switch, steps = strand.parent.switch, awaitable.__await__()
     try:
@@ -140,6 +217,9 @@ def sleep(seconds: float) -> None:
     """Block the present strand for so long."""
     if seconds < 0:
         raise ValueError("sleep length must be non-negative")
+    if _is_child:
+        time.sleep(seconds)
+        return
     block_on(asyncio.sleep(seconds))
 
 
@@ -161,6 +241,7 @@ class Lock:
         return blocking and self._wait(timeout)
 
     def _wait(self, timeout: float) -> bool:
+        go_no_further_if_ended()
         loop = asyncio.get_running_loop()
         waiter: asyncio.Future[bool] = loop.create_future()
         self._waiters.append(waiter)
@@ -240,6 +321,22 @@ class Threads:
         self._numbers = count(1)
         self._alive = 0
         self._handles: list[ThreadHandle] = []
+        self.main: Strand | None = None
+        """The strand of the main thread."""
+        self._main_task: asyncio.Task[Any] | None = None
+        self.on_interrupt: Callable[[], object] = lambda: None
+        """Does what `_thread.interrupt_main` does."""
+
+    async def run_main(self, run: Callable[[], Any]) -> None:
+        """Run the main thread."""
+        self.main, self._main_task = self.strand(run), asyncio.current_task()
+        await run_strand(self.main)
+
+    def interrupt(self, error: BaseException) -> None:
+        """Have the main thread raise an exception where it waits."""
+        if self.main is not None and not self.main.dead and self._main_task is not None:
+            self.main.interrupt = error
+            self._main_task.cancel()
 
     def strand(self, run: Callable[[], Any], is_task: bool = False) -> Strand:
         """Make a strand with a number of its own."""
@@ -318,7 +415,7 @@ class Threads:
             _excepthook=_thread_failed,
             _ExceptHookArgs=threading.ExceptHookArgs,
             exit=sys.exit,
-            interrupt_main=lambda signum=2: None,
+            interrupt_main=lambda signum=2: self.on_interrupt(),
             _count=lambda: self._alive,
             _set_sentinel=self._set_sentinel,
             daemon_threads_allowed=lambda: True,

@@ -15,7 +15,16 @@ import zenoh
 from zenoh.handlers import Callback
 
 from vnet.gateway import frames
-from vnet.gateway.emulated.strands import IDLE, Strand, block_on, drive, fail, idle
+from vnet.gateway.emulated.strands import (
+    IDLE,
+    Strand,
+    block_on,
+    drive,
+    fail,
+    go_no_further_if_ended,
+    idle,
+    look,
+)
 from vnet.gateway.frames import CrossingReply, CrossingSample
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
@@ -276,14 +285,16 @@ class Handler:
         if self._items:
             return self._items.popleft()
         if self._closed:
-            raise zenoh.ZError("channel closed")
+            raise zenoh.ZError("channel is empty and closed")
+        look()
         return None
 
     def recv(self) -> Any:
         """Return the next item; block until there is one. Raises ZError if there will be none."""
         while not self._items:
             if self._closed:
-                raise zenoh.ZError("channel closed")
+                raise zenoh.ZError("channel is empty and closed")
+            go_no_further_if_ended()
             waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             self._waiters.append(waiter)
             try:

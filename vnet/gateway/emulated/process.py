@@ -1,0 +1,140 @@
+"""The process of a program on virtual time, as it takes itself for one: its signals and its end.
+
+Python's own functions act on the whole process, which has the emulator and all its vehicles.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import Any, NoReturn
+
+from vnet.gateway.emulated.strands import HardExit, Threads, block_on, current_strand, leave_hard, sleep
+
+PID = 1
+"""Number of the program's process."""
+INTERRUPTED = 130
+"""Status of a program that an interrupt has ended."""
+_IGNORED = (signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH)
+"""Signals that do nothing to a program without a handler."""
+
+
+class OwnProcess:
+    """Signals that a program sends to itself, and ends without a farewell. No signal comes from elsewhere."""
+
+    def __init__(self, threads: Threads) -> None:
+        self._threads = threads
+        self._handlers: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
+        self.interrupt: BaseException | None = None
+        """The last interrupt that was the program's own."""
+
+    def os_functions(self) -> dict[str, Any]:
+        """Return what stands for functions of `os`."""
+        return {
+            "getpid": lambda: PID,
+            "getpgid": lambda pid: PID,
+            "getpgrp": lambda: PID,
+            "getppid": lambda: 0,
+            "kill": self._kill,
+            "killpg": self._kill,
+            "_exit": self._exit,
+            "abort": lambda: self._exit(-signal.SIGABRT),
+            "fork": _refuse,
+            "forkpty": _refuse,
+            **{name: _refuse for name in vars(os) if name.startswith("exec")},
+        }
+
+    def signal_functions(self) -> dict[str, Any]:
+        """Return what stands for functions of `signal`."""
+        return {
+            "signal": self._set_handler,
+            "getsignal": lambda number: self._handlers.get(number, signal.SIG_DFL),
+            "raise_signal": self.send,
+            "pthread_kill": lambda thread, number: self.send(number),
+            "pause": _wait_for_ever,
+            "sigwait": lambda signals: _wait_for_ever(),
+            "sigwaitinfo": lambda signals: _wait_for_ever(),
+            "sigtimedwait": lambda signals, timeout: sleep(timeout),
+            "pthread_sigmask": lambda how, mask: set(),
+            "alarm": lambda seconds: 0,
+            "setitimer": lambda which, seconds, interval=0.0: (0.0, 0.0),
+            "getitimer": lambda which: (0.0, 0.0),
+            "set_wakeup_fd": lambda *args, **kwargs: -1,
+            "siginterrupt": lambda *args: None,
+        }
+
+    def _set_handler(self, number: int, handler: Any) -> Any:
+        before = self._handlers.get(number, signal.SIG_DFL)
+        self._handlers[number] = handler
+        return before
+
+    def _kill(self, pid: int, number: int) -> None:
+        if pid in (PID, -PID, 0, -1):
+            self.send(number)
+        else:  # a child
+            os.kill(pid, number)
+
+    def send(self, number: int) -> None:
+        """Do what a signal to the program does. What a handler raises, its main thread gets."""
+        handler = self._handlers.get(number, signal.SIG_DFL)
+        if number in (signal.SIGKILL, signal.SIGSTOP) or (
+            handler == signal.SIG_DFL and number not in (0, *_IGNORED)
+        ):
+            self._exit(-number)
+        if not callable(handler):
+            return
+        try:
+            handler(number, None)
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt):
+                self.interrupt = error
+            if current_strand() is self._threads.main:
+                raise
+            self._threads.interrupt(error)
+
+    def _exit(self, status: int) -> None:
+        """End the program at once: nothing of it runs any more."""
+        leave, strand = HardExit(status), current_strand()
+        if strand is self._threads.main:
+            leave_hard(leave)
+        self._threads.interrupt(leave)
+        if strand is not None:
+            leave_hard(None)
+
+
+def _wait_for_ever() -> None:
+    block_on(asyncio.get_running_loop().create_future())
+
+
+def _refuse(*args: object, **options: object) -> NoReturn:
+    raise OSError(errno.ENOSYS, "not available on virtual time: the process has other vehicles, too")
+
+
+def subprocess_functions(environ: Mapping[str, str]) -> dict[str, Any]:
+    """Return what stands for functions of `subprocess`: child processes get the program's environment."""
+
+    class Popen(subprocess.Popen[Any]):
+        def __init__(self, *args: Any, **options: Any) -> None:
+            if options.get("env") is None:
+                options["env"] = environ
+            super().__init__(*args, **options)
+
+    def inheriting(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *args, env=None, **options: function(*args, env=environ if env is None else env, **options)
+
+    names = ("call", "check_call", "check_output", "run")
+    return {"Popen": Popen, **{name: inheriting(getattr(subprocess, name)) for name in names}}
+
+
+def take_output(builtins: dict[str, Any], sys: ModuleType) -> None:
+    """Have `print` write where the program's own `sys.stdout` is."""
+
+    def own_print(*values: object, file: Any = None, **options: Any) -> None:
+        print(*values, file=vars(sys)["stdout"] if file is None else file, **options)
+
+    builtins["print"] = own_print
