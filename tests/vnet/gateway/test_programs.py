@@ -264,3 +264,29 @@ def test_a_program_that_ignores_its_end_is_ended(drive: Drive) -> None:
         """
     )
     assert run.verdict == "valid"
+
+
+def test_configuration_of_a_session_counts_or_is_refused_by_name(
+    drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUST_BACKTRACE", "1")  # with which the last one crashed the process
+    run = drive(
+        """
+        import time, zenoh
+        def config(key, value):
+            config = zenoh.Config()
+            config.insert_json5(key, value)
+            return config
+        session = zenoh.open(config("queries_default_timeout", "300"))
+        kept = session.declare_queryable("asked")
+        print([reply.err.payload.to_string() for reply in session.get("asked")], round(time.monotonic(), 1))
+        for key, value in (("namespace", '"cars"'), ("downsampling", "[{}]")):
+            try:
+                zenoh.open(config(key, value))
+            except zenoh.ZError as error:
+                print(error)
+        """
+    )
+    assert log(run)[0] == "['Timeout'] 0.3"
+    assert log(run)[1].startswith("namespace")
+    assert "missing field" in log(run)[2]

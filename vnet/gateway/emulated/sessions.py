@@ -36,6 +36,15 @@ from vnet.gateway.emulated.vehicle import Vehicle
 
 QUERY_TIMEOUT_S = 10.0
 """Zenoh's own `queries_default_timeout`."""
+_REFUSED_SETTINGS = (
+    "namespace",
+    "access_control/enabled",
+    "downsampling",
+    "low_pass_filter",
+    "qos/network",
+    "qos/publication",
+)
+"""Parts of a configuration that change what a session sends, and which virtual time does not have."""
 LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
 
 
@@ -367,8 +376,15 @@ class Session:
         self._is_closed = False
         self._declared: dict[Entity, str] = {}
         self._at_close: list[Callable[[], object]] = []
-        enabled = msgspec.json.decode(config.get_json("timestamping/enabled"))
-        mode = msgspec.json.decode(config.get_json("mode")) or "peer"
+
+        def setting(name: str) -> Any:
+            return msgspec.json.decode(config.get_json(name))
+
+        for name in filter(setting, _REFUSED_SETTINGS):
+            raise zenoh.ZError(f"{name} of a configuration is not available on virtual time")
+        timeout_ms = setting("queries_default_timeout")
+        self._timeout_s = QUERY_TIMEOUT_S if timeout_ms is None else timeout_ms / 1000
+        enabled, mode = setting("timestamping/enabled"), setting("mode") or "peer"
         self.stamps = bool(enabled.get(mode) if isinstance(enabled, dict) else enabled)
         """True if its samples have timestamps of its own."""
 
@@ -515,7 +531,7 @@ class Session:
             priority=priority or zenoh.Priority.DATA,
             express=bool(express),
         )
-        asking.expire_after(QUERY_TIMEOUT_S if timeout is None else timeout)
+        asking.expire_after(self._timeout_s if timeout is None else timeout)
         if cancellation_token is not None:
             cancellation_token.add(asking)
         if not asking.is_over:

@@ -36,6 +36,10 @@ MOST_LOOKS, BUSY_WAIT_S = 1000, 0.001
 LONGEST_WAIT_S = 1e9
 """Largest timeout of a lock in seconds, as `threading.TIMEOUT_MAX`."""
 
+for _variable in ("RUST_BACKTRACE", "RUST_LIB_BACKTRACE"):
+    # An error of Zenoh's would walk the stack, of which greenlets have moved a part, and crash the process.
+    os.environ[_variable] = "0"
+
 _unending: list[greenlet] = []
 """Strands that did not end when they were told to: held, as to discard one is to tell it again."""
 _is_child = False
