@@ -47,6 +47,8 @@ from vnet.units import NS_PER_S
 ENDPOINTS = "endpoints.json"
 """File of a run's folder with the endpoint of each vehicle."""
 HIGHEST_PORT = 65_535
+HOW = "zenoh.Config.from_env() finds the endpoint by ZENOH_CONFIG, and zenoh.Config() does not"
+"""Most frequent cause of a program that does not connect."""
 
 
 @dataclass
@@ -256,7 +258,7 @@ class Gateways:
             self._spawn(self._end(node))
             self._tell("ended", node, how)
         elif not vehicle.names and not vehicle.is_ready:
-            self._say_hello(vehicle, failure="its commands have ended before they had connected")
+            self._say_hello(vehicle, failure=f"its commands have ended before they had connected: {HOW}")
         elif not vehicle.names:
             vehicle.endings.append(wire.Ending(node, "finished"))
             self._flush_soon(vehicle)
@@ -541,8 +543,9 @@ class Gateways:
         total = len(self._emulation.world.node_ids)
         if not where:
             return f"{len(nodes)} of {total} endpoints do not listen within {timeout_s:g} s: {first_names(nodes)}"
-        return f"programs of {len(where)} of {total} vehicles have not connected within {timeout_s:g} s: " + (
-            first_names(where)
+        return (
+            f"programs of {len(where)} of {total} vehicles have not connected within {timeout_s:g} s: "
+            f"{first_names(where)}: {HOW}"
         )
 
 
