@@ -290,3 +290,59 @@ def test_configuration_of_a_session_counts_or_is_refused_by_name(
     assert log(run)[0] == "['Timeout'] 0.3"
     assert log(run)[1].startswith("namespace")
     assert "missing field" in log(run)[2]
+
+
+def test_a_program_has_a_working_directory_and_sleeps_of_its_own(drive: Drive) -> None:
+    run = drive(
+        """
+        import asyncio, os, select, sys, time, zenoh
+        home = os.getcwd()
+        folder = os.path.join(os.path.dirname(os.path.abspath(__file__)), sys.argv[1])
+        os.mkdir(folder)
+        os.chdir(folder)
+        session = zenoh.open(zenoh.Config())
+        kept = session.declare_subscriber("a", lambda sample: print(os.getcwd() == folder))
+        select.select([], [], [], 0.5)
+        open("data", "w").close()
+        session.put("a", "b")
+        time.sleep(0.1)
+        print(os.path.exists(os.path.join(folder, "data")), time.monotonic())
+        """,
+        vehicles=2,
+        radio={"keys": ["none"]},
+    )
+    for node in ("v01", "v02"):
+        assert log(run, node)[:2] == ["True", "True 0.6"]
+
+
+def test_libraries_on_asyncio_find_no_loop_outside_of_coroutines(drive: Drive) -> None:
+    run = drive(
+        """
+        import asyncio
+        from asyncio import events, tasks
+        async def work():
+            await asyncio.sleep(0.1)
+            return events._get_running_loop() is asyncio.get_running_loop(), tasks.current_task() is not None
+        async def leave():
+            asyncio.get_running_loop().create_task(end())
+            await asyncio.sleep(0)
+        async def end():
+            try:
+                await asyncio.sleep(100)
+            finally:
+                print("ended")
+        def asked():
+            try:
+                return asyncio.current_task()
+            except RuntimeError:
+                return "none"
+        print(events._get_running_loop(), asked())
+        with asyncio.Runner() as runner:
+            print(runner.run(work()))
+            runner.run(leave())
+        loop = asyncio.new_event_loop()
+        loop.close()
+        print(loop.is_closed(), asyncio.new_event_loop().is_closed())
+        """
+    )
+    assert log(run)[:-1] == ["None none", "(True, True)", "ended", "True False"]

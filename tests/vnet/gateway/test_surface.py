@@ -2,7 +2,6 @@
 
 import ast
 from collections.abc import Iterator
-from itertools import count
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, cast
@@ -16,7 +15,7 @@ from vnet.gateway.emulated.programs import REFUSED, zenoh_modules
 MOST_REFUSED = 0.15
 MODULES = zenoh_modules(
     cast(Any, SimpleNamespace(due=None)),
-    cast(Any, SimpleNamespace(threads=SimpleNamespace(new_number=count().__next__), environ={})),
+    cast(Any, SimpleNamespace(threads=None, environ={})),
 )
 
 

@@ -15,6 +15,7 @@ import importlib.util
 import io
 import os
 import random
+import select
 import signal
 import subprocess
 import sys
@@ -131,6 +132,7 @@ class ProgramModules:
             "importlib": lambda: Facade(importlib, import_module=self._import_module, __import__=self._import),
             "os": self._os,
             "numpy": self._numpy,
+            "select": lambda: Facade(select, select=_select),
             "signal": lambda: Facade(signal, **self.process.signal_functions()),
             "subprocess": lambda: Facade(subprocess, **subprocess_functions(self.environ)),
             "sys": self._sys,
@@ -468,18 +470,24 @@ class ProgramModules:
             program_loop = ProgramLoop(loop, self)
             return program_loop
 
-        return Facade(
-            asyncio,
-            run=lambda main, *, debug=None, loop_factory=None: program_loop.run(main),
-            Runner=lambda **options: Runner(program_loop),
-            new_event_loop=new_event_loop,
-            set_event_loop=lambda loop: None,
-            get_event_loop=lambda: loop if _in_coroutine() else program_loop,
-            get_running_loop=lambda: loop if _in_coroutine() else _no_loop(),
-            all_tasks=lambda loop=None: set(self.living_tasks()),
-            wrap_future=_wrap_future,
-            run_coroutine_threadsafe=self._run_coroutine_threadsafe,
-        )
+        own = {
+            "run": lambda main, *, debug=None, loop_factory=None: program_loop.run(main),
+            "Runner": lambda **options: Runner(program_loop),
+            "new_event_loop": new_event_loop,
+            "set_event_loop": lambda loop: None,
+            "get_event_loop": lambda: loop if _in_coroutine() else program_loop,
+            "get_running_loop": lambda: loop if _in_coroutine() else _no_loop(),
+            "_get_running_loop": lambda: loop if _in_coroutine() else None,
+            "current_task": lambda loop=None: asyncio.current_task() if _in_coroutine() else _no_loop(),
+            "all_tasks": lambda loop=None: set(self.living_tasks()),
+            "wrap_future": _wrap_future,
+            "run_coroutine_threadsafe": self._run_coroutine_threadsafe,
+        }
+        for part in (asyncio.events, asyncio.futures, asyncio.runners, asyncio.tasks):
+            found = {name: value for name, value in own.items() if hasattr(part, name)}
+            self.modules[part.__name__] = Facade(part, **found)
+        parts = {part: self.modules[f"asyncio.{part}"] for part in ("events", "futures", "runners", "tasks")}
+        return Facade(asyncio, **own, **parts)
 
     def living_tasks(self) -> list[asyncio.Task[Any]]:
         """Return the tasks that were made within the present call of `asyncio.run`, and go on."""
@@ -532,6 +540,14 @@ def _run_job(executor: Any, function: Callable[..., Any], *args: Any) -> asyncio
 def _in_coroutine() -> bool:
     strand = current_strand()
     return strand is None or strand.is_task
+
+
+def _select(readers: Any, writers: Any, others: Any, timeout_s: float | None = None) -> Any:
+    """Do as `select.select`, which without files is a sleep."""
+    if readers or writers or others or timeout_s is None:
+        return select.select(readers, writers, others, timeout_s)
+    sleep(timeout_s)
+    return [], [], []
 
 
 def _no_loop() -> NoReturn:

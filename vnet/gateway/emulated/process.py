@@ -36,6 +36,7 @@ class OwnProcess:
     def os_functions(self) -> dict[str, Any]:
         """Return what stands for functions of `os`."""
         return {
+            "chdir": self._threads.folder.change,
             "getpid": lambda: PID,
             "getpgid": lambda pid: PID,
             "getpgrp": lambda: PID,

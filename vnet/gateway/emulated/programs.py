@@ -73,7 +73,7 @@ def _own_names(real: ModuleType) -> dict[str, Any]:
 
 def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, ModuleType]:
     """Return the package `zenoh` of a program, by the names of its modules."""
-    outlet = Outlet(vehicle.due, program.threads.new_number)
+    outlet = Outlet(vehicle.due, program.threads)
     config = type("Config", (values.Config,), {"environ": program.environ})
 
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:

@@ -16,8 +16,10 @@ import traceback
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
 from contextvars import Context, copy_context
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
+from pathlib import Path
 from types import ModuleType, coroutine
 from typing import Any, TypeVar
 
@@ -58,14 +60,35 @@ class HardExit(SystemExit):
     """The end of a program of which nothing runs any more, its `finally` blocks neither."""
 
 
+@dataclass
+class Folder:
+    """The working directory of a program, which is that of the process while its code runs."""
+
+    home: Path
+    """That of the process."""
+    path: Path | None = None
+    """That of the program, None if it is the same."""
+
+    def change(self, path: Any) -> None:
+        """Do as `os.chdir`."""
+        os.chdir(path)
+        self.path = Path.cwd()
+
+
 class Strand(greenlet):
     """A thread, or the greenlet of a coroutine (`is_task`), which alone a blocking call in it blocks."""
 
     def __init__(
-        self, run: Callable[[], Any], number: int, is_task: bool = False, context: Context | None = None
+        self,
+        run: Callable[[], Any],
+        number: int,
+        folder: Folder,
+        is_task: bool = False,
+        context: Context | None = None,
     ) -> None:
         super().__init__(run)
         self.number = number
+        self.folder = folder
         self.is_task = is_task
         self.at_end: list[Callable[[], object]] = []
         self.interrupt: BaseException | None = None
@@ -80,7 +103,18 @@ class Strand(greenlet):
     def begin(self) -> Any:
         """Run until the strand blocks, and return what it waits for; or to its end, and return its result."""
         self.parent = getcurrent()
-        return self.switch()
+        return self.go(self.switch)
+
+    def go(self, step: Callable[..., Any], *values: Any) -> Any:
+        """Go on by `switch` or `throw`, in the folder of the program."""
+        folder = self.folder
+        if folder.path is not None:
+            os.chdir(folder.path)
+        try:
+            return step(*values)
+        finally:
+            if folder.path is not None:
+                os.chdir(folder.home)
 
 
 @coroutine
@@ -99,7 +133,7 @@ def drive(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
         except BaseException as error:
             item = _thrown(strand, error)
         else:
-            item = strand.switch(value)
+            item = strand.go(strand.switch, value)
     if isinstance(item, GreenletExit):
         raise asyncio.CancelledError
     return item
@@ -117,7 +151,7 @@ def _thrown(strand: Strand, error: BaseException) -> Any:
         task.uncancel()
         if isinstance(error, HardExit):
             return error
-    return strand.throw(error)
+    return strand.go(strand.throw, error)
 
 
 IDLE = object()
@@ -146,7 +180,7 @@ def _end(strand: Strand) -> None:
         if strand.dead:
             return
         try:
-            strand.throw(GreenletExit())
+            strand.go(strand.throw, GreenletExit())
         except KeyboardInterrupt:
             raise
         except BaseException:  # of what the program does in answer, which nobody hears any more
@@ -324,6 +358,7 @@ class Threads:
     def __init__(self) -> None:
         self._numbers = count(1)
         self._alive = 0
+        self.folder = Folder(Path.cwd())
         self._handles: list[ThreadHandle] = []
         self.main: Strand | None = None
         """The strand of the main thread."""
@@ -344,7 +379,7 @@ class Threads:
 
     def strand(self, run: Callable[[], Any], is_task: bool = False) -> Strand:
         """Make a strand with a number of its own."""
-        return Strand(run, next(self._numbers), is_task)
+        return Strand(run, next(self._numbers), self.folder, is_task)
 
     def new_number(self) -> int:
         """Return the number of a further thread."""

@@ -18,6 +18,7 @@ from vnet.gateway import frames
 from vnet.gateway.emulated.strands import (
     IDLE,
     Strand,
+    Threads,
     block_on,
     drive,
     fail,
@@ -339,7 +340,7 @@ class CallbackSink:
         self._callback = callback
         self._drop = drop
         self._outlet = outlet
-        self._number = outlet.new_number()
+        self._number = outlet.threads.new_number()
         self._context = copy_context()
         self._strand: Strand | None = None
         self._items: deque[Any] = deque()
@@ -364,7 +365,9 @@ class CallbackSink:
         """Call the callback until it blocks; then a task goes on with it."""
         strand = self._strand
         if strand is None:
-            strand = self._strand = Strand(self._work, self._number, context=self._context)
+            strand = self._strand = Strand(
+                self._work, self._number, self._outlet.threads.folder, context=self._context
+            )
         item = strand.begin()
         if item is not IDLE:
             Task(_go_on(strand, item), loop=asyncio.get_running_loop(), name=f"thread {self._number}")
@@ -417,8 +420,7 @@ class Outlet(NamedTuple):
     """Destination of items for a program."""
 
     due: DueCallbacks
-    new_number: Callable[[], int]
-    """Numbers the program's threads."""
+    threads: Threads
 
 
 def sink_of(handler: Any, outlet: Outlet) -> tuple[Handler | CallbackSink, Any, bool]:
