@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -70,10 +70,11 @@ def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]
     path = problem["loc"]
     if problem["type"] != "extra_forbidden":
         path = tuple(part for part in path if not _ALTERNATIVE.fullmatch(str(part)))
-    key = printable(".".join(str(part) for part in path) or "it")
+    keys, _ = _followed(of, path)
+    key = printable(".".join(str(part) for part in keys) or "it")
     before = f"{key}: " if path else ""
     if problem["type"] == "extra_forbidden":
-        allowed = _allowed_keys(of, path[:-1])
+        allowed = sorted({name for section in _followed(of, path[:-1])[1] for name in section.model_fields})
         return f"{key}: unknown key{did_you_mean(path[-1], allowed)}; allowed here: {', '.join(allowed)}"
     if problem["type"] == "union_tag_not_found":
         return f"{before}a kind is needed"
@@ -106,20 +107,24 @@ def _worded(problem: ErrorDetails) -> str:
     return message[:1].lower() + message[1:]
 
 
-def _allowed_keys(of: type[BaseModel] | TypeAdapter[Any], path: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the section at `path`, where numbers are indices of lists and kinds stand for classes.
+def _followed(
+    of: type[BaseModel] | TypeAdapter[Any], path: Sequence[int | str]
+) -> tuple[list[int | str], list[type[BaseModel]]]:
+    """Return the keys of a `path`, without the kinds that pydantic puts in, and the sections at its end.
 
-    Names that are neither a key nor a kind are the user's own, of a table such as `world.sensor`.
+    Numbers are indices of lists. Names that are neither a key nor a kind are the user's own, of a table such as
+    `world.sensor`.
     """
-    models = list(_sections_in(of))
+    keys, models = list[int | str](), list(_sections_in(of))
     for name in path:
-        if isinstance(name, int):
-            continue
         kinds = [m for m in models if "kind" in m.model_fields] if len(models) > 1 else []
         by_kind = [m for m in kinds if name in get_args(m.model_fields["kind"].annotation)]
-        fields = [m.model_fields[name] for m in models if name in m.model_fields]
-        models = by_kind or [m for f in fields for m in _sections_in(f.annotation)] or models
-    return sorted({key for model in models for key in model.model_fields})
+        if not by_kind or not keys or isinstance(keys[-1], int):  # of a fault the kind tells which it is
+            keys.append(name)
+        if not isinstance(name, int):
+            fields = [m.model_fields[name] for m in models if name in m.model_fields]
+            models = by_kind or [m for f in fields for m in _sections_in(f.annotation)] or models
+    return keys, models
 
 
 def _sections_in(annotation: Any) -> Iterator[type[BaseModel]]:

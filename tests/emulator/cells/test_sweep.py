@@ -52,6 +52,13 @@ def test_the_cells_are_all_combinations_with_every_seed() -> None:
     assert len({cell.digest for cell in cells}) == len(cells)
 
 
+def test_kinds_are_varied_with_the_defaults_of_each() -> None:
+    kinds = ["lte-mode4", "nr-mode2", "80211p"]
+    changes = {"radio.path_loss": {"kind": "winner_b1"}, "radio.mac": {"kind": kinds[0]}}
+    cells = SweepPlan.of(scenario_of("beacon", changes), {"radio.mac.kind": kinds}, [1], True).cells
+    assert [cell.scenario.radio.mac.kind for cell in cells if cell.scenario.radio.mac] == kinds
+
+
 def test_shards_are_the_whole_without_an_overlap() -> None:
     whole = plan()
     shards = [whole.shard(number, 3) for number in (1, 2, 3)]

@@ -70,6 +70,7 @@ def test_bytes_that_are_no_scenario_are_one_line(tmp_path: Path, folder: bool) -
         ("radio.loss=", ["radio.loss = ''", "number"]),
         ("radio.loss=much", ["radio.loss = 'much'", "number"]),
         ("radio.los=0.1", ["radio.los", "unknown key", "loss"]),
+        ('radio.mac={kind = "lte-mode4", one_sht = 1}', ["radio.mac.one_sht", "unknown key", "one_shot"]),
         ("raido.loss=0.1", ["raido", "unknown key", "radio"]),
         ("run.keep_payloads=yes", ["run.keep_payloads = 'yes'", "true or false"]),
         ("run.pacing=fast", ["run.pacing = 'fast'", "'lockstep' or 'realtime'"]),
