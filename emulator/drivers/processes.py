@@ -78,17 +78,20 @@ class ProtocolError(VnetError):
         self.rule = rule
 
 
-def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
+def check_ownership(nodes: Sequence[str], *traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
     """Raise ProtocolError if the traffic of the process of `nodes`, or its `waiting` nodes, are not its own."""
-    sent = traffic.frames, traffic.messages, traffic.actions
-    told = *sent, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations
     own = frozenset(nodes)  # of a simulation a thousand, each of which is looked for several times
-    for node in [part.node for parts in told for part in parts] + [*waiting]:
+    for node in [*waiting, *(part.node for each in traffic for parts in _told(each) for part in parts)]:
         if node not in own:
             raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own", "own_node")
-    for action in traffic.actions:
+    for action in (action for each in traffic for action in each.actions):
         if not action.is_sound:
             raise ProtocolError(f"{action.node} asks for an acceleration that is no number", "numbers")
+
+
+def _told(traffic: wire.Traffic) -> Sequence[Sequence[Any]]:
+    sent = traffic.frames, traffic.messages, traffic.actions
+    return *sent, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations
 
 
 def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_ns: int) -> None:
@@ -99,7 +102,6 @@ def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_
             f"of its window, {end_ns}",
             "timers",
         )
-    check_ownership(nodes, wire.Traffic(), [*message.waiting_radio, *message.waiting_gnss])
     earliest_ns = granted_ns
     for step in message.steps:
         if not earliest_ns <= step.time_ns < end_ns:
@@ -109,4 +111,5 @@ def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_
                 "steps",
             )
         earliest_ns = step.time_ns + 1
-        check_ownership(nodes, step.traffic)
+    waiting = [*message.waiting_radio, *message.waiting_gnss]
+    check_ownership(nodes, *(step.traffic for step in message.steps), waiting=waiting)

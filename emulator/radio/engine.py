@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
-from typing import overload
+from typing import Required, TypedDict, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,6 +271,17 @@ NO_CHOICES = None, None, None, None
 
 _choices = attrgetter("power_dbm", "rate_mbps", "to", "period_ms")
 
+
+class _Chosen(TypedDict, total=False):
+    """The fields of a frame that a program may choose."""
+
+    bitrate_mbps: Required[float]
+    gain_db: float
+    to: int
+    ticket: int
+    period_ms: int
+
+
 _COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
 _CHOICES = attrgetter(*(f"frame.{name}" for name in CHOSEN))
 _OF_FRAME = ("frame.sent_ns", "frame.sender", "frame.seq", "frame.size_bytes", "frame.copy")
@@ -392,6 +403,11 @@ class Engine:
         self._topology.advance(time_ns)
         for asked in frames:
             payload = asked if isinstance(asked, bytes) else asked.payload
+            chosen: _Chosen | None = {"bitrate_mbps": self._radio.bitrate_mbps}
+            if isinstance(asked, SentFrame) and _choices(asked) != NO_CHOICES:
+                chosen = self._chosen(time_ns, node, asked)
+                if chosen is None:
+                    continue
             frame = Frame(
                 sender=node,
                 seq=self._next_seq[node],
@@ -399,14 +415,9 @@ class Engine:
                 payload=payload,
                 topology=self._topology.now,
                 effects=self._links.effects,
-                bitrate_mbps=self._radio.bitrate_mbps,
                 name=self._node_ids[node],
+                **chosen,
             )
-            if isinstance(asked, SentFrame) and _choices(asked) != NO_CHOICES:
-                chosen = self._chosen(frame, asked)
-                if chosen is None:
-                    continue
-                frame = chosen
             self._next_seq[node] += 1
             for take in self.on_payload:
                 take(time_ns, node, frame.seq, payload)
@@ -417,9 +428,8 @@ class Engine:
             for each in self._senders.frames(frame):
                 self._enqueue(each)
 
-    def _chosen(self, frame: Frame, asked: SentFrame) -> Frame | None:
-        """Return a frame with what its program has chosen; None for one to nobody, which is not sent."""
-        node = frame.sender
+    def _chosen(self, time_ns: int, node: int, asked: SentFrame) -> _Chosen | None:
+        """Return what a program has chosen for a frame; None for one to nobody, which is not sent."""
         gain_db, bitrate_mbps = allowed_choices(self._radio, asked, self._rules.largest_dbm(node))
         to, ticket = BROADCAST, 0
         if asked.to is not None:
@@ -427,13 +437,18 @@ class Engine:
             if not self._mac.acknowledges:
                 return None
             if to in (node, BROADCAST):
-                self._unicasts.refuse(node, asked.number, frame.sent_ns)
+                self._unicasts.refuse(node, asked.number, time_ns)
                 return None
             ticket, self._trace.acknowledges = self._unicasts.register(node, asked.number), True
         if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
-        period_ms = allowed_period_ms(self._radio, asked)
-        return replace(frame, gain_db=gain_db, bitrate_mbps=bitrate_mbps, to=to, ticket=ticket, period_ms=period_ms)
+        return {
+            "gain_db": gain_db,
+            "bitrate_mbps": bitrate_mbps,
+            "to": to,
+            "ticket": ticket,
+            "period_ms": allowed_period_ms(self._radio, asked),
+        }
 
     def _enqueue(self, frame: Frame) -> None:
         sent = Transmission(frame, attempt=int(frame.to != BROADCAST))
@@ -467,8 +482,7 @@ class Engine:
 
     def _settle(self) -> None:
         """Run the stages over the frames that have been sent."""
-        if transmissions := self._mac.sent:
-            self._mac.sent = []
+        if transmissions := self._mac.take_sent():
             receptions = self._decided(transmissions)
             for stage in self.timing:
                 stage(transmissions, receptions)

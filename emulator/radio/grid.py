@@ -16,8 +16,8 @@ only NR says.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,15 +85,30 @@ class Candidates(NamedTuple):
         return self._replace(mask=self.mask & ((slots >= first) & (slots <= last))[:, None])
 
 
-class Heard(NamedTuple):
-    """Frames of a slot: received powers (K, N) in mW, who decoded what they reserve, and their places and periods.
+class Places(NamedTuple):
+    """Places of K frames, in the order of their slots: (K,) each.
 
-    A place is the first subchannel and their number; a period of 0 slots reserves nothing.
+    `slot` is the index of a frame's slot among some, `first` its first subchannel, and `length` their number.
+    """
+
+    slot: IntArray
+    first: IntArray
+    length: IntArray
+
+    def each(self) -> Iterator[tuple[int, int, int]]:
+        """Yield the place of each frame: the index of its slot, its first subchannel, and their number."""
+        return zip(self.slot.tolist(), self.first.tolist(), self.length.tolist(), strict=True)
+
+
+class Heard(NamedTuple):
+    """Frames of some slots: received powers (K, N) in mW, who decoded what they reserve, and their places.
+
+    Their `periods` (K,) are in slots; 0 reserves nothing.
     """
 
     power_mw: Array
     decoded: Mask
-    places: Sequence[tuple[int, int]]
+    places: Places
     periods: Sequence[int]
 
 
@@ -123,28 +138,44 @@ class SensedGrid:
             self._power_mw[:, rows] = 0
         self._next = slot
 
-    def sense(self, slot: int, power_mw: Array, deaf: Mask, heard: Heard) -> None:
-        """Note a slot: the power (subchannels, N) at each vehicle, who transmitted, and what others reserve.
+    def sense(self, slots: Sequence[int], power_mw: Array, deaf: Mask, heard: Heard) -> None:
+        """Note slots: the power (slots, subchannels, N) at each vehicle, who transmitted, and what others reserve.
 
-        Of the frames on one subchannel the strongest that a vehicle can decode counts.
+        None of them may have been over. Of the frames on one subchannel the strongest that a vehicle can decode
+        counts.
         """
-        self.advance(slot + 1)
-        row = slot % self._ring
-        self._deaf[:, row] = deaf
+        self.advance(slots[0])
+        index = [slot - slots[0] for slot in slots]
+        shape = slots[-1] - slots[0] + 1, *power_mw.shape[1:]
+        reserved_dbm, period = np.full(shape, NOT_RESERVED_DBM, np.float16), np.zeros(shape, np.int16)
+        dbm = np.full(heard.power_mw.shape, NOT_RESERVED_DBM)
+        np.log10(heard.power_mw, out=dbm, where=heard.decoded)
+        dbm = (10 * dbm).astype(np.float16)
+        frames = zip(dbm, heard.periods, heard.places.each(), strict=True)
+        for own_dbm, reserved_for, (slot, first, length) in frames:
+            if reserved_for:
+                place = index[slot], slice(first, first + length)
+                stronger = own_dbm > reserved_dbm[place]
+                np.copyto(reserved_dbm[place], own_dbm, where=stronger)
+                np.copyto(period[place], reserved_for, where=stronger)
+        self._put(self._reserved_dbm, slots[0], reserved_dbm)
+        self._put(self._period, slots[0], period)
+        silent = np.zeros((shape[0], shape[2]), bool)
+        silent[index] = deaf
+        self._put(self._deaf, slots[0], silent)
         if self._power_mw is not None:
-            self._power_mw[:, row] = np.where(deaf | (power_mw < self._busy_mw), 0, power_mw).T
-        for (first, length), period, own_mw, decoded in zip(
-            heard.places, heard.periods, heard.power_mw, heard.decoded, strict=True
-        ):
-            if not period:
-                continue
-            dbm = np.full(len(own_mw), NOT_RESERVED_DBM)
-            np.log10(own_mw, out=dbm, where=decoded)
-            dbm = (10 * dbm).astype(np.float16)[:, None]
-            reserved_dbm = self._reserved_dbm[:, row, first : first + length]
-            stronger = dbm > reserved_dbm
-            np.copyto(reserved_dbm, dbm, where=stronger)
-            np.copyto(self._period[:, row, first : first + length], period, where=stronger)
+            sensed_mw = np.zeros(shape, np.float32)
+            sensed_mw[index] = np.where(deaf[:, None] | (power_mw < self._busy_mw), 0, power_mw)
+            self._put(self._power_mw, slots[0], sensed_mw)
+        self._next = slots[-1] + 1
+
+    def _put(self, kept: NDArray[Any], first: int, values: NDArray[Any]) -> None:
+        """Put values (slots, …, N) of successive slots where what is kept (N, ring, …) has them."""
+        row, count = first % self._ring, len(values)
+        values = np.moveaxis(values, -1, 0)
+        before = min(count, self._ring - row)
+        kept[:, row : row + before] = values[:, :before]
+        kept[:, : count - before] = values[:, before:]
 
     def candidates(self, now: int, wanted: Wanted) -> Candidates:
         """Return the candidates among the resources that a vehicle looks for in slot `now`.

@@ -35,6 +35,11 @@ class Mac:
     def __init__(self) -> None:
         self.sent: list[Transmission] = []
 
+    def take_sent(self) -> list[Transmission]:
+        """Remove and return the transmissions of `sent`, with all that decides about their receptions."""
+        sent, self.sent = self.sent, []
+        return sent
+
     def enqueue(self, sent: Transmission) -> None:
         """Take a frame sent at `sent_ns`; set `sender_outcome` and `end_ns` before it is in `sent`."""
         raise NotImplementedError

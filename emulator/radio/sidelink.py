@@ -20,12 +20,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from heapq import heappop, heappush
 
 import numpy as np
 
 from emulator.radio.frames import Frame, Receptions, Signal, Transmission
-from emulator.radio.grid import BusyMeter, Candidates, Heard, SensedGrid, Wanted
+from emulator.radio.grid import BusyMeter, Candidates, Heard, Places, SensedGrid, Wanted
 from emulator.radio.mac import Mac, ThrottledQueue
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.outcomes import Outcome
@@ -49,6 +50,8 @@ OCCUPANCY_MS = 1000
 """Time over which the channel occupancy ratio is measured (TS 36.214, 5.1.31)."""
 SCI_SNR_DB = 0.0
 """Least ratio of signal to noise and interference at which a reservation is decoded."""
+MOST_UNSENSED = 50
+"""Most slots between two that are sensed at once."""
 CHANNEL_KHZ = 9000
 """Width of the 50 resource blocks of 10 MHz, over which `radio.receiver.noise_dbm` is given."""
 _CHOICE, _COUNTER, _KEEP, _REPEAT, _SHOT, _AGAIN, _TIES = range(7)
@@ -147,6 +150,8 @@ class Sidelink(Mac):
         self._throttle = ThrottledQueue()
         self._stations: dict[int, _Station] = {}
         self._booked: dict[int, list[_Booking]] = {}
+        self._on_air: list[tuple[int, list[_Booking]]] = []
+        """Slots with what is transmitted in them, which nobody has needed to sense yet."""
         self._events: list[_Event] = []
         self._planned = 0
         self._now_ns = 0
@@ -160,7 +165,9 @@ class Sidelink(Mac):
     def enqueue(self, sent: Transmission) -> None:
         """Take a frame; it is ready after its access jitter, and not before the sender's earlier frames."""
         frame = sent.frame
-        station = self._stations.setdefault(frame.sender, _Station(frame.sender))
+        station = self._stations.get(frame.sender)
+        if station is None:
+            station = self._stations[frame.sender] = _Station(frame.sender)
         sent.signal = self._signals.of(frame)
         ready_ns = frame.sent_ns
         if self._jitter_ns:
@@ -174,6 +181,11 @@ class Sidelink(Mac):
         station.ready_ns = max(slow_ns, station.ready_ns)
         station.coming += 1
         self._plan(station.ready_ns, READY, frame.sender, sent)
+
+    def take_sent(self) -> list[Transmission]:
+        """See `Mac`."""
+        self._sense()
+        return super().take_sent()
 
     def _leave(self, sent: Transmission, sender_outcome: Outcome, time_ns: int) -> None:
         sent.sender_outcome, sent.end_ns = sender_outcome, time_ns
@@ -313,7 +325,9 @@ class Sidelink(Mac):
         if (grant := station.grant) is not None:
             for slot in range(grant.slot, wanted.last + 1, grant.period):
                 booked |= {slot, slot + grant.repeat[0]} if grant.repeat else {slot}
-        found = self._grid.candidates(self._now_ns // self._slot_ns, wanted._replace(booked=frozenset(booked)))
+        now = self._now_ns // self._slot_ns
+        self._sense(now)
+        found = self._grid.candidates(now, wanted._replace(booked=frozenset(booked)))
         if self._mac.ranks_power:
             ties = self._draws.uniform(frame.sender, frame.seq, _TIES + found.mask.size, frame.draw)[_TIES:]
             found = found.quietest(self._mac.candidate_share, ties)
@@ -415,6 +429,7 @@ class Sidelink(Mac):
         station, slots = booking.station, OCCUPANCY_MS * NS_PER_MS // self._slot_ns
         while station.used and station.used[0][0] <= booking.slot - slots:
             station.used.popleft()
+        self._sense()
         ratio = self._meter.at(self._now_ns // SLICE_NS * SLICE_NS)[station.node]
         limits = [
             most for busy, most in zip(self._congestion.busy, self._congestion.most, strict=True) if ratio >= busy
@@ -422,30 +437,53 @@ class Sidelink(Mac):
         occupied = booking.length + sum(length for _, length in station.used)
         return not limits or occupied <= limits[-1] * slots * self._mac.subchannels
 
-    def _transmit(self, slot: int, on_air: Sequence[_Booking]) -> None:
-        """Decide what everybody receives and senses in a slot."""
-        deaf = np.zeros(self._signals.count, bool)
-        deaf[[each.station.node for each in on_air]] = True
-        power_mw = np.array([_signal(each.sent).power_mw for each in on_air])
-        places = [(each.subchannel, each.length) for each in on_air]
-        sensed_mw = self._link.sensed_mw(power_mw, places)
-        others_mw = [sensed_mw[first : first + length].sum(axis=0) for first, length in places] - power_mw
-        np.maximum(others_mw, 0.0, out=others_mw)
-        lengths = np.array([length for _, length in places])
-        decoded = self._link.decodes_reservation(power_mw, others_mw, lengths) & ~deaf
-        busy = (sensed_mw >= self._link.busy_mw).sum(axis=0)
-        for index, booking in enumerate(on_air):
+    def _transmit(self, slot: int, on_air: list[_Booking]) -> None:
+        """Put frames on air in a slot."""
+        for booking in on_air:
             sent = booking.sent
             assert sent is not None
-            _signal(sent).slots.append((others_mw[index], deaf))
-            busy[booking.station.node] = booking.length
             if self._congestion is not None:
                 booking.station.used.append((slot, booking.length))
             if not booking.is_repeat:
                 sent.on_air_ns = slot * self._slot_ns
             sent.end_ns = (slot + 1) * self._slot_ns
-        self._grid.sense(slot, sensed_mw, deaf, Heard(power_mw, decoded, places, [each.period for each in on_air]))
-        self._meter.add(slot, busy)
+        if self._on_air and slot - self._on_air[0][0] >= MOST_UNSENSED:
+            self._sense()
+        self._on_air.append((slot, on_air))
+
+    def _sense(self, before: int | None = None) -> None:
+        """Decide what everybody receives and senses in the slots that are left, or in those before one of them.
+
+        Many slots at once take little more time than one.
+        """
+        count = len(self._on_air) if before is None else sum(slot < before for slot, _ in self._on_air)
+        if not count:
+            return
+        slots, bookings = zip(*self._on_air[:count], strict=True)
+        del self._on_air[:count]
+        on_air = [booking for some in bookings for booking in some]
+        nodes = [booking.station.node for booking in on_air]
+        power_mw = np.array([_signal(booking.sent).power_mw for booking in on_air])
+        places = Places(
+            slot=np.repeat(np.arange(count), [len(some) for some in bookings]),
+            first=np.array([booking.subchannel for booking in on_air]),
+            length=np.array([booking.length for booking in on_air]),
+        )
+        deaf = np.zeros((count, self._signals.count), bool)
+        deaf[places.slot, nodes] = True
+        sensed_mw = self._link.sensed_mw(power_mw, places)
+        places_mw = [sensed_mw[slot, first : first + length] for slot, first, length in places.each()]
+        others_mw = np.array([each_mw[0] if len(each_mw) == 1 else each_mw.sum(axis=0) for each_mw in places_mw])
+        others_mw -= power_mw
+        np.maximum(others_mw, 0.0, out=others_mw)
+        decoded = self._link.decodes_reservation(power_mw, others_mw, places.length) & ~deaf[places.slot]
+        busy = (sensed_mw >= self._link.busy_mw).sum(axis=1)
+        busy[places.slot, nodes] = places.length
+        for booking, each_mw, index in zip(on_air, others_mw, places.slot.tolist(), strict=True):
+            _signal(booking.sent).slots.append((each_mw, deaf[index]))
+        self._grid.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, [each.period for each in on_air]))
+        for slot, each in zip(slots, busy, strict=True):
+            self._meter.add(slot, each)
 
     def _follow(self, booking: _Booking) -> None:
         """Book the second transmission of a frame, or leave it to be judged."""
@@ -470,11 +508,13 @@ class Sidelink(Mac):
 
     def busy_ratios(self, time_ns: int) -> list[Array]:
         """See `Mac`."""
+        self._sense()
         self._meter.count(time_ns)
         return self._meter.windows[: time_ns // WINDOW_NS]
 
     def busy_ratios_at(self, time_ns: int) -> Array:
         """See `Mac`; the time is no more than two lookaheads and a window back."""
+        self._sense()
         return self._meter.at(time_ns)
 
 
@@ -505,13 +545,15 @@ class Link:
         """Return the number of subchannels that a frame takes."""
         return -(-max(size_bytes, 1) // self._bytes)
 
-    def sensed_mw(self, power_mw: Array, places: Sequence[tuple[int, int]]) -> Array:
-        """Return the power (subchannels, N) of signals with these powers (K, N) and places, with their leakage."""
-        sensed_mw = np.zeros((self._subchannels, len(power_mw[0])))
-        for own_mw, (first, length) in zip(power_mw, places, strict=True):
-            each_mw = own_mw / length
-            sensed_mw += each_mw * self._leak
-            sensed_mw[first : first + length] += each_mw * (1 - self._leak)
+    def sensed_mw(self, power_mw: Array, places: Places) -> Array:
+        """Return the power (slots, subchannels, N) of signals with these powers (K, N), with their leakage."""
+        sensed_mw = np.zeros((int(places.slot[-1]) + 1, self._subchannels, power_mw.shape[1]))
+        each_mw = power_mw / places.length[:, None]
+        frames = zip(each_mw * self._leak, each_mw * (1 - self._leak), places.each(), strict=True)
+        for leaked_mw, own_mw, (slot, first, length) in frames:
+            in_slot_mw = sensed_mw[slot]
+            in_slot_mw += leaked_mw
+            in_slot_mw[first : first + length] += own_mw
         return sensed_mw
 
     def decodes_reservation(self, own_mw: Array, others_mw: Array, lengths: IntArray) -> Mask:
@@ -580,7 +622,7 @@ class SidelinkReception:
                 signal = _signal(sent)
                 own_mw[index] = signal.power_mw
                 others_mw[index] = self._link.noise_mw(self._link.length(sent.frame.size_bytes))
-                others_mw[index] += np.min([others for others, _ in signal.slots], axis=0)
+                others_mw[index] += reduce(np.minimum, [others for others, _ in signal.slots])
         power_mw = own_mw[frame_index, receiver]
         power_mw[power_mw == 0] = np.nan
         return np.asarray(10 * np.log10([power_mw, power_mw / others_mw[frame_index, receiver]]))

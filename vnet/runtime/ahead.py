@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NoReturn
 
 from msgspec.structs import replace
@@ -44,7 +45,7 @@ class RunAhead:
         self._is_exchanging = False
         self._is_over = False
         for node in host.nodes.values():
-            node.radio.inbox.refill = self.catch_up
+            node.radio.inbox.refill = partial(self._look, node.radio.inbox.refill)
 
     def open_window(self, grant: wire.Grant) -> int:
         """Take a grant; returns its first instant, with everything delivered that is due at it."""
@@ -78,6 +79,11 @@ class RunAhead:
         if self._fixes_ns is not None and self._fixes_ns <= wake_ns:
             self._host.mail.deliver(Mail.of((), self._take_fixes()), wake_ns)
         return wake_ns
+
+    def _look(self, refill: Callable[[], None]) -> None:
+        """Let a program look for packets, as of this instant."""
+        self.catch_up()
+        refill()
 
     def catch_up(self) -> None:
         """Have this instant granted if it is quiet: a program looks for packets, tells anything, or begins a job.

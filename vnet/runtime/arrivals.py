@@ -7,15 +7,16 @@ that the nodes' clocks show.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
-from operator import itemgetter
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
-from vnet.mailbox import Mailbox
+from vnet.mailbox import INBOX_LIMIT, Mailbox
 from vnet.node import Fix, Node
 from vnet.radio import Packet
 from vnet.runtime.own_asyncio import present_node
@@ -147,38 +148,43 @@ class MeasuredBusyRatios:
         return self._measured[0].ratios[self._index[node]] if self._measured else None
 
 
+_received_ns = attrgetter("received_ns")
+
+
 class Window:
     """The window of a process, with its packets, each at its arrival, and the steps that were made in it.
 
     The emulator grants a process a window of time, in which it passes from instant to instant by itself
-    (docs/virtual-time.md). Packets that no instant has come to stay for the next window.
+    (docs/virtual-time.md). Packets stay until their node looks for them, also beyond the window.
     """
 
     def __init__(self) -> None:
         self.end_ns = 0
         """The end of the window, which is not in it."""
-        self._new: dict[str, list[Packet]] = {}
-        self._packets: deque[tuple[int, str, Packet]] = deque()
+        self._packets: dict[str, list[Packet]] = {}
         self._steps: list[wire.Step] = []
         self._instants = 0
 
     def open(self, end_ns: int, packets: dict[str, list[Packet]]) -> None:
-        """Begin the next window; the steps of the last one have been taken."""
-        if self._new:
-            self._queue_new()
-        self.end_ns = end_ns
-        self._new = packets
+        """Begin the next window; the steps of the last one have been taken.
 
-    def _queue_new(self) -> None:
-        """Put packets in the order of their arrivals: only when needed, because most are due at once."""
-        new = [(packet.received_ns, node, packet) for node, some in self._new.items() for packet in some]
-        self._packets.extend(sorted(new, key=itemgetter(0)))
-        self._new = {}
+        Its packets, oldest first for each node, go behind those that wait. Of these a mailbox would keep the last.
+        """
+        self.end_ns = end_ns
+        if not self._packets:
+            self._packets = packets
+            return
+        for node, new in packets.items():
+            if waiting := self._packets.get(node):
+                if len(waiting) > 2 * INBOX_LIMIT:
+                    del waiting[:-INBOX_LIMIT]
+                waiting += new
+            else:
+                self._packets[node] = new
 
     def drop(self, node: str) -> None:
         """Drop the packets of a node whose process is gone."""
-        self._new.pop(node, None)
-        self._packets = deque(entry for entry in self._packets if entry[1] != node)
+        self._packets.pop(node, None)
 
     def end_instant(self, time_ns: int, traffic: wire.Traffic) -> None:
         """Note that the process has nothing left to do at an instant, and what was enqueued at it."""
@@ -187,32 +193,23 @@ class Window:
             self._steps.append(wire.Step(time_ns, traffic))
 
     @property
-    def has_packets(self) -> bool:
-        """True if packets are yet to be taken."""
-        return bool(self._new or self._packets)
+    def with_packets(self) -> list[str]:
+        """Nodes with packets that are yet to be taken."""
+        return [*self._packets]
 
     def first_packet_ns(self, awaits: Callable[[str], bool]) -> int:
         """Return the arrival of the first packet at a node that `awaits` one, or the window's end."""
-        self._queue_new()
-        return next((received_ns for received_ns, node, _ in self._packets if awaits(node)), self.end_ns)
+        firsts_ns = (some[0].received_ns for node, some in self._packets.items() if awaits(node))
+        return min(firsts_ns, default=self.end_ns)
 
-    def take_packets(self, time_ns: int, paused: Collection[str]) -> dict[str, list[Packet]]:
-        """Remove and return the packets that have arrived by then, oldest first; those of paused nodes wait."""
-        due = self._new
-        if not (self._packets or paused) and all(some[-1].received_ns <= time_ns for some in due.values()):
-            self._new = {}
-            return due
-        self._queue_new()
-        due = {}
-        waiting: list[tuple[int, str, Packet]] = []
-        while self._packets and self._packets[0][0] <= time_ns:
-            _, node, packet = entry = self._packets.popleft()
-            if node in paused:
-                waiting.append(entry)
-            else:
-                due.setdefault(node, []).append(packet)
-        self._packets.extendleft(reversed(waiting))
-        return due
+    def take_packets(self, node: str, time_ns: int) -> list[Packet]:
+        """Remove and return the packets that have arrived at a node by then, oldest first."""
+        some = self._packets.pop(node, [])
+        if not some or some[-1].received_ns <= time_ns:
+            return some
+        due = bisect_right(some, time_ns, key=_received_ns)
+        self._packets[node] = some[due:]
+        return some[:due]
 
     def take_final(self, last: wire.Traffic) -> wire.Traffic:
         """Return the exceptions and notes that have not been taken, and those of the `last` traffic."""
@@ -245,9 +242,13 @@ class MailDelivery:
             self._add_events(self.ordered, mail, time_ns)
             return
         for node, packets in mail.packets.items():
-            self._nodes[node].radio.inbox.deliver(self._shown(node, packets))
+            self.deliver_packets(node, packets)
         for node, fix in mail.fixes:
             self._nodes[node].gnss.inbox.deliver((fix,))
+
+    def deliver_packets(self, node: str, packets: Sequence[Packet]) -> None:
+        """Deliver packets, oldest first, to a node."""
+        self._nodes[node].radio.inbox.deliver(self._shown(node, packets))
 
     def deliver_news(self, arrivals: Iterable[NewsItem], time_ns: int | None = None) -> None:
         """Deliver results of frames to single nodes, and messages of the backbone."""

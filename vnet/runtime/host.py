@@ -30,7 +30,7 @@ from vnet.driving import Action
 from vnet.errors import DeadlockError
 from vnet.mailbox import Mailbox, Waits
 from vnet.node import Fix, Node
-from vnet.radio import RadioAbilities, SentFrame
+from vnet.radio import Packet, RadioAbilities, SentFrame
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals, outside_loop
@@ -130,7 +130,15 @@ class Host:
         for name, inbox in inboxes.items():
             inbox.guard = partial(self._check_thread, node.id, f"{name}.drain() or receive()")
             inbox.waits = self._waits[name]
+        node.radio.inbox.refill = partial(self._refill, node)
         return node
+
+    def _refill(self, node: Node) -> None:
+        """Deliver the packets that have arrived at a node whose program looks for them (lockstep)."""
+        if self._thread != get_ident() or not self._runs(node) or node.id in self._paused:
+            return
+        if packets := self._window.take_packets(node.id, self._clock()):
+            self.mail.deliver_packets(node.id, packets)
 
     def _check_thread(self, node: str, call: str) -> None:
         if self._thread is not None and self._thread != get_ident():
@@ -264,6 +272,7 @@ class Host:
         """A node's process is gone (simulated): its program is cancelled, unheard; if killed it goes no further."""
         gone = self.nodes[node]
         goes_on = self._runs(gone)
+        self._refill(gone)
         gone.disconnect()
         self._active[node] = False
         self._late = [entry for entry in self._late if entry[0] != node]
@@ -289,13 +298,17 @@ class Host:
     def restart(self, welcome: wire.Welcome) -> None:
         """Run a node's program again, as another incarnation (simulated)."""
         node = self.nodes[welcome.node] = self._node(welcome)
+        self._window.drop(node.id)
         self._orders[welcome.node] = welcome.order
         self._active[node.id] = True
         self._start(node)
 
     def pause(self, nodes: Iterable[str]) -> None:
         """Pause these nodes from now on, and no others: their callbacks wait (simulated)."""
-        self._paused = set(nodes)
+        paused = set(nodes)
+        for node in paused:
+            self._refill(self.nodes[node])
+        self._paused = paused
         self._hold()
 
     def _hold(self) -> None:
@@ -366,7 +379,7 @@ class Host:
         (window := self._window).end_instant(self._clock(), self.take_traffic())
         next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
         next_ns = self.news.first_ns(self._paused, next_ns)
-        if self._waits["radio"].count and window.has_packets:
+        if self._waits["radio"].count:
             next_ns = min(next_ns, window.first_packet_ns(self._awaits_packet))
         if next_ns >= window.end_ns:
             return None
@@ -377,11 +390,20 @@ class Host:
         return self._active[node] and node not in self._paused and self.nodes[node].radio.inbox.waiting
 
     def _deliver_due(self, time_ns: int, fixes: Sequence[tuple[str, Fix]] = ()) -> None:
-        packets = self._window.take_packets(time_ns, self._paused)
-        due = {node: some for node, some in packets.items() if self._active[node]}
-        self.mail.deliver(Mail(due, fixes), time_ns)
+        self.mail.deliver(Mail(self._take_packets(time_ns), fixes), time_ns)
         if arrived := self.news.take(time_ns, self._paused):
             self.mail.deliver_news([each for each in arrived if self._active[each.node]], time_ns)
+
+    def _take_packets(self, time_ns: int) -> dict[str, list[Packet]]:
+        """Return the packets that are due now at nodes that await some; other nodes take theirs as they look."""
+        if self.mail.ordered is not None:
+            nodes = [node for node in self._window.with_packets if self._active[node] and node not in self._paused]
+        elif self._waits["radio"].count:
+            nodes = [node for node in self._window.with_packets if self._awaits_packet(node)]
+        else:
+            return {}
+        due = ((node, self._window.take_packets(node, time_ns)) for node in nodes)
+        return {node: packets for node, packets in due if packets}
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""
@@ -394,6 +416,7 @@ class Host:
         """Record that a node's program is over, and cancel what it left running."""
         if not self._active[node]:
             return
+        self._refill(self.nodes[node])
         self._active[node] = False
         self.nodes[node].radio.forget_results()
         self._outbox.endings.append(wire.Ending(node, kind, error, details, place))  # type: ignore[arg-type]

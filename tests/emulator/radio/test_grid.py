@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.radio.grid import BusyMeter, Candidates, Heard, SensedGrid, Wanted
+from emulator.radio.grid import BusyMeter, Candidates, Heard, Places, SensedGrid, Wanted
 from emulator.scenario.sidelink import LteMode4, NrMode2, Sidelink
 
 QUIET_DBM, LOUD_DBM = -100.0, -60.0
@@ -25,8 +25,9 @@ def sense(grid: SensedGrid, mac: Sidelink, slot: int, frames: list[tuple[int, in
         power_mw[first : first + length, 0] += 10 ** (dbm / 10) / length
     own_mw = np.array([[10 ** (dbm / 10), 1.0] for *_, dbm in frames])
     decoded = np.array([[True, False]] * len(frames))
-    places, periods = [frame[:2] for frame in frames], [frame[2] for frame in frames]
-    grid.sense(slot, power_mw, np.array([False, True]), Heard(own_mw, decoded, places, periods))
+    first, length, periods, _ = (np.array(column) for column in zip(*frames, strict=True))
+    places = Places(np.zeros(len(frames), np.int64), first, length)
+    grid.sense([slot], power_mw[None], np.array([[False, True]]), Heard(own_mw, decoded, places, periods.tolist()))
 
 
 frame_lists = st.lists(
@@ -80,6 +81,34 @@ def test_excluded_are_the_resources_that_others_reserved(
     assert found.mask.size == len(expected)
     for (slot, first), dbm in expected.items():
         assert found.has(slot, first) == (dbm <= threshold_dbm), (slot, first, dbm)
+
+
+@settings(max_examples=25, deadline=None)
+@given(frame_lists.filter(bool), st.integers(80, 150))
+def test_slots_that_are_sensed_at_once_are_as_if_one_by_one(
+    frames: list[tuple[int, int, int, int, float]], now: int
+) -> None:
+    mac = lte(subchannels=4)
+    at_once, one_by_one = SensedGrid(mac, 2), SensedGrid(mac, 2)
+    frames = sorted(frames)
+    slots = sorted({slot for slot, *_ in frames})
+    index, first, length, periods, dbm = (np.array(column) for column in zip(*frames, strict=True))
+    places = Places(np.searchsorted(slots, index), first, length)
+    power_mw = np.stack([10 ** (dbm / 10), np.ones(len(dbm))], axis=1)
+    decoded = np.array([[True, False]] * len(dbm))
+    sensed_mw = np.zeros((len(slots), 4, 2))
+    for own_mw, (slot, start, count) in zip(power_mw, places.each(), strict=True):
+        sensed_mw[slot, start : start + count, 0] += own_mw[0] / count
+    deaf = np.array([[False, True]] * len(slots))
+    at_once.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods.tolist()))
+    for slot in slots:
+        sense(one_by_one, mac, slot, [each[1:] for each in frames if each[0] == slot])
+    for node in (0, 1):
+        wanted = Wanted(node, now + 4, now + 100, 1, 100, 10)
+        found, expected = at_once.candidates(now, wanted), one_by_one.candidates(now, wanted)
+        assert np.array_equal(found.mask, expected.mask)
+        assert found.power_mw is not None and expected.power_mw is not None
+        assert np.array_equal(found.power_mw, expected.power_mw)
 
 
 def test_threshold_rises_until_a_fifth_remains() -> None:

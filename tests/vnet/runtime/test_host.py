@@ -9,6 +9,8 @@ import pytest
 
 from vnet import Node
 from vnet.errors import PayloadTooLargeError, ProgramError
+from vnet.mailbox import INBOX_LIMIT, Mailbox
+from vnet.radio import Packet
 from vnet.roads.lanes import LaneMap
 from vnet.runtime.arrivals import Window
 from vnet.runtime.host import Host
@@ -392,24 +394,35 @@ def test_a_program_that_cannot_be_loaded_says_why(entry: str, message: str) -> N
         load_program(entry)
 
 
-def test_packets_of_a_paused_node_wait_and_keep_their_order() -> None:
-    """With and without a paused node a window gives what is due, oldest first, and keeps the rest."""
+def test_packets_of_a_window_wait_until_they_are_due_and_keep_their_order() -> None:
     first, early, late = (packet_at("v1", time_ns).packet() for time_ns in (3, 5, 9))
     window = Window()
     window.open(10, {"v2": [early], "v1": [first, late]})
-    assert window.take_packets(5, {"v2"}) == {"v1": [first]}
-    assert window.take_packets(5, ()) == {"v2": [early]}
-    assert window.take_packets(8, ()) == {}
-    assert window.take_packets(9, ()) == {"v1": [late]}
-    assert not window.has_packets
+    assert window.take_packets("v1", 5) == [first]
+    assert window.take_packets("v2", 4) == []
+    assert window.take_packets("v2", 5) == [early]
+    assert window.take_packets("v1", 8) == []
+    assert window.take_packets("v1", 9) == [late]
+    assert not window.with_packets
 
 
-def test_packets_that_are_due_at_once_are_those_that_are_sorted() -> None:
-    """Packets of each node come oldest first, also where an earlier window has left some."""
+def test_packets_that_an_earlier_window_has_left_come_first() -> None:
     first, second, third = (packet_at("v1", time_ns).packet() for time_ns in (3, 5, 12))
     window = Window()
     window.open(10, {"v1": [first, second]})
-    assert window.take_packets(4, ()) == {"v1": [first]}
+    assert window.take_packets("v1", 4) == [first]
     window.open(20, {"v1": [third]})
     assert window.first_packet_ns("v1".__eq__) == 5
-    assert window.take_packets(20, ()) == {"v1": [second, third]}
+    assert window.take_packets("v1", 20) == [second, third]
+
+
+def test_a_window_keeps_no_more_packets_than_a_mailbox_and_the_last_window_bring() -> None:
+    """Of what nobody looks for, the last are kept: those that the mailbox would have."""
+    window, inbox = Window(), Mailbox[Packet]()
+    for number in range(5):
+        new = [packet_at("v1", number * INBOX_LIMIT + n).packet() for n in range(INBOX_LIMIT)]
+        window.open((number + 1) * INBOX_LIMIT, {"v1": new})
+    kept = window.take_packets("v1", 5 * INBOX_LIMIT)
+    assert len(kept) <= 3 * INBOX_LIMIT
+    inbox.deliver(kept)
+    assert inbox.drain() == new
