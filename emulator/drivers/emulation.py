@@ -475,6 +475,7 @@ class Emulation:
         self.driving = Driving(world, folder, self.number)
         for node, up in self.up.items():
             self.engine.set_up(self.number[node], up)
+        self._lane_map, self._boot_id = world.lane_map.to_wire(), wire.boot_id()
         self._watchers: list[Callable[[PeriodView], None]] = []
         self._period = 0
         self._finished = False
@@ -536,13 +537,13 @@ class Emulation:
             scenario.run.pacing,
             program.entry,
             scenario.options_of(node),
-            self.world.lane_map.to_wire(),
+            self._lane_map,
             node_seed(scenario.run.seed, node, incarnation),
             self.world.period_ns,
             scenario.radio.max_payload_bytes,
             scenario.run.orphan_timeout_s,
             scenario.run.spin_limit,
-            wire.boot_id(),
+            self._boot_id,
             not self.presence.has_ended(node),
             wire.VERSION,
             self.orders.of_node(node, incarnation),

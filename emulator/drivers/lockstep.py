@@ -56,9 +56,9 @@ class LockstepProcess:
         self.clocks: list[wire.ClockError] = []
 
     @property
-    def running(self) -> list[str]:
+    def running(self) -> Sequence[str]:
         """Nodes that are not paused."""
-        return [node for node in self.nodes if node not in self.paused]
+        return [node for node in self.nodes if node not in self.paused] if self.paused else self.nodes
 
     def take_packets(self) -> dict[str, list[Packet]]:
         """Return the packets of nodes that run, and have any."""

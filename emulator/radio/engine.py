@@ -14,8 +14,7 @@ program takes a packet.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
@@ -58,7 +57,7 @@ from emulator.radio.stages import (
 from emulator.radio.topology import Topology, connectivity_of
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
 from emulator.radio.unicast import Unicasts
-from emulator.scenario.scenario import MIN_LATENCY_NS, Radio, least_latency_ns
+from emulator.scenario.scenario import Radio, least_latency_ns
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
 from vnet.radio import Packet, SentFrame
@@ -122,23 +121,25 @@ class Deliveries(Sequence[Delivery]):
         """
         table = self._table[:, self._order()]
         table = table[:, np.argsort(table[_RECEIVER], kind="stable")]
-        packets = self._packets(table)
-        first = 0
-        for receiver, count in Counter(table[_RECEIVER].tolist()).items():
-            yield receiver, packets[first : first + count]
-            first += count
+        packets, receivers = self._packets(table), table[_RECEIVER]
+        first = np.flatnonzero(np.diff(receivers, prepend=-1))
+        ends = [*first.tolist(), len(packets)][1:]
+        for receiver, start, end in zip(receivers[first].tolist(), first.tolist(), ends, strict=True):
+            yield receiver, packets[start:end]
 
     def _packets(self, table: IntArray) -> list[Packet]:
         """Return the packets of these columns (4, n) of the table, as they stand."""
         arrivals_ns, receivers, _, numbers = table.tolist()
-        transmissions = [self._frames[number] for number in numbers]
-        payloads = [
-            sent.altered.get(receiver, sent.frame.payload) if sent.altered else sent.frame.payload
-            for sent, receiver in zip(transmissions, receivers, strict=True)
-        ]
-        names, sent_ns = [sent.frame.name for sent in transmissions], [sent.frame.sent_ns for sent in transmissions]
+        frames = {number: self._frames[number] for number in set(numbers)}
+        names = {number: sent.frame.name for number, sent in frames.items()}
+        sent_ns = {number: sent.frame.sent_ns for number, sent in frames.items()}
+        payloads: Iterable[bytes] = map({n: sent.frame.payload for n, sent in frames.items()}.__getitem__, numbers)
+        if any(sent.altered for sent in frames.values()):
+            receptions = zip(numbers, receivers, payloads, strict=True)
+            payloads = [frames[number].altered.get(receiver, sent) for number, receiver, sent in receptions]
         powers = self._trace.powers(table[_ROW]) if self._trace.knows_power else ()
-        return [*map(Packet, names, sent_ns, arrivals_ns, payloads, *powers)]
+        of_frames = map(names.__getitem__, numbers), map(sent_ns.__getitem__, numbers)
+        return [*map(Packet, *of_frames, arrivals_ns, payloads, *powers)]
 
     def _order(self) -> NDArray[np.intp]:
         order: NDArray[np.intp] = self._table[_ARRIVAL].argsort(kind="stable")
@@ -315,7 +316,8 @@ class Engine:
         self._topology = Topology(position_m, connectivity_of(radio, seed, inputs), radio.max_peers, nakagami)
         self._trace = Trace(node_ids, radio.mac is not None, knows_power=radio.path_loss is not None)
         self._copies = CopyNumbers()
-        self._unicasts = Unicasts(least_latency_ns(radio), self._trace)
+        self._least_latency_ns = least_latency_ns(radio)
+        self._unicasts = Unicasts(self._least_latency_ns, self._trace)
         self._mac: Mac
         if radio.sidelink is not None and signals is not None:
             self._mac = Sidelink(radio, signals, seed)
@@ -403,11 +405,12 @@ class Engine:
         self._topology.advance(time_ns)
         for asked in frames:
             payload = asked if isinstance(asked, bytes) else asked.payload
-            chosen: _Chosen | None = {"bitrate_mbps": self._radio.bitrate_mbps}
+            chosen: _Chosen = {"bitrate_mbps": self._radio.bitrate_mbps}
             if isinstance(asked, SentFrame) and _choices(asked) != NO_CHOICES:
-                chosen = self._chosen(time_ns, node, asked)
-                if chosen is None:
+                allowed = self._chosen(time_ns, node, asked)
+                if allowed is None:
                     continue
+                chosen = allowed
             frame = Frame(
                 sender=node,
                 seq=self._next_seq[node],
@@ -624,7 +627,7 @@ class Engine:
     def advance(self, time_ns: int) -> Deliveries:
         """Return all packets that arrive up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
         self._run(time_ns)
-        if any(sent.end_ns + MIN_LATENCY_NS <= time_ns for sent in self._mac.sent):
+        if any(sent.end_ns + self._least_latency_ns <= time_ns for sent in self._mac.sent):
             self._settle()
         return self._arrive(time_ns)
 

@@ -172,7 +172,7 @@ class SensedGrid:
     def _put(self, kept: NDArray[Any], first: int, values: NDArray[Any]) -> None:
         """Put values (slots, …, N) of successive slots where what is kept (N, ring, …) has them."""
         row, count = first % self._ring, len(values)
-        values = np.moveaxis(values, -1, 0)
+        values = values.transpose(-1, *range(values.ndim - 1))
         before = min(count, self._ring - row)
         kept[:, row : row + before] = values[:, :before]
         kept[:, : count - before] = values[:, before:]
@@ -217,9 +217,11 @@ class SensedGrid:
         scale = min(100 * NS_PER_MS // self._mac.slot_ns, self._mac.sensing_slots)
         repeats = np.where((period < scale) & (now - slot <= period), -(-scale // period), 1)
         for nth in range(1, int(repeats.max(initial=0)) + 1):
-            again = nth <= repeats
-            reserved = slot[again] + nth * period[again]
-            self._mark(wanted, strongest_dbm, reserved, subchannel[again], dbm[again])
+            if nth > 1:
+                again = nth <= repeats
+                repeats, slot, period = repeats[again], slot[again], period[again]
+                subchannel, dbm = subchannel[again], dbm[again]
+            self._mark(wanted, strongest_dbm, slot + nth * period, subchannel, dbm)
         if wanted.length == 1:
             return strongest_dbm
         parts = [strongest_dbm[:, n : strongest_dbm.shape[1] - wanted.length + 1 + n] for n in range(wanted.length)]
@@ -235,7 +237,8 @@ class SensedGrid:
             index = offset + lap
             ahead = reserved - wanted.first - index
             meets = (index >= 0) & (index < len(strongest_dbm)) & (ahead >= 0) & (ahead < wanted.times * period)
-            np.maximum.at(strongest_dbm, (index[meets], subchannel[meets]), dbm[meets])
+            place = index[meets] * strongest_dbm.shape[1] + subchannel[meets]  # `at` is slow with two indices
+            np.maximum.at(strongest_dbm.reshape(-1), place, dbm[meets])
             if wanted.times <= 1:
                 break
 
@@ -263,9 +266,12 @@ class SensedGrid:
         each = latest[:, None] - step * np.arange((self._slots - 1) // step)
         known = (each >= 0) & (each >= now - self._slots)
         rows = each % self._ring
-        weight = (known & ~self._deaf[wanted.node, rows]).astype(np.float64)
-        power_mw = (self._power_mw[wanted.node, rows] * weight[:, :, None]).sum(axis=1)
-        power_mw /= np.maximum(weight.sum(axis=1), 1)[:, None]
+        counts = np.count_nonzero(known & ~self._deaf[wanted.node][rows], axis=1)
+        sensed_mw = self._power_mw[wanted.node].take(rows, axis=0)
+        if not known.all():
+            sensed_mw *= known[:, :, None]
+        power_mw = sensed_mw.sum(axis=1, dtype=np.float64)  # it was silent in slots in which it transmitted
+        power_mw /= np.maximum(counts, 1)[:, None]
         places = self._mac.subchannels - wanted.length + 1
         return np.asarray(sum(power_mw[:, n : n + places] for n in range(wanted.length)) / wanted.length)
 

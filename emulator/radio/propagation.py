@@ -219,9 +219,12 @@ class Nakagami:
         return np.asarray(np.searchsorted(self._until_m, distance_m) * QUANTILES)
 
     def factor(self, shape: NDArray[np.intp], step: NDArray[np.intp]) -> Array:
-        """Return the factors for table offsets from `shape` and drawn steps in [0, QUANTILES)."""
+        """Return the factors for table offsets from `shape` and drawn steps in [0, QUANTILES).
+
+        Without fading it is one for all.
+        """
         if len(self._factor) == 1:
-            return np.ones(step.shape)
+            return self._factor
         factor: Array = self._factor[step + shape]
         return factor
 

@@ -181,7 +181,8 @@ class Trace:
             powers = self._powers.add(len(outcome))
             for name, power_db in zip(UNHASHED, powers_db, strict=True):
                 steps = np.clip(np.rint(power_db * POWER_STEPS_DB), UNKNOWN_POWER + 1, -UNKNOWN_POWER - 1)
-                powers[name] = np.nan_to_num(steps, nan=UNKNOWN_POWER)
+                steps[np.isnan(steps)] = UNKNOWN_POWER
+                powers[name] = steps
         return first
 
     def begin_choices(self, bitrate_mbps: float) -> None:

@@ -6,6 +6,7 @@ the code that fills it (`emulator.drivers.conclude.gather`); `recorded.table(…
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
@@ -21,6 +22,31 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.driven.stepped import Background
 from vnet.errors import VnetError
 from vnet.types import Array
+
+
+class _NoPandas:
+    """Finder of modules that lets an import of pandas fail, as where it is not installed."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> None:
+        """Raise ModuleNotFoundError for pandas."""
+        if name == "pandas":
+            raise ModuleNotFoundError(name)
+
+
+def _make_first_array() -> None:
+    """Have pyarrow make its first array, for which it imports pandas where it can, and nothing here needs it.
+
+    It takes as long as vnet's own start. What does need it, as `to_pandas()`, imports it then.
+    """
+    sys.meta_path.insert(0, _NoPandas)
+    try:
+        pa.array([0])
+    finally:
+        sys.meta_path.remove(_NoPandas)
+
+
+_make_first_array()
 
 Condition = Callable[[Scenario], bool]
 

@@ -25,8 +25,8 @@ def sense(grid: SensedGrid, mac: Sidelink, slot: int, frames: list[tuple[int, in
         power_mw[first : first + length, 0] += 10 ** (dbm / 10) / length
     own_mw = np.array([[10 ** (dbm / 10), 1.0] for *_, dbm in frames])
     decoded = np.array([[True, False]] * len(frames))
-    first, length, periods, _ = (np.array(column) for column in zip(*frames, strict=True))
-    places = Places(np.zeros(len(frames), np.int64), first, length)
+    starts, lengths, periods, _ = (np.array(column) for column in zip(*frames, strict=True))
+    places = Places(np.zeros(len(frames), np.int64), starts, lengths)
     grid.sense([slot], power_mw[None], np.array([[False, True]]), Heard(own_mw, decoded, places, periods.tolist()))
 
 

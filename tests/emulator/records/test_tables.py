@@ -1,5 +1,7 @@
 """The declaration of a table is all that vnet knows about it, beside the code that fills it."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pyarrow as pa
@@ -13,6 +15,7 @@ from emulator.records.manifest import read_manifest
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.tables import FLOAT, TABLES, TEXT, TRACE, Column, Table
 from emulator.scenario.scenario import Scenario
+from tests.support.paths import ROOT
 from vnet.errors import VnetError
 
 TYRES = Table(
@@ -75,3 +78,16 @@ def test_a_gap_and_a_wrong_type_are_refused_by_name(tmp_path: Path, monkeypatch:
 def test_names_are_unique_and_every_run_has_a_trace() -> None:
     assert len({table.file for table in TABLES}) == len(TABLES)
     assert TRACE.is_due is not None and TRACE.is_due(Scenario())
+
+
+@pytest.mark.slow
+def test_a_table_is_made_without_pandas_and_becomes_a_data_frame_all_the_same() -> None:
+    pytest.importorskip("pandas")
+    lines = [
+        "import sys",
+        "from emulator.records.tables import TRACE",
+        "table = TRACE.schema.empty_table()",
+        "assert 'pandas' not in sys.modules",
+        "assert list(table.to_pandas().columns) == table.column_names",
+    ]
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, cwd=ROOT)

@@ -417,7 +417,7 @@ def test_packets_that_an_earlier_window_has_left_come_first() -> None:
 
 
 def test_a_window_keeps_no_more_packets_than_a_mailbox_and_the_last_window_bring() -> None:
-    """Of what nobody looks for, the last are kept: those that the mailbox would have."""
+    """The packets that are kept for a node that looks for none are the last: those that its mailbox would have."""
     window, inbox = Window(), Mailbox[Packet]()
     for number in range(5):
         new = [packet_at("v1", number * INBOX_LIMIT + n).packet() for n in range(INBOX_LIMIT)]
