@@ -237,7 +237,9 @@ def test_crash_of_main_is_a_crash_of_its_vehicle_with_its_line(drive: Drive) -> 
     (crash,) = events(run, "crashed")
     assert (crash["node"], crash["place"]) == ("v01", "program0.py:3")
     assert "ZeroDivisionError" in crash["error"]
-    assert any("program0.py" in line for line in log(run))
+    files = [line.split('"')[1] for line in log(run) if line.startswith("  File")]
+    assert files[-1].endswith("program0.py")
+    assert sum("gateway/emulated" in file for file in files) == 1, "frames of vnet's own tell nothing"
 
 
 def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None:
@@ -252,6 +254,7 @@ def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None
     (told,) = events(run, "exception")
     assert "ZeroDivisionError" in told["error"]
     assert "in a thread" in told["place"]
+    assert sum(line.startswith("Traceback") for line in log(run)) == 1
     assert "goes on" in log(run)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
+from types import TracebackType
 from typing import Any
 
 from vnet.errors import ProgramError
@@ -43,7 +44,16 @@ async def main(node: Node) -> None:
             for words in commands:
                 tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT)))
     except* Exception as errors:
-        raise errors.exceptions[0] from None
+        error = errors.exceptions[0]
+        raise error.with_traceback(_of_program(error.__traceback__)) from None
     finally:
         for task in background:
             task.cancel()
+
+
+def _of_program(trace: TracebackType | None) -> TracebackType | None:
+    """Return what of a traceback is the program's, all of it if nothing is."""
+    inner = trace
+    while inner is not None and inner.tb_frame.f_globals.get("__name__", "").startswith("vnet."):
+        inner = inner.tb_next
+    return inner or trace

@@ -12,7 +12,6 @@ import os
 import sys
 import threading
 import time
-import traceback
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
 from contextvars import Context, copy_context
@@ -483,6 +482,5 @@ def _thread_failed(failed: threading.ExceptHookArgs) -> None:
 
 
 def fail(error: Exception, place: str = "in a thread") -> None:
-    """Print an exception that has ended a thread or a callback, and have the run tell of it."""
-    traceback.print_exception(error)
+    """Have the run tell of an exception that has ended a thread or a callback; the vehicle's log has its lines."""
     tell_failed_thread(present_node(), error, place)
