@@ -346,3 +346,29 @@ def test_libraries_on_asyncio_find_no_loop_outside_of_coroutines(drive: Drive) -
         """
     )
     assert log(run)[:-1] == ["None none", "(True, True)", "ended", "True False"]
+
+
+def test_cancelling_a_query_waits_for_its_callback_and_refuses_the_next(drive: Drive) -> None:
+    run = drive(
+        """
+        import time, zenoh
+        session, done = zenoh.open(zenoh.Config()), []
+        kept = session.declare_queryable("asked", lambda query: query.reply("asked", "yes"))
+        token = session.liveliness().declare_token("alive")
+        def answered(reply):
+            time.sleep(0.3)
+            done.append(str(reply.ok.key_expr))
+        for ask, key in ((session.get, "asked"), (session.liveliness().get, "alive")):
+            cancel = zenoh.CancellationToken()
+            ask(key, answered, cancellation_token=cancel)
+            time.sleep(0.1)
+            cancel.cancel()
+            print(done, round(time.monotonic(), 1), cancel.is_cancelled)
+            try:
+                ask(key, cancellation_token=cancel)
+            except zenoh.ZError:
+                print("refused")
+        """,
+        radio={"keys": ["none"]},
+    )
+    assert log(run)[:4] == ["['asked'] 0.3 True", "refused", "['asked', 'alive'] 0.6 True", "refused"]

@@ -17,7 +17,9 @@ from vnet.gateway.emulated.values import (
     NO_ENCODING,
     NOTHING,
     PUT,
+    CallbackSink,
     EntityGlobalId,
+    Handler,
     Hello,
     MatchingStatus,
     Outlet,
@@ -169,21 +171,28 @@ class CancellationToken:
     def __init__(self) -> None:
         self._is_cancelled = False
         self._askings: list[Asking] = []
+        self._sinks: list[Handler | CallbackSink] = []
 
     def cancel(self) -> None:
-        """End the queries that have it, now and later."""
+        """End the queries that have it, and block until their callbacks have ended."""
         self._is_cancelled = True
         askings, self._askings = self._askings, []
         for asking in askings:
             asking.cancel()
+        sinks, self._sinks = self._sinks, []
+        for sink in sinks:
+            if isinstance(sink, CallbackSink):
+                sink.wait()
 
     is_cancelled = property(lambda self: self._is_cancelled)
 
-    def add(self, asking: Asking) -> None:
-        """Have it end a query."""
-        self._askings.append(asking)
+    def add(self, sink: Handler | CallbackSink, asking: Asking | None = None) -> None:
+        """Have it end a query. Raises ZError if it is cancelled."""
         if self._is_cancelled:
-            self.cancel()
+            raise zenoh.ZError("Query was cancelled")
+        self._sinks.append(sink)
+        if asking is not None:
+            self._askings.append(asking)
 
 
 class Liveliness:
@@ -211,9 +220,10 @@ class Liveliness:
         """Get the tokens that are there: those of other vehicles as far as they have been heard."""
         self._session.check_open()
         sink, seen, _ = sink_of(handler, self._session.outlet)
-        if cancellation_token is None or not cancellation_token.is_cancelled:
-            for token in self._session.vehicle.tokens(key_of(key_expr)):
-                sink.push(Reply(token_sample(token, alive=True)))
+        if cancellation_token is not None:
+            cancellation_token.add(sink)
+        for token in self._session.vehicle.tokens(key_of(key_expr)):
+            sink.push(Reply(token_sample(token, alive=True)))
         sink.close()
         return seen
 
@@ -531,11 +541,10 @@ class Session:
             priority=priority or zenoh.Priority.DATA,
             express=bool(express),
         )
-        asking.expire_after(self._timeout_s if timeout is None else timeout)
         if cancellation_token is not None:
-            cancellation_token.add(asking)
-        if not asking.is_over:
-            self.vehicle.ask(asking, self, allowed_destination != REMOTE, allowed_destination != LOCAL)
+            cancellation_token.add(sink, asking)
+        asking.expire_after(self._timeout_s if timeout is None else timeout)
+        self.vehicle.ask(asking, self, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return seen
 
     def declare_subscriber(self, key_expr: Any, handler: Any = None, **options: Any) -> Subscriber:

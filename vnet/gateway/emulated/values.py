@@ -20,6 +20,7 @@ from vnet.gateway.emulated.strands import (
     Strand,
     Threads,
     block_on,
+    current_strand,
     drive,
     fail,
     go_no_further_if_ended,
@@ -345,6 +346,14 @@ class CallbackSink:
         self._strand: Strand | None = None
         self._items: deque[Any] = deque()
         self._runs = self._closed = False
+        self._waiters: list[asyncio.Future[None]] = []
+
+    def wait(self) -> None:
+        """Block until the callback has had all, unless it is the callback itself that asks."""
+        if self._runs and current_strand() is not self._strand:
+            waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            self._waiters.append(waiter)
+            block_on(waiter)
 
     def push(self, item: Any) -> None:
         """Have the callback called with an item."""
@@ -380,6 +389,9 @@ class CallbackSink:
                 drop, self._drop = self._drop, None
                 self._call(drop)
             self._runs = False
+            waiters, self._waiters = self._waiters, []
+            for waiter in waiters:
+                waiter.set_result(None)
             idle()
 
     def _call(self, function: Callable[..., Any], *args: Any) -> None:
