@@ -40,7 +40,7 @@ MOMENTS_OF_FAULTS = ("fault_started", "fault_ended")
 """Names of the moments at which faults begin and end at a vehicle (`emulator.checks.properties`)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # a frozen one takes five times as long to make; each is its program's own
 class Fix:
     """One GNSS fix: position (2,) in m east-north, covariance (2, 2) in m², heading in radians or None.
 

@@ -7,11 +7,13 @@ or send what a rule of the user's own says.
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault, swizzle_times_ns
@@ -156,7 +158,7 @@ class LinkFaults:
     def _continued(self, planned: PlannedFault) -> _RandomFault:
         """Return a fault with its state so far and its present links, or a new one."""
         one = self._random.get(planned.number)
-        return self._started(planned) if one is None else replace(one, planned=planned)
+        return self._started(planned) if one is None else dataclasses.replace(one, planned=planned)
 
     def _started(self, planned: PlannedFault) -> _RandomFault:
         bad = np.zeros((self._count, self._count) if isinstance(planned.fault, LossFault) else (0, 0), dtype=bool)

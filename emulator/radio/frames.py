@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from emulator.radio.outcomes import PENDING, Outcome
@@ -77,8 +78,7 @@ def allowed_period_ms(radio: Radio, asked: SentFrame) -> int:
     return int(asked.period_ms) if asked.period_ms in periods_ms else 0
 
 
-@dataclass(slots=True, eq=False)
-class Signal:
+class Signal(Struct, eq=False):
     """A frame's signal at the receivers, (N,) each; the entry of its own sender holds the transmit power.
 
     `random_draws` are words of 64 random bits, which give the draws that decide about it. `power_mw` is the
@@ -96,8 +96,8 @@ class Signal:
     power_mw: NDArray[np.float64]
     sender_draws: int
     locked: NDArray[np.bool_] | None = None
-    pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
-    slots: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = field(default_factory=list)
+    pieces: list[tuple[int, NDArray[np.float64]]] = []
+    slots: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = []
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,7 @@ class Answered:
     copy_delay_ns: int
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Frame:
+class Frame(Struct, frozen=True, eq=False, kw_only=True):  # made much faster than a frozen dataclass
     """A frame, as it is sent. `sender` is a node's number; `seq` counts the sender's frames.
 
     `copy` counts the times that a fault sends the frame again, or that its sender transmits it again. Such a copy
@@ -151,8 +150,7 @@ class Frame:
         return len(self.payload)
 
 
-@dataclass(slots=True, eq=False)
-class Transmission:
+class Transmission(Struct, eq=False):
     """One transmission of a frame, and what becomes of it.
 
     `sender_outcome` is decided at the sender: oversize, queue_full, held_back, fault (a rule dropped it); pending
@@ -180,8 +178,8 @@ class Transmission:
     garbled: NDArray[np.bool_] | None = None
     ack: Transmission | None = None
     acked: bool = False
-    altered: dict[int, bytes] = field(default_factory=dict)
-    answers: dict[int, tuple[NDArray[np.intp], Answered]] = field(default_factory=dict)
+    altered: dict[int, bytes] = {}
+    answers: dict[int, tuple[NDArray[np.intp], Answered]] = {}
 
 
 class CopyNumbers(Counter[tuple[int, int]]):

@@ -131,7 +131,9 @@ class TransmitQueue(Mac):
         if (unthrottled := self._unthrottled.get(frame.sender)) is not None:
             self._put(frame, unthrottled, jitter_ns, bitrate_mbps)
             bitrate_mbps = min(bitrate_mbps, self._throttled_mbps[frame.sender])
-        backlog = self._backlogs.setdefault(frame.sender, _Backlog())
+        backlog = self._backlogs.get(frame.sender)
+        if backlog is None:
+            backlog = self._backlogs[frame.sender] = _Backlog()
         end_ns = self._put(frame, backlog, jitter_ns, bitrate_mbps)
         if end_ns is None:
             sent.sender_outcome, sent.end_ns = Outcome.queue_full, frame.sent_ns

@@ -7,11 +7,12 @@ transmitted again after a backoff from a window that doubles, up to the short re
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import replace
 from heapq import heappop, heappush
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from emulator.radio.dot11p import PREAMBLE_NS, SIFS_NS, SLOT_NS, airtime_ns
@@ -59,7 +60,7 @@ def acknowledgement_of(sent: Transmission) -> Transmission:
     """
     frame, effects = sent.frame, sent.frame.effects
     if isinstance(effects, ActiveLinkFaults):
-        effects = replace(effects, ruled=())
+        effects = dataclasses.replace(effects, ruled=())
     return Transmission(
         Frame(
             sender=frame.to,

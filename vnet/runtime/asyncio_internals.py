@@ -218,7 +218,8 @@ class NumberedTimer(asyncio.TimerHandle):
 
     def __lt__(self, other: asyncio.TimerHandle) -> bool:
         assert isinstance(other, NumberedTimer)
-        return (self.when(), self._place) < (other.when(), other._place)
+        when, others = self.when(), other.when()
+        return when < others or (when == others and self._place < other._place)
 
 
 def _private(owner: object) -> Any:
