@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -19,10 +21,11 @@ INTRODUCTION = """
 `vnet` runs scenarios and judges runs. `vnet-agent` is one process with vehicles; `vnet run` starts these processes
 itself. Each chapter has a table of commands and one of their options; `--help` prints those of one command.
 """
+SHARED = "Commands of several chapters take these:"
 STATUSES = {
     **{verdict.exit_status: f"the run is {verdict}" for verdict in Verdict},
     2: "wrong usage, or an unusable scenario, folder, credentials file, program or output",
-    70: "a bug in vnet; the error names the file with the traceback",
+    70: "a bug in vnet (the error names the file with the traceback)",
     130: "interrupted by Ctrl-C",
 }
 AGENT = """
@@ -45,15 +48,51 @@ Command = Any
 
 def page() -> str:
     """The whole page."""
-    statuses = table(["exit status", "what"], ([str(status), what] for status, what in sorted(STATUSES.items())))
-    parts = [INTRODUCTION, statuses, AGENT]
+    statuses = "; ".join(f"{status}: {what}" for status, what in sorted(STATUSES.items()))
+    parts = [INTRODUCTION, textwrap.fill(f"Exit statuses are {statuses}. {' '.join(AGENT.split())}", 120)]
     of = {name: list(group) for name, group in groupby(_of(PROGRAMS["vnet"], "vnet"), lambda each: _path(each)[1])}
     named = {name for names in CHAPTERS.values() for name in names}
     others = {"Other commands": tuple(sorted(of.keys() - named - {"experiment"}))}
-    for chapter, names in (CHAPTERS | others).items():
-        if found := [context for name in names for context in of.get(name, [])]:
-            parts += [f"## {chapter}", *_tables(found)]
-    return whole_page("Commands", *parts, "## `vnet-agent`", *_tables(_of(PROGRAMS["vnet-agent"], "vnet-agent")))
+    chapters = {
+        chapter: [context for name in names for context in of.get(name, [])]
+        for chapter, names in (CHAPTERS | others).items()
+    } | {"`vnet-agent`": _of(PROGRAMS["vnet-agent"], "vnet-agent")}
+    options = {chapter: _options(found) for chapter, found in chapters.items()}
+    shared = _shared(options)
+    parts += [SHARED, _table(shared)]
+    for chapter, found in chapters.items():
+        rows = ([f"`{each.command_path} {_pieces(each)}`", str(each.command.help)] for each in found)
+        own = {option: commands for option, commands in options[chapter].items() if option not in shared}
+        parts += [f"## {chapter}", table(["command", "what it does"], rows), _table(own)] if found else []
+    return whole_page("Commands", *parts)
+
+
+Options = dict[tuple[str, str], list[str]]
+"""Names and text of an argument or option, with the commands that take it."""
+
+
+def _options(found: Sequence[typer.Context]) -> Options:
+    """Return the arguments and options of some commands, each once."""
+    commands_of: Options = {}
+    for context in found:
+        for record in _records(context):
+            commands_of.setdefault(record, []).append(" ".join(_path(context)[1:]) or "vnet-agent")
+    return commands_of
+
+
+def _shared(options: Mapping[str, Options]) -> Options:
+    """Return the options that commands of several chapters take, with all these commands."""
+    count = Counter(option for of in options.values() for option in of)
+    return {
+        option: [command for of in options.values() for command in of.get(option, [])]
+        for option in count
+        if count[option] > 1
+    }
+
+
+def _table(options: Options) -> str:
+    rows = ([f"`{name}`", ", ".join(of), what] for (name, what), of in options.items())
+    return table(["argument or option", "of", "what"], rows)
 
 
 def contexts(name: str, command: Command, parent: typer.Context | None = None) -> Iterator[typer.Context]:
@@ -72,18 +111,6 @@ def _of(app: typer.Typer, name: str) -> list[typer.Context]:
 
 def _path(context: typer.Context) -> list[str]:
     return context.command_path.split()
-
-
-def _tables(found: Sequence[typer.Context]) -> Iterator[str]:
-    """The commands of a chapter, and their arguments and options: each once, with the commands that take it."""
-    rows = ([f"`{context.command_path} {_pieces(context)}`", str(context.command.help)] for context in found)
-    yield table(["command", "what it does"], rows)
-    commands_of: dict[tuple[str, str], list[str]] = {}
-    for context in found:
-        for record in _records(context):
-            commands_of.setdefault(record, []).append(" ".join(_path(context)[1:]))
-    options = ([f"`{name}`", ", ".join(of), what] for (name, what), of in commands_of.items())
-    yield table(["argument or option", "of", "what"], options)
 
 
 def _pieces(context: typer.Context) -> str:

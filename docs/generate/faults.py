@@ -23,6 +23,8 @@ senders = ["v01", "v02"]             # what these two send
 receivers = { fraction = 0.5 }       # and half of all vehicles receive
 loss_bad = 0.9
 ```
+
+The tables below have a row in bold for each kind, and below it a row for each key of its own.
 """
 COMMON = """
 Faults of vehicles also have `nodes`; those of links also have `senders` and `receivers`, and act on links with an
@@ -38,16 +40,14 @@ interpret payloads: [lies in them](../faults.md#in-a-scenario) are a program for
 ([`[[program.exceptions]]`](scenario.md#program)).
 """
 INFRASTRUCTURE = """
-For live runs only. `router_restart` needs `vnet run --router separate`, unless programs
-speak Zenoh.
+For live runs only. `router_restart` needs `vnet run --router separate`, unless programs speak Zenoh.
 """
 DRAWN = f"""
 `vnet campaign`, and the strategy `faults` of property tests, draw faults of these kinds. A run of a campaign has
 one to {MOST_FAULTS} of them. Weights are relative. A fault starts at any hundredth of a second, lasts any number of
-tenths that fits, and ends `run.settle_s` before the end. Parameters that are not listed keep their defaults. All
-numbers of a range are equally likely; a pair of numbers is two draws.
-
-`vnet campaign --draw delay.delay_ms=1..2000` draws from another range, in the same steps; it may be repeated.
+tenths that fits, and ends `run.settle_s` before the end. Keys without a range above keep their defaults. All
+numbers of a range are equally likely; a pair of numbers is two draws. `vnet campaign --draw
+delay.delay_ms=1..2000` draws from another range, in the same steps; it may be repeated.
 """
 RULES = """
 [faults.md](../faults.md#rules-of-your-own) defines rules. They are part of a scenario, or of a test as
@@ -66,31 +66,35 @@ def page() -> str:
     for title in dict.fromkeys(kind.chapter for kind in KINDS.values()):
         chapter = {name: kind for name, kind in KINDS.items() if kind.chapter == title}
         parts += [f"## {title}", NOTES.get(title, ""), *_chapter(chapter)]
-    parts += ["## What a campaign draws", DRAWN, table(["kind", "weight", "target", "parameters"], _drawn())]
+    parts += ["## What a campaign draws", DRAWN, table(["kinds with their weights", "target"], _drawn())]
     return whole_page("Faults", *parts)
 
 
 def _drawn() -> Iterator[Sequence[str]]:
-    """Yield a row for each kind that a campaign draws, from its declarations."""
+    """Yield a row for each target: the kinds that a campaign aims at it, from their declarations."""
+    kinds_of: dict[str, list[str]] = {}
     for name in simulated_kinds():
-        kind = KINDS[name]
-        target = docstring(kind.draw_target).removeprefix("Draw ").rstrip(".")
-        ranges = [f"`{key}` {_range(law)}" for key, law in kind.drawn_ranges().items()]
-        yield f"`{name}`", str(kind.campaign_weight), target, "; ".join(ranges)
+        target = docstring(KINDS[name].draw_target).removeprefix("Draw ").rstrip(".")
+        kinds_of.setdefault(target, []).append(f"`{name}` {KINDS[name].campaign_weight}")
+    for target, names in kinds_of.items():
+        yield ", ".join(names), target
 
 
 def _range(law: Drawn) -> str:
     """Return the range of a parameter in words."""
     low, high = law.bounds
-    return f"{low:g} to {high:g} in steps of {law.step:g}"
+    return f" (a campaign: {low:g} to {high:g} in steps of {law.step:g})"
 
 
-def _chapter(kinds: Mapping[str, type[Fault]]) -> Iterator[str]:
-    """Yield the table of all kinds of a chapter, and one of the keys of those that have their own."""
-    rows = ([f"`{name}`", kind.acts_on, docstring(kind)] for name, kind in kinds.items())
-    yield table(["kind", "acts on", "what happens"], rows)
-    keys = [[f"`{name}`", *row] for name, kind in kinds.items() for row in key_rows(kind, without=_without(kind))]
-    yield table(["kind", *HEADER], keys)
+def _chapter(kinds: Mapping[str, type[Fault]]) -> list[str]:
+    """Return the table of all kinds of a chapter: a row for each, and below it one for each key of its own."""
+    rows: list[list[str]] = []
+    for name, kind in kinds.items():
+        drawn = kind.drawn_ranges()
+        rows.append([f"**`{name}`**", kind.acts_on, "", "", "", docstring(kind)])
+        for key, *cells, text in key_rows(kind, without=_without(kind)):
+            rows.append([key, *cells, text + (_range(drawn[key.strip("`")]) if key.strip("`") in drawn else "")])
+    return [table(("kind, key", "acts on, type", *HEADER[2:]), rows)]
 
 
 def _without(kind: type[Fault]) -> tuple[str, ...]:

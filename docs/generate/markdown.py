@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
@@ -12,7 +13,8 @@ NOTICE = "<!-- Generated from the code by `make docs`; edits here are overwritte
 
 def page(title: str, *parts: str) -> str:
     """A whole page from its parts, which are paragraphs, headings and tables."""
-    return "\n\n".join([NOTICE, f"# {title}", *(part.strip("\n") for part in parts if part)]) + "\n"
+    text = "\n\n".join([NOTICE, f"# {title}", *(part.strip("\n") for part in parts if part)]) + "\n"
+    return re.sub(r"^(##+ .*)\n\n", r"\1\n", text, flags=re.MULTILINE)
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
+import textwrap
 from collections.abc import Iterator
 
 import msgspec
@@ -21,7 +22,7 @@ from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.units import unit_of
 
-INTRODUCTION = """
+INTRODUCTION = f"""
 A program is one async function of one argument. It needs only `from vnet import Node`; `Fix` and `Packet` are for
 annotations.
 
@@ -36,7 +37,8 @@ async def main(node: Node) -> None:
 ```
 
 [How time passes in it](../virtual-time.md), and [what else it may do](../how-to/threads-and-libraries.md). Arrays
-are numpy's, of float64.
+are numpy's, of float64. `async for` over `node.radio`, `node.gnss` and `node.backbone` waits for the next packet,
+fix or message until the run ends; of each the newest {INBOX_LIMIT} unread ones are kept.
 """
 PARTS = {
     "Node": vnet.Node,
@@ -52,9 +54,6 @@ PARTS = {
 }
 HOSTS_ONLY = {"disconnect", "to_wire", "from_wire", "is_sending", "forget_results", "settle"}
 """Public, but none of a program's business."""
-WAITING = f"""
-`async for` waits for the next one until the run ends. The newest {INBOX_LIMIT} unread ones are kept.
-"""
 ERRORS = f"""
 `{PayloadTooLargeError.__name__}` is in `vnet.errors`; it has `size_bytes` and `max_payload_bytes`. An error that
 leaves the program, or that a task, callback or job never handles, makes the run invalid:
@@ -71,16 +70,18 @@ def page() -> str:
 def _part(title: str, thing: type) -> Iterator[str]:
     yield f"## `{title}`"
     said, _, attributes = docstring(thing).partition("\nAttributes:\n")
-    yield said
     if dataclasses.is_dataclass(thing) or issubclass(thing, msgspec.Struct | tuple):
         types = {name: getattr(kind, "__forward_arg__", kind) for name, kind in thing.__annotations__.items()}
-        fields = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in types.items())
-        yield table(["attribute", "type", "unit"], fields)
+        said += f" Attributes: {', '.join(_field(name, str(kind)) for name, kind in types.items())}."
+    yield textwrap.fill(" ".join(said.split()), 120, break_on_hyphens=False)
     rows = [[f"`{name}`", sentence(text)] for name, text in _listed(attributes)]
     rows += [[f"`{name}`", docstring(member)] for name, member in _members(thing)]
     yield table(["attribute or method", "what"], rows)
-    if hasattr(thing, "__aiter__"):
-        yield WAITING
+
+
+def _field(name: str, kind: str) -> str:
+    """Name of an attribute with its type and unit."""
+    return f"`{name}` ({', '.join(filter(None, [_plain(kind).replace(' | ', ' or '), unit_of(name)]))})"
 
 
 def _listed(attributes: str) -> list[tuple[str, str]]:
