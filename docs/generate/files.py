@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping
 
 import pyarrow as pa
@@ -64,6 +65,8 @@ Two sections are added by the run: SHA-256 of its inputs and its code.
 WORLD_ABOUT = """
 An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.
 """
+FEW = 4
+"""Columns of a table that are told in a sentence."""
 WORLD_COLUMNS = ["array", "type", "shape", "unit", "what"]
 KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
@@ -135,6 +138,9 @@ def page() -> str:
     parts = [INTRODUCTION, table(["file", "what"], rows)]
     for each in TABLES:
         about = docstring(each.fields_of) if each.fields_of else each.about
+        if len(each.columns) <= FEW and not each.fields_of:
+            parts += [f"## `{each.file}`", in_a_sentence(each), each.further]
+            continue
         parts += [f"## `{each.file}`", about, columns(each.columns, each.fields_of), each.further]
     parts += ["## Columns of the cooperative program", COOPERATIVE, columns(_of_program(STATES), None)]
     parts += [docstring(Figures), columns(_of_program(METRICS), Figures)]
@@ -176,6 +182,15 @@ def columns(of: Mapping[str, Column], fields_of: type | None) -> str:
     _check_texts("column", of, {name: text for name, text in said.items() if text})
     rows = ([f"`{n}`", f"`{_type(c.type)}`", unit_of(n), said[n]] for n, c in of.items())
     return table(["column", "type", "unit", "what"], rows)
+
+
+def in_a_sentence(kind: Table) -> str:
+    """The columns of a table that has few."""
+    said = (
+        f"`{name}` ({', '.join(filter(None, [f'`{_type(column.type)}`', unit_of(name)]))}): {column.text}"
+        for name, column in kind.columns.items()
+    )
+    return textwrap.fill(f"{kind.about} {'; '.join(said)}.".strip(), 120, break_on_hyphens=False)
 
 
 def _check_texts(what: str, names: Iterable[str], texts: Mapping[str, str]) -> None:

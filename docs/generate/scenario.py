@@ -20,7 +20,7 @@ A scenario is a TOML file. Every key has a default, so an empty file is a run; a
 `--set SECTION.KEY=VALUE` changes one key on the command line. Each run writes all keys into its own
 `scenario.toml`, with digests of its inputs and code ([`[inputs]` and `[code]`](files.md#scenariotoml)).
 [scenarios/](../../scenarios/twelve.toml) has examples. A row in bold begins a section below the chapter's own;
-the rows after it are its keys.
+the rows after it are its keys. `[[fault]]` has a page of its own: [faults.md](faults.md).
 """
 NOT_KEYS = ("exceptions", "sensor")
 """Keys that are arrays or tables of sections."""
@@ -76,8 +76,6 @@ def _arrays() -> Iterator[str]:
     yield "## `[[roadside]]`"
     yield _about(RoadsideUnit)
     yield table(HEADER, key_rows(RoadsideUnit))
-    yield "## `[[fault]]`"
-    yield "Kind, place, start and duration of a fault: [faults.md](faults.md)."
 
 
 def _options() -> Iterator[str]:
