@@ -47,13 +47,13 @@ def new(
             _check_name(folder.name)
             write_project(folder)
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-        (scenario,) = folder.glob("*.toml")
+        scenario, *_ = sorted(folder.glob("*.toml"))
         print(f"next: cd {shlex.quote(str(folder))} && vnet simulate {scenario.name}")
 
 
 def examples() -> list[str]:
     """Return the names of the examples with a scenario."""
-    return sorted(path.parent.name for path in EXAMPLES.glob("*/*.toml"))
+    return sorted({path.parent.name for path in EXAMPLES.glob("*/*.toml")})
 
 
 def _example(name: str) -> Path:

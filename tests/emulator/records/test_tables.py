@@ -57,7 +57,7 @@ def test_a_table_is_added_by_its_declaration(tmp_path: Path, monkeypatch: pytest
     finally:
         TABLES.remove(TYRES)
     assert "| `tyres.parquet` | [a row for each vehicle](#tyresparquet), where roads are rough |" in text
-    assert "| `wear_m` | `double` | m | how much of the rubber is gone |" in text
+    assert "`wear_m` (`double`, m): how much of the rubber is gone" in text
 
 
 @pytest.mark.slow
