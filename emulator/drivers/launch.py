@@ -36,6 +36,7 @@ STARVED = 0.1
 """Share of a processor below which a process that wants to run has got none: its machine keeps it from ending."""
 STARVED_LOOKS = 10
 STARVED_LOOK_S = 0.02
+"""Looks at a process, and seconds between two, until it counts as starved."""
 MOST_ZYGOTES = 3
 """Attempts to fork an agent: a zygote that has ended is started again."""
 
