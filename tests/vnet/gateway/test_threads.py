@@ -142,6 +142,56 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
     ]
 
 
+def test_asyncio_is_pythons_own(drive: Drive) -> None:
+    """A coroutine that blocks holds up its loop, which closes generators and takes signals."""
+    run = drive(
+        """
+        import asyncio, os, signal, threading, time
+
+        async def numbers():
+            try:
+                while True:
+                    yield 1
+            finally:
+                await asyncio.sleep(0.1)
+                print("closed", round(time.monotonic(), 2))
+
+        async def main():
+            loop = asyncio.get_running_loop()
+            tick = asyncio.create_task(asyncio.sleep(0.1, "tick"))
+            await asyncio.sleep(0)
+            time.sleep(0.5)
+            print(await tick, round(loop.time(), 2))
+            async for number in numbers():
+                break
+            tasks = {asyncio.create_task(asyncio.sleep(0, number)) for number in range(20)}
+            print([await each for each in asyncio.as_completed(tasks)] == list(range(20)))
+            told = asyncio.Event()
+            loop.add_signal_handler(signal.SIGTERM, told.set)
+            threading.Timer(0.3, os.kill, [os.getpid(), signal.SIGTERM]).start()
+            threading.Thread(target=asyncio.run, args=[asyncio.sleep(0.1)]).start()
+            await told.wait()
+            print("told", round(loop.time(), 2), loop.remove_signal_handler(signal.SIGTERM))
+            asyncio.create_task(fail())
+            await asyncio.sleep(0)
+            try:
+                await asyncio.open_connection("localhost", 1)
+            except Exception as error:
+                print("refused" if "sockets" in str(error) else error)
+            await asyncio.sleep(100)
+
+        async def fail():
+            1 / 0
+
+        asyncio.run(main())
+        """
+    )
+    assert log(run)[:4] == ["tick 0.5", "True", "closed 0.6", "told 0.8 True"]
+    assert "refused" in log(run)
+    (told,) = events(run, "exception")
+    assert "in a task or a callback of asyncio" in told["place"]
+
+
 def test_joinable_threads_of_later_pythons_work(drive: Drive) -> None:
     run = drive(
         """

@@ -7,7 +7,6 @@ program, and so are the modules of the standard library that block or draw: they
 
 from __future__ import annotations
 
-import asyncio
 import builtins
 import datetime
 import importlib
@@ -20,8 +19,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Coroutine, Iterable, Sequence
-from concurrent import futures
+from collections.abc import Callable, Iterable, Sequence
 from contextvars import ContextVar
 from functools import cache, partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
@@ -29,18 +27,16 @@ from itertools import dropwhile
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
-from weakref import WeakKeyDictionary
 
 from vnet.errors import ProgramError, shown
 from vnet.gateway import client_config, session_variables
 from vnet.gateway.emulated.chance import numpy_random, prepare_random, prepare_uuid
 from vnet.gateway.emulated.facade import Facade
+from vnet.gateway.emulated.loops import prepare_asyncio
 from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
 from vnet.gateway.emulated.shown import hide, import_shared, show
-from vnet.gateway.emulated.strands import Threads, block_on, current_strand, look, run_strand, sleep
+from vnet.gateway.emulated.strands import Threads, look, set_generator_hooks, sleep
 from vnet.node import Node
-from vnet.runtime.own_asyncio import Task
-from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.units import NS_PER_S
 
 ENDPOINT = "tcp/127.0.0.1:7447"
@@ -56,15 +52,11 @@ CORES = 4
 _OWN_COPIES = (
     "_threading_local",
     "argparse",
+    "asyncio",
     "concurrent",
-    "concurrent.futures",
-    "concurrent.futures._base",
-    "concurrent.futures.thread",
     "contextlib",
     "fileinput",
     "logging",
-    "logging.config",
-    "logging.handlers",
     "optparse",
     "queue",
     "random",
@@ -74,15 +66,14 @@ _OWN_COPIES = (
     "threading",
     "uuid",
 )
-"""Modules of the standard library of which each program has its own: they block, draw, keep such objects, or read
-the words of the command."""
-_ABSENT = ("_queue",)
+"""Modules and packages of the standard library of which each program has its own: they block, draw, keep such
+objects, or read the words of the command."""
+_ABSENT = ("_asyncio", "_queue")
 """Accelerators whose Python version is taken, as they block in C."""
 _SHARED = ("vnet", "agents", "emulator", "greenlet")
 
 
 _present: ContextVar[ProgramModules | None] = ContextVar("vnet_zenoh_program", default=None)
-_present_run: ContextVar[object] = ContextVar("vnet_asyncio_run", default=None)
 
 
 class OwnModules(dict[str, ModuleType]):
@@ -94,7 +85,7 @@ class OwnModules(dict[str, ModuleType]):
 
     def __setitem__(self, name: str, module: ModuleType) -> None:
         super().__setitem__(name, module)
-        if name not in _OWN_COPIES and name not in self._shown and show(name, _present_module):
+        if not _is_own_copy(name) and name not in self._shown and show(name, _present_module):
             self._shown.add(name)
 
     def close(self) -> None:
@@ -122,11 +113,8 @@ class ProgramModules:
         self._random = random.Random(int.from_bytes(node.rng.bytes(16)))
         self.modules = OwnModules()
         self._builtins = {**vars(builtins), "__import__": self._import, "input": _no_input}
-        self.coroutines: WeakKeyDictionary[asyncio.Task[Any], object] = WeakKeyDictionary()
-        """Tasks of the program, and the call of `asyncio.run` within which each was made."""
         self._facades: dict[str, Callable[[], ModuleType]] = {
             "_thread": self.threads.module,
-            "asyncio": self._asyncio,
             "atexit": self._atexit,
             "datetime": self._datetime,
             "importlib": lambda: Facade(importlib, import_module=self._import_module, __import__=self._import),
@@ -139,6 +127,7 @@ class ProgramModules:
             "time": self._time,
         }
         self._preparations: dict[str, Callable[[Any], None]] = {
+            "asyncio": lambda module: prepare_asyncio(module, node, self.threads, self.process.set_handler),
             "concurrent.futures": self._prepare_futures,
             "queue": self._prepare_queue,
             "random": lambda module: prepare_random(module, self._random),
@@ -235,7 +224,7 @@ class ProgramModules:
         if name in self._facades:
             module = self.modules[name] = self._facades[name]()
             return module
-        if name in _OWN_COPIES:
+        if _is_own_copy(name):
             spec = importlib.util.find_spec(name)
         elif top in sys.stdlib_module_names or top in _SHARED:
             spec = None
@@ -243,7 +232,7 @@ class ProgramModules:
             spec = self._find(name)
             if spec is None:
                 raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-        if spec is None or not _is_python(spec) or (name not in _OWN_COPIES and self._is_compiled(top)):
+        if spec is None or not _is_python(spec) or (not _is_own_copy(name) and self._is_compiled(top)):
             module = self.modules[name] = import_shared(name)
             return module
         return self._execute(spec)
@@ -268,7 +257,8 @@ class ProgramModules:
         vars(module)["__builtins__"] = self._builtins
         try:
             if isinstance(spec.loader, SourceFileLoader):  # else a folder without code
-                exec(spec.loader.get_code(name), vars(module))  # type: ignore[arg-type]
+                code = _shared_code if _is_own_copy(name) else _code
+                exec(code(spec.loader, name), vars(module))
         except BaseException:
             self.modules.pop(name, None)
             raise
@@ -310,7 +300,13 @@ class ProgramModules:
     # Modules of which the program has others.
 
     def _sys(self) -> ModuleType:
-        own = {"argv": self.argv, "path": self.path, "modules": self.modules, "stdin": io.StringIO()}
+        own: dict[str, Any] = {
+            "argv": self.argv,
+            "path": self.path,
+            "modules": self.modules,
+            "stdin": io.StringIO(),
+        }
+        own["set_asyncgen_hooks"] = set_generator_hooks
         return Facade(sys, **own, __stdout__=sys.stdout, __stderr__=sys.stderr)
 
     def _os(self) -> ModuleType:
@@ -456,60 +452,6 @@ class ProgramModules:
 
         module.ProcessPoolExecutor = ProcessPoolExecutor
 
-    # asyncio: coroutines of the program run on the node's loop, in strands of their own.
-
-    def _asyncio(self) -> ModuleType:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, VirtualTimeLoop)
-        loop.set_task_factory(_new_task)
-        loop.run_jobs_by(_run_job)
-        program_loop = ProgramLoop(loop, self)
-
-        def new_event_loop() -> ProgramLoop:
-            nonlocal program_loop
-            program_loop = ProgramLoop(loop, self)
-            return program_loop
-
-        own = {
-            "run": lambda main, *, debug=None, loop_factory=None: program_loop.run(main),
-            "Runner": lambda **options: Runner(program_loop),
-            "new_event_loop": new_event_loop,
-            "set_event_loop": lambda loop: None,
-            "get_event_loop": lambda: loop if _in_coroutine() else program_loop,
-            "get_running_loop": lambda: loop if _in_coroutine() else _no_loop(),
-            "_get_running_loop": lambda: loop if _in_coroutine() else None,
-            "current_task": lambda loop=None: asyncio.current_task() if _in_coroutine() else _no_loop(),
-            "all_tasks": lambda loop=None: set(self.living_tasks()),
-            "wrap_future": _wrap_future,
-            "run_coroutine_threadsafe": self._run_coroutine_threadsafe,
-        }
-        for part in (asyncio.events, asyncio.futures, asyncio.runners, asyncio.tasks):
-            found = {name: value for name, value in own.items() if hasattr(part, name)}
-            self.modules[part.__name__] = Facade(part, **found)
-        parts = {part: self.modules[f"asyncio.{part}"] for part in ("events", "futures", "runners", "tasks")}
-        return Facade(asyncio, **own, **parts)
-
-    def living_tasks(self) -> list[asyncio.Task[Any]]:
-        """Return the tasks that were made within the present call of `asyncio.run`, and go on."""
-        run = _present_run.get()
-        return sorted((task for task, its in self.coroutines.items() if its is run and not task.done()), key=hash)
-
-    def _run_coroutine_threadsafe(self, coroutine: Any, loop: Any) -> futures.Future[Any]:
-        result = self.load("concurrent.futures").Future()
-        task = asyncio.get_running_loop().create_task(coroutine)
-
-        def done(task: asyncio.Task[Any]) -> None:
-            if task.cancelled():
-                result.cancel()
-                result.set_running_or_notify_cancel()
-            elif (error := task.exception()) is not None:
-                result.set_exception(error)
-            else:
-                result.set_result(task.result())
-
-        task.add_done_callback(done)
-        return result  # type: ignore[no-any-return]
-
 
 def _present_module(name: str) -> ModuleType | None:
     """Return the module of this name of the program whose code runs."""
@@ -517,29 +459,8 @@ def _present_module(name: str) -> ModuleType | None:
     return None if program is None else program.modules.get(name)
 
 
-def _new_task(loop: Any, coroutine: Any, **options: Any) -> asyncio.Task[Any]:
-    """Make a task of a vehicle with programs: those of a program run in strands."""
-    program = _present.get()
-    if program is None:
-        return Task(coroutine, loop=loop, **options)
-    task = Task(program.threads.green(coroutine), loop=loop, **options)
-    program.coroutines[task] = _present_run.get()
-    return task
-
-
-def _run_job(executor: Any, function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
-    """Run a job of `run_in_executor` or `to_thread` in a strand, or in the program's own executor."""
-    if executor is not None:
-        return _wrap_future(executor.submit(function, *args))
-    program = _present.get()
-    assert program is not None
-    strand = program.threads.strand(partial(function, *args))
-    return Task(run_strand(strand), loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
-
-
-def _in_coroutine() -> bool:
-    strand = current_strand()
-    return strand is None or strand.is_task
+def _is_own_copy(name: str) -> bool:
+    return name.partition(".")[0] in _OWN_COPIES
 
 
 def _select(readers: Any, writers: Any, others: Any, timeout_s: float | None = None) -> Any:
@@ -550,125 +471,8 @@ def _select(readers: Any, writers: Any, others: Any, timeout_s: float | None = N
     return [], [], []
 
 
-def _no_loop() -> NoReturn:
-    raise RuntimeError("no running event loop")
-
-
 def _no_input(prompt: object = "") -> NoReturn:
     raise EOFError("input(): a vehicle has no keyboard")
-
-
-def _wrap_future(future: Any, *, loop: Any = None) -> asyncio.Future[Any]:
-    """Return a future of asyncio for one of the program's own `concurrent.futures`."""
-    if isinstance(future, asyncio.Future):
-        return future
-    outer = asyncio.get_running_loop().create_future()
-
-    def done(inner: Any) -> None:
-        if outer.done():
-            return
-        if inner.cancelled():
-            outer.cancel()
-        elif (error := inner.exception()) is not None:
-            outer.set_exception(error)
-        else:
-            outer.set_result(inner.result())
-
-    future.add_done_callback(done)
-    return outer
-
-
-class ProgramLoop:
-    """The node's loop as a blocking program sees one of its own: it runs while the program says so."""
-
-    def __init__(self, loop: VirtualTimeLoop, program: ProgramModules) -> None:
-        self._loop = loop
-        self._program = program
-        self._stopped: asyncio.Future[None] | None = None
-        self._is_closed = False
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._loop, name)
-
-    def run(self, main: Coroutine[Any, Any, Any]) -> Any:
-        """Do as `asyncio.run`."""
-        if _in_coroutine():
-            raise RuntimeError("asyncio.run() cannot be called from a running event loop")
-        outer = _present_run.set(object())
-        try:
-            return self.run_until_complete(main)
-        finally:
-            self.cancel_tasks()
-            _present_run.reset(outer)
-
-    def cancel_tasks(self) -> None:
-        """Cancel the tasks of the present run, and wait for them."""
-        left = self._program.living_tasks()
-        for task in left:
-            task.cancel()
-        if left:
-            block_on(asyncio.wait(left))
-
-    def run_until_complete(self, future: Any) -> Any:
-        """Do as the loop's."""
-        task = self._loop.create_task(future) if asyncio.iscoroutine(future) else future
-        return block_on(task)
-
-    def run_forever(self) -> None:
-        """Block until `stop`."""
-        self._stopped = self._loop.create_future()
-        block_on(self._stopped)
-
-    def stop(self) -> None:
-        """End `run_forever`."""
-        if self._stopped is not None and not self._stopped.done():
-            self._stopped.set_result(None)
-
-    def close(self) -> None:
-        """Take note of it: the loop is the node's."""
-        self._is_closed = True
-
-    def is_closed(self) -> bool:
-        """Return whether it was closed."""
-        return self._is_closed
-
-    def is_running(self) -> bool:
-        """Return whether a coroutine runs."""
-        return _in_coroutine()
-
-    async def shutdown_asyncgens(self) -> None:
-        """Do nothing, as `close`."""
-
-    shutdown_default_executor = shutdown_asyncgens
-
-
-class Runner:
-    """`asyncio.Runner` on the node's loop."""
-
-    def __init__(self, loop: ProgramLoop) -> None:
-        self._loop = loop
-        self._outer: Any = _present_run.set(object())
-
-    def __enter__(self) -> Runner:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def run(self, main: Coroutine[Any, Any, Any], *, context: Any = None) -> Any:
-        """Run a coroutine."""
-        return self._loop.run_until_complete(main)
-
-    def get_loop(self) -> ProgramLoop:
-        """Return the loop."""
-        return self._loop
-
-    def close(self) -> None:
-        """Cancel the tasks that are left."""
-        if self._outer is not None:
-            self._loop.cancel_tasks()
-            _present_run.reset(self._outer)
-            self._outer = None
 
 
 def _looking_get(get: Callable[..., Any], empty: type[Exception]) -> Callable[..., Any]:
@@ -695,6 +499,13 @@ def _is_python(spec: ModuleSpec) -> bool:
     return isinstance(spec.loader, SourceFileLoader) or (
         spec.loader is None or type(spec.loader).__name__ == "NamespaceLoader"
     )
+
+
+def _code(loader: SourceFileLoader, name: str) -> Any:
+    return loader.get_code(name)
+
+
+_shared_code = cache(_code)
 
 
 @cache

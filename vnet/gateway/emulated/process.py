@@ -53,7 +53,7 @@ class OwnProcess:
     def signal_functions(self) -> dict[str, Any]:
         """Return what stands for functions of `signal`."""
         return {
-            "signal": self._set_handler,
+            "signal": self.set_handler,
             "getsignal": lambda number: self._handlers.get(number, signal.SIG_DFL),
             "raise_signal": self.send,
             "pthread_kill": lambda thread, number: self.send(number),
@@ -69,7 +69,8 @@ class OwnProcess:
             "siginterrupt": lambda *args: None,
         }
 
-    def _set_handler(self, number: int, handler: Any) -> Any:
+    def set_handler(self, number: int, handler: Any) -> Any:
+        """Have a signal handled so; return what it was handled by before."""
         before = self._handlers.get(number, signal.SIG_DFL)
         self._handlers[number] = handler
         return before

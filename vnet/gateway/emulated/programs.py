@@ -30,33 +30,6 @@ REFUSED = {
     "TransportEventsListener": "sessions of the emulator have no transport",
 }
 """Names of Zenoh that virtual time does not have, and why."""
-ZENOHS_OWN = (
-    "CongestionControl",
-    "ConsolidationMode",
-    "Encoding",
-    "InterceptionPoint",
-    "KeyExpr",
-    "Locality",
-    "NTP64",
-    "Parameters",
-    "Priority",
-    "QueryConsolidation",
-    "QueryTarget",
-    "Reliability",
-    "ReplyKeyExpr",
-    "SampleKind",
-    "Selector",
-    "SetIntersectionLevel",
-    "Timestamp",
-    "TimestampId",
-    "TimestampInstrumentation",
-    "TimestampInstrumentationBuilder",
-    "WhatAmI",
-    "WhatAmIMatcher",
-    "ZBytes",
-    "ZError",
-)
-"""Values that Python can construct, and which are the same everywhere."""
 _EMULATED = (values, queries, sessions, advanced)
 
 
@@ -88,7 +61,8 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
     vars(handlers).update(_own_names(zenoh.handlers), Callback=zenoh.handlers.Callback)
     vars(ext).update({name: value for name, value in vars(zenoh.ext).items() if not name.startswith("_")})
     vars(ext).update(_own_names(zenoh.ext))
-    vars(package).update({name: getattr(zenoh, name) for name in ZENOHS_OWN})
+    # Values that Python can construct are Zenoh's own.
+    vars(package).update({name: value for name, value in vars(zenoh).items() if not name.startswith("_")})
     vars(package).update(_own_names(zenoh))
     vars(package).update({name: refused(name, reason) for name, reason in REFUSED.items()})
     vars(package).update(

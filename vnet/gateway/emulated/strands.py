@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine, Generator
+from collections.abc import Awaitable, Callable, Generator
 from contextvars import Context, copy_context
 from dataclasses import dataclass
 from functools import partial
@@ -75,20 +75,12 @@ class Folder:
 
 
 class Strand(greenlet):
-    """A thread, or the greenlet of a coroutine (`is_task`), which alone a blocking call in it blocks."""
+    """A thread."""
 
-    def __init__(
-        self,
-        run: Callable[[], Any],
-        number: int,
-        folder: Folder,
-        is_task: bool = False,
-        context: Context | None = None,
-    ) -> None:
+    def __init__(self, run: Callable[[], Any], number: int, folder: Folder, context: Context | None = None) -> None:
         super().__init__(run)
         self.number = number
         self.folder = folder
-        self.is_task = is_task
         self.at_end: list[Callable[[], object]] = []
         self.interrupt: BaseException | None = None
         """Exception that it is to raise where it waits."""
@@ -97,6 +89,8 @@ class Strand(greenlet):
         self.is_gone = False
         """True once it shall not run any more."""
         self.looked_s, self.looks = -1.0, 0
+        self.generator_hooks: tuple[Any, ...] | None = None
+        """The hooks of `sys.set_asyncgen_hooks` that an event loop has set which it runs."""
         self.gr_context = copy_context() if context is None else context
 
     def begin(self) -> Any:
@@ -105,20 +99,28 @@ class Strand(greenlet):
         return self.go(self.switch)
 
     def go(self, step: Callable[..., Any], *values: Any) -> Any:
-        """Go on by `switch` or `throw`, in the folder of the program."""
-        folder = self.folder
+        """Go on by `switch` or `throw`, in the folder of the program, and with its hooks."""
+        folder, before = self.folder, sys.get_asyncgen_hooks()
         if folder.path is not None:
             os.chdir(folder.path)
+        if self.generator_hooks is not None:
+            sys.set_asyncgen_hooks(*self.generator_hooks)
         try:
             return step(*values)
         finally:
             if folder.path is not None:
                 os.chdir(folder.home)
+            if self.generator_hooks is not None:
+                sys.set_asyncgen_hooks(*before)
+
+
+async def go_on(strand: Strand, item: Any) -> Any:
+    """Run a strand that waits for `item` to its end, and return its result."""
+    return await _steps(strand, item)
 
 
 @coroutine
-def drive(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
-    """Run a strand that waits for `item` to its end, and return its result."""
+def _steps(strand: Strand, item: Any) -> Generator[Any, Any, Any]:
     note_greenlet(strand)
     while not strand.dead and item is not IDLE:
         if isinstance(item, HardExit):
@@ -166,7 +168,7 @@ def idle() -> None:
 
 async def run_strand(strand: Strand) -> Any:
     """Run a strand from its beginning, and return its result."""
-    return await drive(strand, strand.begin())
+    return await go_on(strand, strand.begin())
 
 
 def _end(strand: Strand) -> None:
@@ -191,6 +193,13 @@ def current_strand() -> Strand | None:
     """Return the strand that runs, None outside of all."""
     strand = getcurrent()
     return strand if isinstance(strand, Strand) else None
+
+
+def set_generator_hooks(*hooks: Any, **named: Any) -> None:
+    """Do as `sys.set_asyncgen_hooks` for the present strand."""
+    sys.set_asyncgen_hooks(*hooks, **named)
+    if (strand := current_strand()) is not None:
+        strand.generator_hooks = sys.get_asyncgen_hooks()
 
 
 def go_no_further_if_ended() -> None:
@@ -245,8 +254,6 @@ def block_on(awaitable: Awaitable[T]) -> T:
     except StopIteration as stop:
         return stop.value  # type: ignore[no-any-return]
     except asyncio.CancelledError:
-        if strand.is_task:
-            raise
         raise GreenletExit from None  # the vehicle's program is ended: `finally` and `with` run, `except` does not
 
 
@@ -260,24 +267,14 @@ def sleep(seconds: float) -> None:
     block_on(asyncio.sleep(seconds))
 
 
-class Lock:
-    """`threading.Lock`; who has waited longest gets it."""
+class Waiting:
+    """Strands that wait for others, in the order in which they came."""
 
     def __init__(self) -> None:
-        self._locked = False
         self._waiters: deque[asyncio.Future[bool]] = deque()
 
-    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        """Take the lock; block until it is there, or for `timeout` seconds. Return whether it was taken."""
-        if timeout != -1 and (not blocking or timeout < 0):
-            text = "timeout value must be a non-negative number"
-            raise ValueError(text if blocking else "can't specify a timeout for a non-blocking call")
-        if not self._locked:
-            self._locked = True
-            return True
-        return blocking and self._wait(timeout)
-
-    def _wait(self, timeout: float) -> bool:
+    def wait(self, timeout: float = -1) -> bool:
+        """Block the present strand until it is woken, or for `timeout` seconds; return whether it was woken."""
         go_no_further_if_ended()
         loop = asyncio.get_running_loop()
         waiter: asyncio.Future[bool] = loop.create_future()
@@ -287,7 +284,7 @@ class Lock:
             return block_on(waiter)
         except BaseException:
             if waiter.done() and not waiter.cancelled() and waiter.result():
-                self.release()
+                self.give_back()
             raise
         finally:
             if timer is not None:
@@ -295,16 +292,49 @@ class Lock:
             if waiter in self._waiters:
                 self._waiters.remove(waiter)
 
-    def release(self) -> None:
-        """Give the lock to who waits for it, if anybody does. Raises RuntimeError unless it is taken."""
-        if not self._locked:
-            raise RuntimeError("release unlocked lock")
+    def wake(self) -> bool:
+        """Wake who has waited longest; return whether anybody waits."""
         while self._waiters:
             waiter = self._waiters.popleft()
             if not waiter.done():
                 waiter.set_result(True)
-                return
+                return True
+        return False
+
+    def wake_all(self) -> None:
+        """Wake all."""
+        while self.wake():
+            pass
+
+    def give_back(self) -> None:
+        """Wake another in the place of a strand that was woken and is ended before it goes on."""
+        self.wake()
+
+
+class Lock(Waiting):
+    """`threading.Lock`; who has waited longest gets it."""
+
+    def __init__(self) -> None:
+        super().__init__()
         self._locked = False
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """Take the lock; block until it is there, or for `timeout` seconds. Return whether it was taken."""
+        if timeout != -1 and (not blocking or timeout < 0):
+            text = "timeout value must be a non-negative number"
+            raise ValueError(text if blocking else "can't specify a timeout for a non-blocking call")
+        if not self._locked:
+            self._locked = True
+            return True
+        return blocking and self.wait(timeout)
+
+    def release(self) -> None:
+        """Give the lock to who waits for it, if anybody does. Raises RuntimeError unless it is taken."""
+        if not self._locked:
+            raise RuntimeError("release unlocked lock")
+        self._locked = self.wake()
+
+    give_back = release
 
     def release_if_locked(self) -> None:
         """Release it unless it is not taken."""
@@ -367,7 +397,7 @@ class Threads:
 
     async def run_main(self, run: Callable[[], Any]) -> None:
         """Run the main thread."""
-        self.main, self._main_task = self.strand(run), asyncio.current_task()
+        self.main, self._main_task = Strand(run, self.new_number(), self.folder), asyncio.current_task()
         await run_strand(self.main)
 
     def interrupt(self, error: BaseException) -> None:
@@ -376,21 +406,18 @@ class Threads:
             self.main.interrupt = error
             self._main_task.cancel()
 
-    def strand(self, run: Callable[[], Any], is_task: bool = False) -> Strand:
-        """Make a strand with a number of its own."""
-        return Strand(run, next(self._numbers), self.folder, is_task)
+    @property
+    def are_over(self) -> bool:
+        """True once the main thread has ended, or is told to."""
+        return self.main is None or self.main.dead or self.main.is_ended or self.main.is_gone
 
     def new_number(self) -> int:
         """Return the number of a further thread."""
         return next(self._numbers)
 
-    def green(self, coroutine: Coroutine[Any, Any, T]) -> Coroutine[Any, Any, T]:
-        """Return a coroutine that does as `coroutine`, in which calls may block."""
-        return run_strand(self.strand(partial(block_on, coroutine), is_task=True))
-
     def start(self, function: Callable[..., Any], args: Any = (), kwargs: Any = None) -> int:
         """Start a thread, and return its number."""
-        strand = self.strand(partial(self._run, function, args, kwargs or {}))
+        strand = Strand(partial(self._run, function, args, kwargs or {}), self.new_number(), self.folder)
         self._alive += 1
         Task(run_strand(strand), loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
         return strand.number

@@ -19,11 +19,10 @@ from vnet.gateway.emulated.strands import (
     IDLE,
     Strand,
     Threads,
-    block_on,
+    Waiting,
     current_strand,
-    drive,
     fail,
-    go_no_further_if_ended,
+    go_on,
     idle,
     look,
 )
@@ -272,11 +271,11 @@ class RingChannel(DefaultHandler):
 
 
 class Handler:
-    """The reading end of a channel."""
+    """A channel, with the reading end that a program sees."""
 
     def __init__(self, most: int | None = None) -> None:
         self._items: deque[Any] = deque(maxlen=most)
-        self._waiters: deque[asyncio.Future[None]] = deque()
+        self._waiting = Waiting()
         self._closed = False
 
     def __class_getitem__(cls, item: object) -> type[Handler]:
@@ -296,14 +295,7 @@ class Handler:
         while not self._items:
             if self._closed:
                 raise zenoh.ZError("channel is empty and closed")
-            go_no_further_if_ended()
-            waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            self._waiters.append(waiter)
-            try:
-                block_on(waiter)
-            finally:
-                if waiter in self._waiters:
-                    self._waiters.remove(waiter)
+            self._waiting.wait()
         return self._items.popleft()
 
     def __iter__(self) -> Iterator[Any]:
@@ -320,18 +312,12 @@ class Handler:
     def push(self, item: Any) -> None:
         """Add an item, and wake who waits longest."""
         self._items.append(item)
-        if self._waiters:
-            waiter = self._waiters.popleft()
-            if not waiter.done():
-                waiter.set_result(None)
+        self._waiting.wake()
 
     def close(self) -> None:
         """Add no more."""
         self._closed = True
-        for waiter in self._waiters:
-            if not waiter.done():
-                waiter.set_result(None)
-        self._waiters.clear()
+        self._waiting.wake_all()
 
 
 class CallbackSink:
@@ -346,14 +332,12 @@ class CallbackSink:
         self._strand: Strand | None = None
         self._items: deque[Any] = deque()
         self._runs = self._closed = False
-        self._waiters: list[asyncio.Future[None]] = []
+        self._waiting = Waiting()
 
     def wait(self) -> None:
         """Block until the callback has had all, unless it is the callback itself that asks."""
         if self._runs and current_strand() is not self._strand:
-            waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            self._waiters.append(waiter)
-            block_on(waiter)
+            self._waiting.wait()
 
     def push(self, item: Any) -> None:
         """Have the callback called with an item."""
@@ -379,7 +363,7 @@ class CallbackSink:
             )
         item = strand.begin()
         if item is not IDLE:
-            Task(_go_on(strand, item), loop=asyncio.get_running_loop(), name=f"thread {self._number}")
+            Task(go_on(strand, item), loop=asyncio.get_running_loop(), name=f"thread {self._number}")
 
     def _work(self) -> None:
         while True:  # a strand costs ten times what a switch does
@@ -389,9 +373,7 @@ class CallbackSink:
                 drop, self._drop = self._drop, None
                 self._call(drop)
             self._runs = False
-            waiters, self._waiters = self._waiters, []
-            for waiter in waiters:
-                waiter.set_result(None)
+            self._waiting.wake_all()
             idle()
 
     def _call(self, function: Callable[..., Any], *args: Any) -> None:
@@ -401,10 +383,6 @@ class CallbackSink:
             pass  # it ends a thread, and a callback at most
         except Exception as error:
             fail(error, "in a callback of Zenoh")
-
-
-async def _go_on(strand: Strand, item: Any) -> None:
-    await drive(strand, item)
 
 
 class DueCallbacks:
