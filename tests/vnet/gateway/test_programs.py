@@ -315,39 +315,6 @@ def test_a_program_has_a_working_directory_and_sleeps_of_its_own(drive: Drive) -
         assert log(run, node)[:2] == ["True", "True 0.6"]
 
 
-def test_libraries_on_asyncio_find_no_loop_outside_of_coroutines(drive: Drive) -> None:
-    run = drive(
-        """
-        import asyncio
-        from asyncio import events, tasks
-        async def work():
-            await asyncio.sleep(0.1)
-            return events._get_running_loop() is asyncio.get_running_loop(), tasks.current_task() is not None
-        async def leave():
-            asyncio.get_running_loop().create_task(end())
-            await asyncio.sleep(0)
-        async def end():
-            try:
-                await asyncio.sleep(100)
-            finally:
-                print("ended")
-        def asked():
-            try:
-                return asyncio.current_task()
-            except RuntimeError:
-                return "none"
-        print(events._get_running_loop(), asked())
-        with asyncio.Runner() as runner:
-            print(runner.run(work()))
-            runner.run(leave())
-        loop = asyncio.new_event_loop()
-        loop.close()
-        print(loop.is_closed(), asyncio.new_event_loop().is_closed())
-        """
-    )
-    assert log(run)[:-1] == ["None none", "(True, True)", "ended", "True False"]
-
-
 def test_cancelling_a_query_waits_for_its_callback_and_refuses_the_next(drive: Drive) -> None:
     run = drive(
         """

@@ -19,9 +19,9 @@ import zenoh
 from zenoh.ext import UInt32, z_deserialize, z_serialize
 
 from vnet.gateway.emulated.modules import EPOCH_NS
-from vnet.gateway.emulated.queries import ANY_KEY, Asking, Direct, Entity, Query
+from vnet.gateway.emulated.queries import ALL_REPLIES, ANY_KEY, Asking, Entity, Query
 from vnet.gateway.emulated.sessions import Listening, LivelinessToken, Publisher, Session, Watcher
-from vnet.gateway.emulated.values import EntityGlobalId, Reply, Sample, SourceInfo, ZenohId, key_of, sink_of
+from vnet.gateway.emulated.values import Direct, EntityGlobalId, Reply, Sample, SourceInfo, ZenohId, key_of
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
@@ -243,13 +243,13 @@ class AdvancedSubscriber(Listening):
         for name, value in (("max_samples", self._most), ("max_age", history and history.max_age)):
             if value == 0:
                 raise zenoh.ZError(f"{name} must not be zero")
-        self._sink, self.handler, self._is_background = sink_of(handler, session.outlet)
+        super().__init__(handler, session.outlet)
         self._sources: dict[EntityGlobalId, _Source] = {}
         self._stamped: dict[bytes, _Source] = {}
         self._queries = 0 if history is None else 1
         self._misses: list[SampleMissListener] = []
         self._ends: list[Callable[[], object]] = [self._stop_timers]
-        self._end, self._is_declared = self._end_all, True
+        self._end = self._end_all
         sink = Direct(self._take, self._sink.close)
         self._main = Entity(session, key_of(key), sink, allowed_origin, eid=next(session.entity_numbers))
         self.id, self.key_expr = self._main.id, self._main.key
@@ -388,11 +388,7 @@ class AdvancedSubscriber(Listening):
 
     def _ask(self, key: str, parameters: str, on_end: Callable[[], object]) -> None:
         parameters = f"{parameters};{ANY_KEY}" if parameters else ANY_KEY
-        asking = Asking(
-            zenoh.Selector(key, parameters),
-            self._replied,
-            on_end,
-        )
+        asking = Asking(zenoh.Selector(key, parameters), self._replied, on_end, **ALL_REPLIES)
         asking.expire_after(RECOVERY_TIMEOUT_S)
         self.session.vehicle.ask(asking, self.session, to_own=True, to_others=True)
 
@@ -485,9 +481,9 @@ class SampleMissListener(Listening):
 
     def __init__(self, subscriber: AdvancedSubscriber, handler: Any) -> None:
         self._listeners = subscriber._misses
-        self._sink, self.handler, self._is_background = sink_of(handler, subscriber.session.outlet)
+        super().__init__(handler, subscriber.session.outlet)
         self._listeners.append(self)
-        self._end, self._is_declared = self._stop, True
+        self._end = self._stop
 
     def push(self, miss: Miss) -> None:
         """Tell of a miss."""

@@ -421,21 +421,19 @@ class ProgramModules:
 
     def _prepare_threading(self, module: Any) -> None:
         module.local = self.load("_threading_local").local
-
-        given = module.Event.is_set
-
-        def is_set(event: Any) -> bool:
-            if not given(event):
-                look()
-            return bool(given(event))
-
-        module.Event.is_set = module.Event.isSet = is_set
+        module.Event.is_set = module.Event.isSet = _looking(module.Event.is_set, nothing=False)
 
     def _prepare_queue(self, module: Any) -> None:
         """Have what finds a queue empty count as a look at it."""
+
+        class Empty(module.Empty):  # type: ignore[misc]
+            def __init__(self, *args: object) -> None:
+                super().__init__(*args)
+                look()
+
+        module.Empty = Empty
         for kind in (module.Queue, module._PySimpleQueue):
-            kind.get = _looking_get(kind.get, module.Empty)
-            kind.empty = _looking_empty(kind.empty)
+            kind.empty = _looking(kind.empty, nothing=True)
 
     def _prepare_futures(self, module: Any) -> None:
         """Have jobs of processes run in threads: a child process has a time of its own."""
@@ -475,22 +473,13 @@ def _no_input(prompt: object = "") -> NoReturn:
     raise EOFError("input(): a vehicle has no keyboard")
 
 
-def _looking_get(get: Callable[..., Any], empty: type[Exception]) -> Callable[..., Any]:
-    def looking(queue: Any, block: bool = True, timeout: float | None = None) -> Any:
-        try:
-            return get(queue, block, timeout)
-        except empty:
+def _looking(ask: Callable[[Any], bool], nothing: bool) -> Callable[[Any], bool]:
+    """Return a method that counts as a look where it answers that there is nothing new."""
+
+    def looking(asked: Any) -> bool:
+        if ask(asked) is nothing:
             look()
-            raise
-
-    return looking
-
-
-def _looking_empty(is_empty: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    def looking(queue: Any) -> bool:
-        if is_empty(queue):
-            look()
-        return is_empty(queue)
+        return ask(asked)
 
     return looking
 

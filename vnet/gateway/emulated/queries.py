@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Protocol
 
 import zenoh
@@ -14,10 +14,12 @@ from vnet.gateway.emulated.values import (
     NO_ENCODING,
     NOTHING,
     PUT,
+    Direct,
     EntityGlobalId,
     Reply,
     ReplyError,
     Sample,
+    Sink,
     SourceInfo,
     ZenohId,
     bytes_or_none,
@@ -28,6 +30,8 @@ from vnet.gateway.emulated.values import (
 
 ANY_KEY = "_anyke"
 """Parameter of queries to which replies with any key are accepted."""
+ALL_REPLIES: dict[str, Any] = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+"""Options of queries that all are asked, and of which each reply counts."""
 
 
 class Owner(Protocol):
@@ -36,26 +40,6 @@ class Owner(Protocol):
     def zid(self) -> ZenohId:
         """Return its id."""
         ...
-
-
-class Sink(Protocol):
-    """A receiver of samples, queries or replies."""
-
-    def push(self, item: Any, /) -> object:
-        """Take one."""
-        ...
-
-    def close(self) -> object:
-        """Take no more."""
-        ...
-
-
-@dataclass(eq=False)
-class Direct:
-    """A sink that calls a function at once."""
-
-    push: Callable[[Any], object]
-    close: Callable[[], object] = lambda: None
 
 
 @dataclass(eq=False)
@@ -88,20 +72,25 @@ class Asking:
     selector: zenoh.Selector
     on_reply: Callable[[Reply], object]
     on_end: Callable[[], object]
-    target: zenoh.QueryTarget = field(default_factory=lambda: zenoh.QueryTarget.ALL)
-    consolidation: zenoh.ConsolidationMode = field(default_factory=lambda: zenoh.ConsolidationMode.NONE)
-    payload: zenoh.ZBytes | None = None
-    encoding: zenoh.Encoding | None = None
-    attachment: zenoh.ZBytes | None = None
+    _: KW_ONLY
+    target: zenoh.QueryTarget | None = None
+    consolidation: Any = None
+    payload: Any = None
+    encoding: Any = None
+    attachment: Any = None
     source_info: SourceInfo | None = None
-    congestion_control: zenoh.CongestionControl = field(default_factory=lambda: zenoh.CongestionControl.BLOCK)
-    priority: zenoh.Priority = field(default_factory=lambda: zenoh.Priority.DATA)
-    express: bool = False
+    congestion_control: zenoh.CongestionControl | None = None
+    priority: zenoh.Priority | None = None
+    express: bool | None = None
 
     def __post_init__(self) -> None:
         self.key, self.parameters = self.selector.key_expr, self.selector.parameters
         self.takes_any_key = ANY_KEY in self.parameters
-        mode = self.consolidation
+        self.target = self.target or zenoh.QueryTarget.DEFAULT
+        if self.payload is not None or self.encoding is not None:
+            self.encoding = encoding_of(self.encoding)
+        self.payload, self.attachment = bytes_or_none(self.payload), bytes_or_none(self.attachment)
+        mode = getattr(self.consolidation, "mode", self.consolidation) or zenoh.ConsolidationMode.AUTO
         if mode == zenoh.ConsolidationMode.AUTO:
             ranged = "_time" in self.parameters
             mode = zenoh.ConsolidationMode.NONE if ranged else zenoh.ConsolidationMode.LATEST
@@ -243,7 +232,11 @@ class Query:
         asking, key_expr = self._asking, key_of(key)
         if not asking.takes_any_key and not asking.key.intersects(key_expr):
             raise zenoh.ZError(f"Attempted to reply on `{key_expr}`, which does not intersect query `{asking.key}`")
-        qos = asking.congestion_control, asking.priority, asking.express if express is None else express
+        qos = (
+            asking.congestion_control or zenoh.CongestionControl.BLOCK,
+            asking.priority or zenoh.Priority.DATA,
+            bool(asking.express if express is None else express),
+        )
         self._answer(Sample(key_expr, payload, kind, encoding, timestamp, *qos, bytes_or_none(attachment)))
 
     def _answer(self, result: Sample | ReplyError) -> None:

@@ -86,9 +86,14 @@ class Declared:
 class Listening(Declared):
     """An entity that takes items, with the end of the channel that the program reads."""
 
-    handler: Any = None
-    _is_background = False
-    """True if it goes on when the program discards it."""
+    def __init__(self, handler: Any, outlet: Outlet) -> None:
+        self._sink, self.handler, self._is_background = sink_of(handler, outlet)
+        self._end: Callable[[], object] = self._sink.close
+        self._is_declared = True
+
+    handler: Any
+    _is_background = True
+    """True if it goes on when the program discards it, as a callback does."""
 
     def __class_getitem__(cls, item: object) -> type[Listening]:
         return cls
@@ -123,11 +128,11 @@ class Subscriber(Listening):
         complete: bool | None = None,
     ) -> None:
         session.check_open()
-        sink, self.handler, self._is_background = sink_of(handler, session.outlet)
+        expression = key_of(key)
+        super().__init__(handler, session.outlet)
         number = next(session.entity_numbers)
-        self._entity = Entity(session, key_of(key), sink, allowed_origin, bool(complete), number)
+        self._entity = Entity(session, expression, self._sink, allowed_origin, bool(complete), number)
         self._end = partial(session.end, self._entity)
-        self._is_declared = True
         session.declare(self.kind, self._entity)
 
     id = property(lambda self: self._entity.id)
@@ -233,10 +238,9 @@ class MatchingListener(Listening):
 
     def __init__(self, owner: Publisher | Querier, handler: Any) -> None:
         session = owner.session
-        self._sink, self.handler, self._is_background = sink_of(handler, session.outlet)
+        super().__init__(handler, session.outlet)
         self._owner, self._matching = owner, False
         self._end = partial(session.vehicle.on_matching.remove, self._look)
-        self._is_declared = True
         session.vehicle.on_matching.append(self._look)
         self._look()
 
@@ -502,20 +506,12 @@ class Session:
         selector: Any,
         handler: Any = None,
         *,
-        target: zenoh.QueryTarget | None = None,
-        consolidation: Any = None,
         accept_replies: zenoh.ReplyKeyExpr | None = None,
         timeout: float | int | None = None,
-        congestion_control: zenoh.CongestionControl | None = None,
-        priority: zenoh.Priority | None = None,
-        express: bool | None = None,
-        payload: Any = None,
-        encoding: Any = None,
-        attachment: Any = None,
         timestamp_instrumentation: object = None,
         allowed_destination: zenoh.Locality | None = None,
-        source_info: SourceInfo | None = None,
         cancellation_token: CancellationToken | None = None,
+        **options: Any,
     ) -> Any:
         """Ask for replies."""
         _refuse(timestamp_instrumentation=timestamp_instrumentation)
@@ -525,22 +521,7 @@ class Session:
         if accept_replies == zenoh.ReplyKeyExpr.ANY and ANY_KEY not in selector.parameters:
             rest = str(selector.parameters)
             selector = zenoh.Selector(selector.key_expr, f"{rest};{ANY_KEY}" if rest else ANY_KEY)
-        if isinstance(consolidation, zenoh.QueryConsolidation):
-            consolidation = consolidation.mode
-        asking = Asking(
-            selector,
-            sink.push,
-            sink.close,
-            target=target or zenoh.QueryTarget.DEFAULT,
-            consolidation=consolidation or zenoh.ConsolidationMode.AUTO,
-            payload=bytes_or_none(payload),
-            encoding=None if payload is None and encoding is None else encoding_of(encoding),
-            attachment=bytes_or_none(attachment),
-            source_info=source_info,
-            congestion_control=congestion_control or zenoh.CongestionControl.BLOCK,
-            priority=priority or zenoh.Priority.DATA,
-            express=bool(express),
-        )
+        asking = Asking(selector, sink.push, sink.close, **options)
         if cancellation_token is not None:
             cancellation_token.add(sink, asking)
         asking.expire_after(self._timeout_s if timeout is None else timeout)
@@ -572,11 +553,10 @@ class Scout(Listening):
     """Scouting, which finds the vehicle's router."""
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, handler: Any, what: Any) -> None:
-        sink, self.handler, self._is_background = sink_of(handler, outlet)
-        self._end, self._is_declared = sink.close, True
+        super().__init__(handler, outlet)
         matcher = what if isinstance(what, zenoh.WhatAmIMatcher) else zenoh.WhatAmIMatcher(what or "router|peer")
         if matcher.matches(zenoh.WhatAmI.ROUTER):
-            sink.push(Hello(zenoh.WhatAmI.ROUTER, vehicle.zid, []))
+            self._sink.push(Hello(zenoh.WhatAmI.ROUTER, vehicle.zid, []))
 
     def stop(self) -> None:
         """Stop scouting."""

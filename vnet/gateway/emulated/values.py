@@ -7,6 +7,7 @@ import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
@@ -383,6 +384,18 @@ class CallbackSink:
             pass  # it ends a thread, and a callback at most
         except Exception as error:
             fail(error, "in a callback of Zenoh")
+
+
+@dataclass(eq=False)
+class Direct:
+    """A sink that calls a function at once."""
+
+    push: Callable[[Any], object]
+    close: Callable[[], object] = lambda: None
+
+
+Sink = Handler | CallbackSink | Direct
+"""A receiver of samples, queries or replies."""
 
 
 class DueCallbacks:

@@ -18,7 +18,7 @@ import zenoh
 
 from vnet.errors import VnetError
 from vnet.gateway.emulated.modules import EPOCH_NS
-from vnet.gateway.emulated.queries import Asking, Entity, Owner
+from vnet.gateway.emulated.queries import ALL_REPLIES, Asking, Entity, Owner
 from vnet.gateway.emulated.values import (
     NO_ENCODING,
     PUT,
@@ -252,9 +252,10 @@ class Vehicle:
             zenoh.Selector(query.selector),
             reply,
             lambda: None,
-            payload=None if query.payload is None else zenoh.ZBytes(query.payload),
-            encoding=None if query.encoding is None else zenoh.Encoding(query.encoding),
-            attachment=None if query.attachment is None else zenoh.ZBytes(query.attachment),
+            **ALL_REPLIES,
+            payload=query.payload,
+            encoding=query.encoding,
+            attachment=query.attachment,
         )
         asking.expire_after(self._query_s)
         self.ask(asking, None, to_own=False, to_others=True)
