@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import Phase, settings
 
+from tests.support import forked_commands
 from vnet.runtime.environment import use_same_arithmetic
 
 use_same_arithmetic()  # as in the commands, whose results some tests compare with those of this process
@@ -75,6 +76,12 @@ def _descriptors_are_closed() -> Iterator[None]:
     if _open_descriptors() > most:
         gc.collect()
         assert _open_descriptors() <= most, f"more than {MOST_LEFT_OPEN} descriptors are left open"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _processes_are_forked() -> None:
+    """Save each worker of cells, and each repetition of a run, the second that it takes to import vnet."""
+    forked_commands.fork_processes()
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ import typer.main
 import agents.cli
 import emulator.cli.commands
 from tests.support import forked_commands
-from tests.support.forked_commands import VNET
+from tests.support.forked_commands import MODULE, VNET
 from tests.support.paths import ROOT
 
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
@@ -186,7 +186,10 @@ def captured(command: Any, arguments: list[str]) -> tuple[str, int]:
 
 def _process(words: Sequence[str]) -> tuple[str, int]:
     started = process(words)
-    start = forked_commands.run if started[: len(VNET)] == VNET else subprocess.run
+    if started[1].startswith("docs/examples/"):
+        started = [*MODULE, started[1].removesuffix(".py").replace("/", "."), *started[2:]]
+    is_forked = started[: len(VNET)] == VNET or started[: len(MODULE)] == MODULE
+    start = forked_commands.run if is_forked else subprocess.run
     nothing, out, error = subprocess.DEVNULL, subprocess.PIPE, subprocess.STDOUT
     done = start(started, stdin=nothing, stdout=out, stderr=error, text=True, timeout=TIMEOUT_S)
     return done.stdout, done.returncode

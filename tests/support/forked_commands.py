@@ -1,7 +1,9 @@
-"""Commands of vnet without the second that each takes to import vnet: forks of one process that has done so.
+"""Processes of vnet without the second that each takes to import vnet: forks of one process.
 
-`Command([*VNET, …], …)` and `run([*VNET, …], …)` are `subprocess.Popen` and `subprocess.run` of the command. That
-one works from the first instruction of its process on is for tests/emulator/cli and tests/system/test_wheel.py.
+`Command([*VNET, …], …)` and `run([*VNET, …], …)` are `subprocess.Popen` and `subprocess.run` of the command, those
+of `[*MODULE, NAME, …]` of a module of this repository. Workers of cells, and repetitions of runs, that it starts
+are forked as well; those of this process, once it has called `fork_processes`. tests/emulator/cli,
+tests/system/test_wheel.py and tests/emulator/cells/test_worker.py start processes as users do.
 """
 
 import atexit
@@ -10,6 +12,7 @@ import functools
 import gc
 import json
 import os
+import runpy
 import select
 import signal
 import socket
@@ -17,11 +20,18 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+from vnet.errors import VnetError
 from vnet.runtime.environment import use_same_arithmetic
 
-VNET = [sys.executable, "-P", "-m", "emulator.cli"]
+PYTHON = [sys.executable, "-P", "-m"]
+VNET = [*PYTHON, "emulator.cli"]
+MODULE = [*PYTHON, "runpy"]
+WORKER = "emulator.cells.worker"
+WITHOUT_CHARTS = "VNET_TESTS_WITHOUT_CHARTS"
+"""In the environment of a command whose pages need no charts: drawing them costs four times a small run."""
 _LENGTH = 2**20
 _NUMBER = "%-20d"
 
@@ -30,17 +40,22 @@ class Command(subprocess.Popen[str]):
     """A command that is forked. Its status comes over a socket: the process that waits for it is its parent."""
 
     def _execute_child(self, args: Sequence[str], *more: Any) -> None:
-        assert list(args[: len(VNET)]) == VNET and more[1] is None, "no other command, and no `preexec_fn`"
+        first = len(PYTHON)
+        known = list(args[:first]) == PYTHON and args[first] in (VNET[first], MODULE[first], WORKER)
+        assert known and more[1] is None, "no other command, and no `preexec_fn`"
         sys.audit("subprocess.Popen", args[0], args, more[4], more[5])
-        cwd, environment, pipes = more[4], more[5], more[9:15]
+        passed, cwd, environment, pipes = more[3], more[4], more[5], more[9:15]
         standard = [here if pipe < 0 else pipe for here, pipe in enumerate((pipes[0], pipes[3], pipes[5]))]
-        request = {"words": list(args[len(VNET) :]), "cwd": str(cwd or Path.cwd()), "has_session": more[-2]}
+        request = {"words": list(args[first:]), "cwd": str(cwd or Path.cwd()), "has_session": more[-2]}
+        request |= {"passed": list(passed), "has_group": more[-1] == 0}
         request["environment"] = dict(os.environ if environment is None else environment)
         data = json.dumps(request).encode()
         assert len(data) < _LENGTH
         self._status, its = socket.socketpair()
-        with its:
-            socket.send_fds(_server(), [data], [its.fileno(), *standard])
+        with its, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+            server.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _LENGTH)
+            server.connect(_address())
+            socket.send_fds(server, [data], [its.fileno(), *standard, *passed])
         self.pid = int(self._status.recv(20))
         self._child_created = True
         self._close_pipe_fds(*pipes)  # type: ignore[attr-defined]
@@ -78,38 +93,74 @@ def run(
     return subprocess.CompletedProcess(words, process.returncode, out, error)
 
 
+def fork_processes() -> None:
+    """Have workers of cells, and repetitions of runs, that this process starts be forked from now on."""
+    from emulator.cells import worker
+    from emulator.drivers import determinism
+
+    vars(worker)["subprocess"] = SimpleNamespace(**vars(subprocess) | {"Popen": Command})
+    vars(determinism)["subprocess"] = SimpleNamespace(**vars(subprocess) | {"run": _run_any})
+
+
+def _run_any(words: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command in a process that is forked, if it is one of vnet with its hash seed."""
+    return run(words, **options) if list(words[: len(VNET)]) == VNET else subprocess.run(words, **options)
+
+
+def _refuse(subject: str, *_: str) -> None:
+    raise VnetError(f"{subject}: left out in this test")
+
+
+NO_CHARTS = {"require": _refuse, "is_installed": lambda _: False}
+"""Replacements in `emulator.pages.canvas`, with which pages are written as if matplotlib were not installed."""
+
+
 @functools.cache
-def _server() -> socket.socket:
-    """Start the process that is forked, once for each process of pytest; return the socket to it."""
-    ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _LENGTH)
-    with its:
-        words = [sys.executable, "-P", "-m", __name__, str(its.fileno())]
+def _address() -> bytes:
+    """Start the process that is forked, once for each process of pytest; return the address of its socket."""
+    requests = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    requests.bind("")
+    requests.listen(64)
+    alive, its_end = socket.socketpair()
+    with requests, its_end:
+        words = [*PYTHON, __name__, str(requests.fileno()), str(its_end.fileno())]
         environment = os.environ | {"PYTHONHASHSEED": "0", "PYTHONPATH": str(Path(__file__).parents[2])}
-        server = subprocess.Popen(words, env=environment, pass_fds=[its.fileno()], stdin=subprocess.DEVNULL)
+        passed = [requests.fileno(), its_end.fileno()]
+        server = subprocess.Popen(words, env=environment, pass_fds=passed, stdin=subprocess.DEVNULL)
+        address = requests.getsockname()
 
     def end() -> None:
-        ours.close()
+        alive.close()
         server.wait()
 
     atexit.register(end)
-    return ours
+    return address
 
 
-def serve(requests: socket.socket) -> None:
-    """Fork a process for each request; return in the process that is to be the command, and in no other."""
+def serve(requests: socket.socket, alive: socket.socket) -> str:
+    """Fork a process for each request until `alive` is closed.
+
+    Return, in the process that is to be the command and in no other, the module that it runs.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    poll = select.poll()
+    poll.register(requests, select.POLLIN)
+    poll.register(alive, select.POLLIN | select.POLLHUP)
     while True:
-        data, descriptors, _, _ = socket.recv_fds(requests, _LENGTH, 4)
+        ready = [descriptor for descriptor, _ in poll.poll()]
         with contextlib.suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
-        if not data:
+        if alive.fileno() in ready:
             os._exit(0)
-        if not os.fork():
+        with requests.accept()[0] as client:
+            data, descriptors, _, _ = socket.recv_fds(client, _LENGTH, 8)
+        if data and not os.fork():
             break
         for descriptor in descriptors:
             os.close(descriptor)
+    address = requests.getsockname()
+    alive.close()
     requests.close()
     status = socket.socket(fileno=descriptors[0])
     if pid := os.fork():
@@ -121,15 +172,19 @@ def serve(requests: socket.socket) -> None:
             status.sendall((_NUMBER % ended).encode())
         os._exit(0)
     status.close()
-    _become(json.loads(data), descriptors[1:])
+    return _become(json.loads(data), descriptors[1:], address)
 
 
-def _become(request: dict[str, Any], standard: list[int]) -> None:
-    """Have this process be as one that was started for the request."""
+def _become(request: dict[str, Any], descriptors: list[int], address: bytes) -> str:
+    """Have this process be as one that was started for the request; return the module that it runs."""
+    from tests.support import forked_commands
+
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if request["has_session"]:
         os.setsid()
-    for number, descriptor in enumerate(standard):
+    elif request["has_group"]:
+        os.setpgid(0, 0)
+    for number, descriptor in enumerate(descriptors[:3]):
         os.dup2(descriptor, number)
         os.close(descriptor)
     os.chdir(request["cwd"])
@@ -137,21 +192,41 @@ def _become(request: dict[str, Any], standard: list[int]) -> None:
     os.environ.update(request["environment"], PYTHONHASHSEED="0")
     path = request["environment"].get("PYTHONPATH", "")
     sys.path[:] = [*filter(None, path.split(os.pathsep)), *sys.path[1:]]  # the first was for this module
-    sys.argv = ["vnet", *request["words"]]
+    passed = dict(zip(map(str, request["passed"]), map(str, descriptors[3:]), strict=True))
+    module, *words = request["words"]
+    sys.argv = ["vnet", *(passed.get(word, word) for word in words)]
+    vars(forked_commands)["_address"] = lambda: address
+    forked_commands.fork_processes()
+    if WITHOUT_CHARTS in os.environ:
+        from emulator.pages import canvas
+
+        vars(canvas).update(NO_CHARTS)
+    return str(module)
 
 
 if __name__ == "__main__":
     use_same_arithmetic()
+    import matplotlib.figure
     import pyarrow
 
+    import emulator.cells.sweep
     import emulator.cli
     import emulator.cli.commands
     import emulator.cli.execution
     import emulator.drivers.live.processes
+    import emulator.report.write
+    import emulator.testing.trial
 
     pyarrow.array([0])  # the first array imports pandas where it is installed, which takes as long as vnet does
 
+    matplotlib.figure.Figure().add_axes((0, 0, 1, 1))  # imports what figures need
     gc.collect()
     gc.freeze()
-    serve(socket.socket(fileno=int(sys.argv[1])))
-    emulator.cli.main()
+    sockets = [socket.socket(fileno=int(number)) for number in sys.argv[1:]]
+    if (asked := serve(*sockets)) == WORKER:
+        emulator.cells.worker._serve(int(sys.argv[1]))
+    elif asked == "runpy":
+        del sys.argv[0]
+        runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+    else:
+        emulator.cli.main()

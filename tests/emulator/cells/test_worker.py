@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -21,6 +22,13 @@ from vnet.errors import PayloadTooLargeError, ScenarioError, VnetError
 pytestmark = pytest.mark.slow
 
 SCENARIO = Scenario()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def are_started_anew() -> Iterator[None]:
+    """Start workers as users do, and not as other tests: with an interpreter of their own."""
+    with patch("emulator.cells.worker.subprocess", subprocess):
+        yield
 
 
 @pytest.fixture(scope="module")
