@@ -259,6 +259,24 @@ def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path:
     assert log(run, "v02")[0] == "<class 'int'> v02 Wheel(size=3) True"
 
 
+def test_modules_that_import_each_other_get_the_programs_own(drive: Drive, tmp_path: Path) -> None:
+    package = tmp_path / "round"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "one.py").write_text("from . import two\n")
+    (package / "two.py").write_text("from . import one\n")
+    run = drive(
+        """
+        import asyncio.tasks, sys, types
+        import round.one
+        print(type(round.two.one) is types.ModuleType, round.two.one is sys.modules["round.one"])
+        timeouts = sys.modules["asyncio.timeouts"]
+        print(timeouts.tasks is asyncio.tasks)
+        """
+    )
+    assert log(run)[:2] == ["True True", "True"]
+
+
 def test_classes_made_by_functions_of_typing_work(drive: Drive) -> None:
     run = drive("""
         import typing

@@ -288,7 +288,8 @@ class ProgramModules:
             for each in wanted + (list(getattr(module, "__all__", ())) if "*" in wanted else []):
                 if each != "*" and not hasattr(module, each):
                     try:
-                        self.load(f"{name}.{each}")
+                        # Python would find those that are being loaded in its own `sys.modules`.
+                        setattr(module, each, self.load(f"{name}.{each}"))
                     except ModuleNotFoundError as error:
                         if error.name != f"{name}.{each}":
                             raise
