@@ -19,7 +19,7 @@ from tests.docs.commands import DocsError
 from tests.docs.markdown import PAGES, blocks
 from tests.docs.once import key_of, unless_passed
 from tests.docs.pages import Page, check_workflow, shows
-from tests.support.forked_commands import NO_CHARTS, WITHOUT_CHARTS
+from tests.support.forked_commands import NO_CHARTS
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -36,8 +36,7 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
     monkeypatch.setenv(
         "PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     )  # commands in commands
-    monkeypatch.setenv(WITHOUT_CHARTS, "1")  # tests/emulator/report has them
-    for name, value in NO_CHARTS.items():
+    for name, value in NO_CHARTS.items():  # as in processes that are forked
         monkeypatch.setattr(f"emulator.pages.canvas.{name}", value)
     for name in ("FORCE_COLOR", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

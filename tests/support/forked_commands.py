@@ -30,8 +30,6 @@ PYTHON = [sys.executable, "-P", "-m"]
 VNET = [*PYTHON, "emulator.cli"]
 MODULE = [*PYTHON, "runpy"]
 WORKER = "emulator.cells.worker"
-WITHOUT_CHARTS = "VNET_TESTS_WITHOUT_CHARTS"
-"""In the environment of a command whose pages need no charts: drawing them costs four times a small run."""
 _LENGTH = 2**20
 _NUMBER = "%-20d"
 
@@ -112,7 +110,10 @@ def _refuse(subject: str, *_: str) -> None:
 
 
 NO_CHARTS = {"require": _refuse, "is_installed": lambda _: False}
-"""Replacements in `emulator.pages.canvas`, with which pages are written as if matplotlib were not installed."""
+"""Replacements in `emulator.pages.canvas`: forked processes write pages as if matplotlib were not installed.
+
+Charts cost four times what a small run does. tests/emulator/report has them, in its own process.
+"""
 
 
 @functools.cache
@@ -197,10 +198,6 @@ def _become(request: dict[str, Any], descriptors: list[int], address: bytes) -> 
     sys.argv = ["vnet", *(passed.get(word, word) for word in words)]
     vars(forked_commands)["_address"] = lambda: address
     forked_commands.fork_processes()
-    if WITHOUT_CHARTS in os.environ:
-        from emulator.pages import canvas
-
-        vars(canvas).update(NO_CHARTS)
     return str(module)
 
 
@@ -214,12 +211,14 @@ if __name__ == "__main__":
     import emulator.cli.commands
     import emulator.cli.execution
     import emulator.drivers.live.processes
+    import emulator.pages.canvas
     import emulator.report.write
     import emulator.testing.trial
 
     pyarrow.array([0])  # the first array imports pandas where it is installed, which takes as long as vnet does
 
-    matplotlib.figure.Figure().add_axes((0, 0, 1, 1))  # imports what figures need
+    matplotlib.figure.Figure().add_axes((0, 0, 1, 1))  # imports what the figures of examples need
+    vars(emulator.pages.canvas).update(NO_CHARTS)
     gc.collect()
     gc.freeze()
     sockets = [socket.socket(fileno=int(number)) for number in sys.argv[1:]]
