@@ -30,6 +30,8 @@ from vnet.errors import ProgramError, ScenarioError, VnetError
 
 pytestmark = pytest.mark.slow
 
+pytest_plugins = "pytester"
+
 
 def planted(program: str) -> Scenario:
     return Scenario.model_validate(
@@ -53,13 +55,13 @@ def run(plan: Plan, folder: Path) -> tuple[int, str]:
 
 def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) -> None:
     folder = tmp_path / "campaign"
-    plan = Plan.of(planted("impatient"), "pause,loss,duplicate", 5, seed=1)
+    plan = Plan.of(planted("impatient"), "pause,loss,duplicate", 2, seed=3)
     status, said = run(plan, folder)
     assert status == 1
     results = results_of(folder)
-    assert [row["seed"] for row in results] == list(range(1, 6))
+    assert [row["seed"] for row in results] == [3, 4]
     failed = [row for row in results if "failed" in row]
-    assert failed
+    assert len(failed) == 1 and len(failed[0]["faults"]) > 1
     for row in failed:
         assert list(row["failed"]) == ["agents_alive"]
         assert "RuntimeError: where has the time gone?" in row["failed"]["agents_alive"]
@@ -74,8 +76,8 @@ def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) 
         assert row["folder"] in again["reproduce"]
         assert 'kind = "pause"' in said
         assert row["parting"]["passing"] == "the same run without faults"
-    spared = [row for row in results if "failed" not in row]
-    assert all("pause" not in {fault["kind"] for fault in row["faults"]} for row in spared)
+    (spared,) = [row for row in results if "failed" not in row]
+    assert spared["faults"] and "pause" not in {fault["kind"] for fault in spared["faults"]}
     text = (folder / "campaign.html").read_text()
     assert f"<h2>Failures: {len(failed)}</h2>" in text
     assert "vnet simulate" in text

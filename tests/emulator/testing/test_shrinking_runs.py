@@ -20,6 +20,8 @@ from vnet.transport.wire import Deviation
 
 pytestmark = pytest.mark.slow
 
+pytest_plugins = "pytester"
+
 
 @given(st.sets(st.integers(0, 199), min_size=1, max_size=4))
 def test_what_fails_together_is_left(needed: set[int]) -> None:
