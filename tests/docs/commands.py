@@ -188,6 +188,8 @@ def _process(words: Sequence[str]) -> tuple[str, int]:
     started = process(words)
     if started[1].startswith("docs/examples/"):
         started = [*MODULE, started[1].removesuffix(".py").replace("/", "."), *started[2:]]
+    elif started[1:3] == ["-m", "pytest"]:
+        started = [*MODULE, *started[2:]]
     is_forked = started[: len(VNET)] == VNET or started[: len(MODULE)] == MODULE
     start = forked_commands.run if is_forked else subprocess.run
     nothing, out, error = subprocess.DEVNULL, subprocess.PIPE, subprocess.STDOUT

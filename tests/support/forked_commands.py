@@ -205,6 +205,7 @@ if __name__ == "__main__":
     use_same_arithmetic()
     import matplotlib.figure
     import pyarrow
+    import pytest  # noqa: F401  # what pages run as well
 
     import emulator.cells.sweep
     import emulator.cli
