@@ -47,19 +47,18 @@ def check_conservation(recorded: RecordedRun) -> Finding:
         "disordered": _out_of_order(recorded),
         "mistimed": _mistimed(recorded),
     }
-    frames = np.unique(recorded.emission[recorded.copy == 0])
+    frames = int((recorded.copy[recorded.emissions.first] == 0).sum())
     gaps = _missing_numbers(recorded)
     counts: dict[str, Any] = {what: int(mask.sum()) for what, mask in broken.items()}
-    counts["wrong_count"] = len(np.unique(recorded.emission[broken["wrong_count"]]))
+    counts["wrong_count"] = len(recorded.first_rows(broken["wrong_count"]))
     total = sum(counts.values()) + gaps
     offending = np.logical_or.reduce(list(broken.values()))
     return result(
         total,
-        f"{counted(len(frames), 'frame')}, {counted(len(recorded.trace), 'reception')} in range, "
-        "each with one outcome",
+        f"{counted(frames, 'frame')}, {counted(len(recorded.trace), 'reception')} in range, each with one outcome",
         f"{counted(total, 'frame or reception', 'frames or receptions')} without exactly one outcome",
         recorded.rows(offending),
-        frames=len(frames),
+        frames=frames,
         pairs=len(recorded.trace),
         **counts,
         missing_frames=gaps,
@@ -89,9 +88,7 @@ def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
 
     A frame to a single vehicle has one row.
     """
-    first, inverse, rows = np.unique(recorded.emission, return_index=True, return_inverse=True, return_counts=True)[
-        1:
-    ]
+    first, inverse, rows = recorded.emissions
     in_range = recorded.places.receivers_in_range(recorded.sender[first], recorded.sent_ns[first])
     wrong = recorded.placed[first] & (rows != np.where(recorded.attempt[first] > 0, 1, in_range))
     sent = np.bincount(inverse, weights=~received_twice(recorded), minlength=len(first)) > 0
@@ -101,8 +98,10 @@ def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
 def _orphans(recorded: RecordedRun) -> Mask:
     """Copies that name no fault, or no original that was sent by then."""
     copies = recorded.copy > 0
-    frame, index = np.unique(recorded.frame, return_inverse=True)
-    original_ns = np.full(len(frame), END_OF_TIME_NS)
+    if not copies.any():
+        return copies
+    index = recorded.frame_of_row
+    original_ns = np.full(len(copies), END_OF_TIME_NS)
     np.minimum.at(original_ns, index[~copies], recorded.sent_ns[~copies])
     named = recorded.trace["cause"].combine_chunks()
     nameless = np.asarray(named.to_numpy(zero_copy_only=False) == "", dtype=bool)
@@ -113,7 +112,7 @@ def _orphans(recorded: RecordedRun) -> Mask:
 def _out_of_order(recorded: RecordedRun) -> Mask:
     """Originals that were sent before an earlier one of their sender."""
     originals = np.flatnonzero(recorded.copy == 0)
-    order = originals[np.lexsort((recorded.seq[originals], recorded.sender[originals]))]
+    order = originals[np.argsort(recorded.emission[originals], kind="stable")]
     same = recorded.sender[order[1:]] == recorded.sender[order[:-1]]
     disordered = np.zeros(len(recorded.trace), dtype=bool)
     disordered[order[1:]] = same & (recorded.sent_ns[order[1:]] < recorded.sent_ns[order[:-1]])
@@ -131,15 +130,12 @@ def _missing_numbers(recorded: RecordedRun) -> int:
 
     Frames sent while no receiver is in range have no rows, so their numbers may be missing.
     """
-    first = np.unique(recorded.emission, return_index=True)[1]
-    originals = first[recorded.copy[first] == 0]
-    missing = 0
-    by_sender = originals[np.argsort(recorded.sender[originals], kind="stable")]
-    for rows in np.split(by_sender, np.flatnonzero(np.diff(recorded.sender[by_sender])) + 1):
-        sender = int(recorded.sender[rows[0]]) if len(rows) else 0
-        seqs = np.concatenate([[-1], recorded.seq[rows]])
-        lonely = recorded.places.was_lonely(sender, np.concatenate([[0], recorded.sent_ns[rows]]))
-        missing += int((np.diff(seqs) - 1)[~lonely].sum())
+    first = recorded.emissions.first
+    originals = first[recorded.copy[first] == 0]  # by sender, and in the order of their numbers
+    sender, seq, sent_ns = recorded.sender[originals], recorded.seq[originals], recorded.sent_ns[originals]
+    begins = np.diff(sender, prepend=-1) != 0
+    after, after_ns = np.where(begins, -1, np.roll(seq, 1)), np.where(begins, 0, np.roll(sent_ns, 1))
+    missing = int((seq - after - 1)[~recorded.places.were_lonely(sender, after_ns, sent_ns)].sum())
     copies = first[recorded.copy[first] > 0]
     copies = copies[~recorded.places.ever_lonely[recorded.sender[copies]]]
     frame, index = np.unique(recorded.frame[copies], return_inverse=True)
@@ -320,11 +316,11 @@ def _ruled(recorded: RecordedRun) -> Mask:
 
 def changed_bytes(recorded: RecordedRun) -> Mask:
     """Return the rows with other bytes than their frame's, as far as an uncorrupted original shows them."""
-    frame, index = np.unique(recorded.frame, return_inverse=True)
+    index = recorded.frame_of_row
     altered = recorded.caused_by("corrupt", "custom", "custom_sender")
     plain = np.flatnonzero((recorded.copy == 0) & ~altered)[::-1]
-    said = np.zeros(len(frame), dtype=np.uint64)
-    known = np.zeros(len(frame), dtype=bool)
+    said = np.zeros(len(index), dtype=np.uint64)
+    known = np.zeros(len(index), dtype=bool)
     said[index[plain]], known[index[plain]] = recorded.digest[plain], True
     return np.asarray(known[index] & (recorded.digest != said[index]))
 

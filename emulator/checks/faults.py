@@ -313,7 +313,7 @@ def _(fault: BurstLoss, recorded: RecordedRun, planned: PlannedFault, drawing: M
 def _steps(recorded: RecordedRun, planned: PlannedFault) -> Array:
     """Number of frames that each row's sender had sent since a fault began, the row's included."""
     while_acting = recorded.acting(planned, recorded.sent_ns, recorded.guard_ns) & ~received_twice(recorded)
-    first = np.flatnonzero(while_acting)[np.unique(recorded.emission[while_acting], return_index=True)[1]]
+    first = recorded.first_rows(while_acting)
     first = first[np.lexsort((recorded.emission[first], recorded.sent_ns[first], recorded.sender[first]))]
     sender = recorded.sender[first]
     index = np.arange(len(first)) - np.searchsorted(sender, sender) + 1

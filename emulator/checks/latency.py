@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from math import sqrt
 from typing import Any
 
@@ -72,10 +73,8 @@ def _queue(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arra
     airtimes_ns = [usual_ns, *slowed_ns]
     longest_ns = int(recorded.sent_ns.max(initial=0)) + 1
     key, batch = np.unique(recorded.sender * longest_ns + recorded.sent_ns, return_inverse=True)
-    offered = np.flatnonzero(
-        ~received_twice(recorded) & ~recorded.outcome_is("oversize") & ~recorded.dropped_by_sender
-    )
-    first = offered[np.unique(recorded.emission[offered], return_index=True)[1]]
+    offered = ~received_twice(recorded) & ~recorded.outcome_is("oversize") & ~recorded.dropped_by_sender
+    first = recorded.first_rows(offered)
     taken = first[~recorded.outcome_is("queue_full")[first]]
     sums = [np.bincount(batch[taken], weights=air[taken], minlength=len(key)) for air in airtimes_ns]
     sums.append(np.bincount(batch[first], weights=airtimes_ns[0][first], minlength=len(key)))
@@ -97,11 +96,34 @@ def _courses(
     delay_ns = recorded.scenario.radio.access_jitter_ms * NS_PER_MS
     start, end, waits = np.zeros(len(sender)), np.zeros(len(sender)), np.zeros(len(sender), dtype=bool)
     episode = _episodes(recorded, plan, sender, sent_ns)
-    who, plain, slow, within = -1, (0.0, 0.0), (0.0, 0.0), NO_EPISODE
-    batches = zip(sender.tolist(), sent_ns.tolist(), episode.tolist(), airtime_ns.tolist(), strict=True)
-    for index, (node, time_ns, number, (usual, fast, slowest, offered)) in enumerate(batches):
-        if node != who:
-            who, plain, within = node, (0.0, 0.0), NO_EPISODE
+    edges = np.flatnonzero(np.diff(sender, prepend=-1)).tolist()
+    for first, last in pairwise([*edges, len(sender)]):
+        of = slice(first, last)
+        if (episode[of] == NO_EPISODE).all():
+            start[of], end[of], waits[of] = _plain_course(sent_ns[of], airtime_ns[of, 0], delay_ns)
+        else:
+            start[of], end[of], waits[of] = _throttled_course(sent_ns[of], airtime_ns[of], delay_ns, episode[of])
+    return start, end, waits
+
+
+def _plain_course(sent_ns: IntArray, airtime_ns: Array, delay_ns: float) -> tuple[Array, Array, Mask]:
+    """As `_courses` of one sender's batches (B,) that no fault throttles: each waits for those before it."""
+    before_ns = np.cumsum(airtime_ns) - airtime_ns
+    start_ns = before_ns + np.maximum.accumulate(sent_ns - before_ns)
+    end_ns = before_ns + airtime_ns + np.maximum.accumulate(sent_ns + delay_ns - before_ns)
+    waits = np.zeros(len(sent_ns), bool)
+    waits[1:] = end_ns[:-1] > sent_ns[1:]
+    return start_ns, end_ns, waits
+
+
+def _throttled_course(
+    sent_ns: IntArray, airtime_ns: Array, delay_ns: float, episode: IntArray
+) -> tuple[Array, Array, Mask]:
+    """As `_courses` of one sender's batches (B,), with the number of the episode of each."""
+    start, end, waits = np.zeros(len(sent_ns)), np.zeros(len(sent_ns)), np.zeros(len(sent_ns), dtype=bool)
+    plain, slow, within = (0.0, 0.0), (0.0, 0.0), NO_EPISODE
+    batches = zip(sent_ns.tolist(), episode.tolist(), airtime_ns.tolist(), strict=True)
+    for index, (time_ns, number, (usual, fast, slowest, offered)) in enumerate(batches):
         waits[index] = number != NO_EPISODE or plain[1] > time_ns
         if number == NO_EPISODE:
             start[index], end[index] = max(time_ns, plain[0]), max(time_ns + delay_ns, plain[1]) + usual

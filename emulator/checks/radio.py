@@ -148,8 +148,7 @@ class _Air:
     @classmethod
     def of(cls, recorded: RecordedRun) -> _Air:
         """All that were on air."""
-        own = np.flatnonzero(~received_twice(recorded) & (recorded.on_air_ns >= 0))
-        frames = own[np.unique(recorded.emission[own], return_index=True)[1]]
+        frames = recorded.first_rows(~received_twice(recorded) & (recorded.on_air_ns >= 0))
         acked = frames[recorded.ack_on_air_ns[frames] >= 0]
         acks_ns = np.array([ack_airtime_ns(rate) for rate in recorded.bitrate_mbps[acked].tolist()], np.int64)
         rows = np.concatenate([frames, acked])

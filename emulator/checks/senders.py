@@ -29,7 +29,7 @@ def check_copies(recorded: RecordedRun) -> Finding:
     if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in recorded.plan):
         return not_exercised("no fault sends frames again" if recorded.plan else NO_FAULTS)
     once = ~received_twice(recorded) & (recorded.attempt < 2)  # what is transmitted again is the MAC's
-    first = _first_rows(recorded, once & ~_near_a_change(recorded) & ~_sent_by_rule(recorded))
+    first = recorded.first_rows(once & ~_near_a_change(recorded) & ~_sent_by_rule(recorded))
     originals, copies = first[recorded.copy[first] == 0], first[recorded.copy[first] > 0]
     frame_ns = dict(_of(recorded, originals))
     at_once = np.array([frame_ns.get(f) == t for f, t in _of(recorded, copies)], dtype=bool)
@@ -40,7 +40,7 @@ def check_copies(recorded: RecordedRun) -> Finding:
     times_sent[order[index]] = often
     wrong = originals[times_sent != _due(recorded, originals)]
     # Replayed frames may have been sent near a change.
-    odd = _replayed_wrongly(recorded, copies[~at_once], _first_rows(recorded, once & (recorded.copy == 0)))
+    odd = _replayed_wrongly(recorded, copies[~at_once], recorded.first_rows(once & (recorded.copy == 0)))
     broken = len(wrong) + len(odd)
     text = f"{counted(len(copies), 'frame')} sent again, as often and as late as configured"
     broken_text = (
@@ -83,12 +83,6 @@ def _due(recorded: RecordedRun, rows: Rows) -> IntArray:
             case Sybil(ghosts=ghosts):
                 due += acts * ghosts
     return due
-
-
-def _first_rows(recorded: RecordedRun, wanted: NDArray[np.bool_]) -> Rows:
-    """The first row of each emission (a frame, or a copy of one) among the rows `wanted`."""
-    rows = np.flatnonzero(wanted)
-    return np.asarray(rows[np.unique(recorded.emission[rows], return_index=True)[1]])
 
 
 def _replayed_wrongly(recorded: RecordedRun, late: Rows, originals: Rows) -> list[int]:

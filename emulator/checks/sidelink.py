@@ -22,13 +22,14 @@ def broken_rules(recorded: RecordedRun, mac: Sidelink) -> dict[str, NDArray[np.i
     twice in a slot, or receives in one. `half_duplex` are the receptions of those that transmitted, and
     `below_sensing` of those at which a signal is too weak.
     """
-    rows = np.flatnonzero(~received_twice(recorded) & (recorded.on_air_ns >= 0))
+    on_air = ~received_twice(recorded) & (recorded.on_air_ns >= 0)
+    rows = np.flatnonzero(on_air)
     begin_ns, left_ns = recorded.on_air_ns[rows], recorded.column("left_ns")[rows]
     lasts, rest = np.divmod(left_ns - begin_ns, mac.slot_ns)
     most = 1 + REPEAT_SLOTS if mac.retransmit else 1
     unaligned = (begin_ns % mac.slot_ns != 0) | (rest != 0) | (lasts < 1) | (lasts > most)
     earliest_ns = (recorded.sent_ns[rows] // mac.slot_ns + mac.t1_slots) * mac.slot_ns
-    frames = rows[np.unique(recorded.emission[rows], return_index=True)[1]]
+    frames = recorded.first_rows(on_air)
     node, slot = _occupied(recorded, mac, frames)
     count, slots = len(recorded.node_ids), _slots(recorded, mac, rows)
     key, times = np.unique(slot * count + node, return_counts=True)

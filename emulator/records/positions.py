@@ -174,8 +174,8 @@ class Places:
         """(N,), who had somebody in range throughout: each of its frames has rows."""
         return np.asarray((self._degrees[0] > 0).all(axis=0))
 
-    def was_lonely(self, sender: int, time_ns: IntArray) -> Mask:
-        """(n - 1,), whether a sender had nobody in range at some time between one of n instants and the next."""
-        lonely = np.concatenate([[0], np.cumsum(self._degrees[0][:, sender] == 0)])
-        index = self._epoch(time_ns)
-        return np.asarray(lonely[index[1:] + 1] > lonely[index[:-1]])
+    def were_lonely(self, sender: NDArray[np.intp], start_ns: IntArray, end_ns: IntArray) -> Mask:
+        """(n,), whether each of these senders had nobody in range at some time from one instant to another."""
+        lonely = np.cumsum(self._degrees[0] == 0, axis=0)
+        before = np.vstack([np.zeros_like(lonely[:1]), lonely])
+        return np.asarray(lonely[self._epoch(end_ns), sender] > before[self._epoch(start_ns), sender])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -97,6 +97,17 @@ class Span:
     def holds(self, time_ns: IntArray) -> Mask:
         """Mask of the instants within the span."""
         return np.asarray((self.start_ns <= time_ns) & (time_ns < self.end_ns))
+
+
+class Emissions(NamedTuple):
+    """The frames of a trace, and the copies of frames (n,): the first row of each, and its number of receptions.
+
+    `of_row` has the index of each row's.
+    """
+
+    first: NDArray[np.intp]
+    of_row: NDArray[np.intp]
+    receptions: IntArray
 
 
 @dataclass(frozen=True)
@@ -372,6 +383,25 @@ class RecordedRun:
     def emission(self) -> IntArray:
         """One number for each (sender, seq, copy)."""
         return np.asarray(self.frame * (int(self.copy.max(initial=0)) + 1) + self.copy)
+
+    @cached_property
+    def emissions(self) -> Emissions:
+        """The emissions of the trace: grouped once, because sorting all rows takes long."""
+        found = np.unique(self.emission, return_index=True, return_inverse=True, return_counts=True)
+        return Emissions(*found[1:])
+
+    @cached_property
+    def frame_of_row(self) -> NDArray[np.intp]:
+        """Number of each row's frame among all frames of the trace, in the order of `frame`."""
+        first, of_row, _ = self.emissions
+        return np.asarray(np.unique(self.frame[first], return_inverse=True)[1][of_row])
+
+    def first_rows(self, wanted: Mask) -> NDArray[np.intp]:
+        """The first of the rows `wanted` of each emission that has any, in the order of `emission`."""
+        rows = np.flatnonzero(wanted)[::-1]  # of several the one assigned last stays
+        first = np.full(len(self.emissions.first), -1)
+        first[self.emissions.of_row[rows]] = rows
+        return first[first >= 0]
 
     def rows(self, broken: Mask | IntArray | NDArray[np.intp]) -> list[dict[str, Any]]:
         """The first offending rows of the trace, by mask or by number."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.outcomes import Outcome, Stage
 from emulator.records.events import Event, EventKind, Level
-from emulator.records.recorded_run import END_OF_TIME_NS, OpenedRun, RecordedRun
+from emulator.records.recorded_run import END_OF_TIME_NS, Emissions, OpenedRun, RecordedRun
 from emulator.records.tables import TRACE
 from emulator.report.source import Source, maybe
 from vnet.errors import printable
@@ -112,7 +112,7 @@ def timeline(source: Source, most: int = MOST_RECEPTIONS, at_us: int | None = No
     all_marks = marks_of(events, source.number)
     marks, bars = _first_marks(all_marks), bars_of(events, source.number, end_us)
     sent_us = _on_air_us(source)
-    frames, points = _frames(source), points_of(all_marks, bars)
+    frames, points = source.emissions, points_of(all_marks, bars)
     kept, how = choose(frames, sent_us[frames.first], points, most)
     rows = np.flatnonzero(kept[frames.of_row])
     rows = rows[np.lexsort((source.receiver[rows], source.emission[rows], sent_us[rows]))]
@@ -198,22 +198,6 @@ def _down(recorded: OpenedRun, end_us: int) -> list[list[int]]:
 # Which frames.
 
 
-@dataclass(frozen=True)
-class TraceFrames:
-    """The frames of a trace (n,): each one's first row and its number of receptions; and the frame of each row."""
-
-    first: NDArray[np.intp]
-    receptions: IntArray
-    of_row: NDArray[np.intp]
-
-
-def _frames(recorded: OpenedRun) -> TraceFrames:
-    _, first, of_row, counts = np.unique(
-        recorded.emission, return_index=True, return_inverse=True, return_counts=True
-    )
-    return TraceFrames(first, counts.astype(np.int64), of_row)
-
-
 def points_of(marks: Sequence[Mark], bars: Sequence[Bar]) -> dict[int, IntArray]:
     """Return the instants in µs of what matters in a run, by their weight."""
     points: dict[int, list[int]] = {}
@@ -225,7 +209,7 @@ def points_of(marks: Sequence[Mark], bars: Sequence[Bar]) -> dict[int, IntArray]
 
 
 def choose(
-    frames: TraceFrames, sent_us: IntArray, points: dict[int, IntArray], most: int
+    frames: Emissions, sent_us: IntArray, points: dict[int, IntArray], most: int
 ) -> tuple[Mask, tuple[int, int]]:
     """Return a mask of the frames that are shown, with `most` receptions at most, and how they were chosen.
 
