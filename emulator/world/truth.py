@@ -170,7 +170,7 @@ class World:
 
     def fix(self, period: int, node: int) -> Fix:
         """Return the fix of vehicle number `node`, which must be present, at the start of `period`."""
-        heading_rad: float = self._fix_heading_rad[period, node].item()
+        heading_rad = self._fix_heading_rad.item(period, node)
         # Copies: a program may do with its fix what it likes.
         fix_m, covariance_m2 = self._fix_m[period, node].copy(), self._covariance_m2.copy()
         return Fix(
@@ -178,7 +178,7 @@ class World:
             fix_m,
             covariance_m2,
             None if math.isnan(heading_rad) else heading_rad,
-            self._fix_speed_mps[period, node].item(),
+            self._fix_speed_mps.item(period, node),
             sensors=self.sensed(period, node) if self.own_sensors else NOTHING_SENSED,
             multipath_sigma_m=self._multipath[0],
             multipath_tau_s=self._multipath[1],

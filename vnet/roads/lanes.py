@@ -55,8 +55,10 @@ class LaneMap:
 
     @classmethod
     def from_wire(cls, data: list[list[float] | float]) -> LaneMap:
-        """Restore a map from `to_wire`. Raises ValueError or TypeError on anything else."""
+        """Restore a map from `to_wire`, bit by bit and read-only. Raises ValueError or TypeError otherwise."""
         points, headings, half_width_m = data
-        heading_rad = np.asarray(headings, dtype=float)
-        point_m = np.asarray(points, dtype=float).reshape(len(heading_rad), 2)
+        heading_rad = np.array(headings, dtype=float)
+        point_m = np.array(points, dtype=float).reshape(len(heading_rad), 2)
+        for array in (heading_rad, point_m):
+            array.setflags(write=False)
         return cls(point_m, heading_rad, float(half_width_m))  # type: ignore[arg-type]

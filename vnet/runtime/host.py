@@ -32,7 +32,8 @@ from vnet.mailbox import Mailbox, Waits
 from vnet.node import Fix, Node
 from vnet.radio import Packet, RadioAbilities, SentFrame
 from vnet.reports import NoteDetail, Report
-from vnet.roads.road_map import map_from_wire
+from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap, map_from_wire
 from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, NodeClocks, Window
 from vnet.runtime.own_asyncio import Task, current_node, present_node
@@ -81,6 +82,7 @@ class Host:
         self._lines = NodeLines(on_line)
         self._log_handler = NodeLogHandler(self._log)
         self._window = Window()
+        self._map: tuple[object, LaneMap | RoadMap] | None = None
         self._mains: dict[str, asyncio.Task[None]] = {}
         """Held here: of a program in a deadlock nothing else refers to them, and they would be collected."""
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
@@ -111,7 +113,7 @@ class Host:
         node = Node(
             welcome.node,
             self,
-            lane_map=map_from_wire(welcome.lane_map),
+            lane_map=self._map_of(welcome.lane_map),
             seed=welcome.seed,
             options=welcome.options,
             period_ns=welcome.period_ns,
@@ -132,6 +134,12 @@ class Host:
             inbox.waits = self._waits[name]
         node.radio.inbox.refill = partial(self._refill, node)
         return node
+
+    def _map_of(self, data: object) -> LaneMap | RoadMap:
+        """Return a map. Nodes that are given the same one share it: its arrays cannot be written to."""
+        if self._map is None or self._map[0] is not data:
+            self._map = data, map_from_wire(data)
+        return self._map[1]
 
     def _refill(self, node: Node) -> None:
         """Deliver the packets that have arrived at a node whose program looks for them (lockstep)."""
