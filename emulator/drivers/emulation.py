@@ -578,14 +578,17 @@ class Emulation:
             unhandled.extend(part.unhandled)
             notes.extend(part.notes)
             self.orders.take(part.deviations)
-            self.backbone.send(time_ns, part.messages)
-            self.driving.take(time_ns, (action for action in part.actions if self.up[action.node]))
+            if part.messages:
+                self.backbone.send(time_ns, part.messages)
+            if part.actions:
+                self.driving.take(time_ns, (action for action in part.actions if self.up[action.node]))
         if frames:
             self._place(time_ns // self.world.period_ns)
         senders = [node for node in sorted(frames, key=self.number.__getitem__) if self.up[node]]
-        for node in self.orders.to_medium(time_ns, senders):
-            self.engine.transmit(time_ns, self.number[node], frames[node])
-        self.log_book.tell(time_ns, notes, unhandled)
+        in_order = self.orders.to_medium(time_ns, senders)
+        self.engine.transmit_all(time_ns, [(self.number[node], frames[node]) for node in in_order])
+        if notes or unhandled:
+            self.log_book.tell(time_ns, notes, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)
 

@@ -30,6 +30,7 @@ from vnet.node import Fix
 from vnet.radio import Packet
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
+from vnet.types import IntArray
 
 
 class LockstepProcess:
@@ -41,6 +42,8 @@ class LockstepProcess:
     def __init__(self, nodes: Sequence[str], order: int) -> None:
         self.id = nodes[0]
         self.nodes = tuple(nodes)
+        self.numbers: IntArray = np.zeros(0, np.int64)
+        """The numbers of its nodes among those of the run."""
         self.order = order
         self.plan = -1
         self.seq = 0
@@ -49,7 +52,8 @@ class LockstepProcess:
         self.waiting_radio: Sequence[str] = ()
         self.waiting_gnss: Sequence[str] = ()
         self.steps: Sequence[wire.Step] = ()
-        self.packets: dict[str, list[Packet]] = {node: [] for node in self.nodes}
+        self.packets: dict[str, list[Packet]] = {}
+        """What the nodes that have any are yet to be granted."""
         self.next_fix = dict.fromkeys(self.nodes, 0)
         self.paused: set[str] = set()
         self.affected: set[str] = set()
@@ -62,9 +66,10 @@ class LockstepProcess:
 
     def take_packets(self) -> dict[str, list[Packet]]:
         """Return the packets of nodes that run, and have any."""
-        due = {node: self.packets[node] for node in self.running if self.packets[node]}
-        self.packets.update({node: [] for node in due})
-        return due
+        packets, self.packets = self.packets, {}
+        for node in self.paused & packets.keys():
+            self.packets[node] = packets.pop(node)
+        return packets
 
     def take_clocks(self) -> list[wire.ClockError]:
         changed, self.clocks = self.clocks, []
@@ -282,19 +287,17 @@ class Lockstep:
         """Put what arrives up to `time_ns` where its receiver will find it."""
         for node in self._crowded:
             if process := self._processes.get(self._process_of[node]):
-                del process.packets[node][:-INBOX_LIMIT]
+                del process.packets.get(node, [])[:-INBOX_LIMIT]
         self._crowded.clear()
-        node_ids = self._emulation.world.node_ids
+        node_ids, process_of, processes = self._emulation.world.node_ids, self._process_of, self._processes
         for receiver, packets in self._emulation.engine.foresee(time_ns).by_receiver():
-            inbox = self._inbox(node_ids[receiver])
-            inbox += packets
-            if len(inbox) > INBOX_LIMIT:
-                self._crowded.add(node_ids[receiver])
+            node = node_ids[receiver]
+            waiting = processes[process_of[node]].packets.setdefault(node, packets)
+            if waiting is not packets:
+                waiting += packets
+            if len(waiting) > INBOX_LIMIT:
+                self._crowded.add(node)
         self._news.show(time_ns)
-
-    def _inbox(self, node: str) -> list[Packet]:
-        """Return the packets that a node has yet to be granted."""
-        return self._processes[self._process_of[node]].packets[node]
 
     def _wakes_in_window(self) -> dict[str, int]:
         """Return the first instant in the window of each process that has one, in the order of the processes."""
@@ -316,19 +319,19 @@ class Lockstep:
 
     def _add(self, process_id: str) -> LockstepProcess:
         process = LockstepProcess(self._groups[process_id], self._order[process_id])
+        process.numbers = np.array([self._emulation.number[node] for node in process.nodes])
         self._processes[process_id] = process
         return process
 
     def _remove(self, process_id: str) -> None:
         process = self._processes.pop(process_id, None)
-        for node in () if process is None else process.nodes:
-            self._listens[self._emulation.number[node]] = False
+        if process is not None:
+            self._listens[process.numbers] = False
         self._news.take(() if process is None else process.nodes)
 
     def _plan(self, process: LockstepProcess) -> None:
         """Note what a process waits for: an arrival, or a time that is known."""
-        for node in process.nodes:
-            self._listens[self._emulation.number[node]] = False
+        self._listens[process.numbers] = False
         for node in process.waiting_radio:
             self._listens[self._emulation.number[node]] = node not in process.paused
         process.plan = next(self._plans)
@@ -390,7 +393,7 @@ class Lockstep:
         process_id = self._process_of[node]
         self._news.take([node])
         if self._permanent:
-            self._processes[process_id].packets[node].clear()
+            self._processes[process_id].packets.pop(node, None)
             self._woken.add(process_id)  # for what a program does on its way out
         else:
             self._remove(process_id)
@@ -412,7 +415,7 @@ class Lockstep:
         process.granted_ns = time_ns
         fixes: list[tuple[str, Fix]] = []
         if min(process.next_fix.values()) <= self.now_ns // self._emulation.world.period_ns:
-            fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
+            fixes = self._take_fixes(process)
         packets, clocks = process.take_packets(), process.take_clocks()
         busy = self._emulation.busy.of(process.nodes, time_ns, self._end_ns)
         results, messages = self._news.take(process.running)
@@ -426,21 +429,23 @@ class Lockstep:
         process.seq += 1
         return grant
 
-    def _take_fixes(self, process: LockstepProcess, node: str) -> list[Fix]:
+    def _take_fixes(self, process: LockstepProcess) -> list[tuple[str, Fix]]:
         """Return the fixes that are due: a window ends with the period, so none is due within it."""
-        world = self._emulation.world
-        last = self.now_ns // world.period_ns
-        first = max(process.next_fix[node], last - INBOX_LIMIT + 1)
-        process.next_fix[node] = max(process.next_fix[node], last + 1)
-        return self._fixes(node, range(first, last + 1))
+        last = self.now_ns // self._emulation.world.period_ns
+        fixes: list[tuple[str, Fix]] = []
+        for node in process.running:
+            first = max(process.next_fix[node], last - INBOX_LIMIT + 1)
+            if first <= last:
+                process.next_fix[node] = last + 1
+                fixes += self._fixes(node, range(first, last + 1))
+        return fixes
 
-    def _fixes(self, node: str, periods: Iterable[int]) -> list[Fix]:
-        """Return the fixes of these periods; none if the node is down."""
+    def _fixes(self, node: str, periods: Iterable[int]) -> list[tuple[str, Fix]]:
+        """Return the fixes of these periods with their node; none if it is down."""
         if not self._emulation.up[node]:
             return []
-        number = self._emulation.number[node]
-        fixes = [self._emulation.gnss.fix(period, number) for period in periods]
-        return [fix for fix in fixes if fix is not None]
+        number, fix_of = self._emulation.number[node], self._emulation.gnss.fix
+        return [(node, fix) for period in periods if (fix := fix_of(period, number)) is not None]
 
     def _quiet_grant(self, process: LockstepProcess, grant: wire.Grant) -> wire.Grant:
         """Return the grant with the bound of quiet instants, and the fixes of the next period if it lies before."""
@@ -450,7 +455,7 @@ class Lockstep:
         if due_ns >= self._quiet_ns or not nodes:
             return replace(grant, quiet_ns=self._quiet_ns)
         process.next_fix.update(dict.fromkeys(nodes, period + 1))
-        fixes = [wire.WireFix.of(node, fix) for node in nodes for fix in self._fixes(node, [period])]
+        fixes = [wire.WireFix.of(*each) for node in nodes for each in self._fixes(node, [period])]
         return replace(grant, quiet_ns=self._quiet_ns, next_fixes=fixes, next_fixes_ns=due_ns)
 
 

@@ -70,6 +70,8 @@ NO_ARRIVAL_NS = np.iinfo(np.int64).max
 INITIAL_CAPACITY = 1 << 12
 """Receptions for which the table has room at first."""
 _ARRIVAL, _RECEIVER, _ROW, _FRAME = range(4)
+_OF_PACKET = attrgetter("frame.name", "frame.sent_ns", "frame.payload")
+"""Returns what all packets of a transmission share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,17 +132,19 @@ class Deliveries(Sequence[Delivery]):
 
     def _packets(self, table: IntArray) -> list[Packet]:
         """Return the packets of these columns (4, n) of the table, as they stand."""
-        arrivals_ns, receivers, _, numbers = table.tolist()
-        frames = {number: self._frames[number] for number in set(numbers)}
-        names = {number: sent.frame.name for number, sent in frames.items()}
-        sent_ns = {number: sent.frame.sent_ns for number, sent in frames.items()}
-        payloads: Iterable[bytes] = map({n: sent.frame.payload for n, sent in frames.items()}.__getitem__, numbers)
-        if any(sent.altered for sent in frames.values()):
-            receptions = zip(numbers, receivers, payloads, strict=True)
-            payloads = [frames[number].altered.get(receiver, sent) for number, receiver, sent in receptions]
+        if not table.shape[1]:
+            return []
+        first = int(table[_FRAME].min())
+        frames = [self._frames.get(number) for number in range(first, int(table[_FRAME].max()) + 1)]
+        index = table[_FRAME] - first
+        of_frames = np.array([_OF_PACKET(sent) if sent else (None,) * 3 for sent in frames], object)
+        names, sent_ns, payloads = of_frames[index].T.tolist()
+        if any(sent.altered for sent in frames if sent):
+            receptions = zip(index.tolist(), table[_RECEIVER].tolist(), payloads, strict=True)
+            altered = [sent.altered if sent else {} for sent in frames]
+            payloads = [altered[number].get(receiver, payload) for number, receiver, payload in receptions]
         powers = self._trace.powers(table[_ROW]) if self._trace.knows_power else ()
-        of_frames = map(names.__getitem__, numbers), map(sent_ns.__getitem__, numbers)
-        return [*map(Packet, *of_frames, arrivals_ns, payloads, *powers)]
+        return [*map(Packet, names, sent_ns, table[_ARRIVAL].tolist(), payloads, *powers)]
 
     def _order(self) -> NDArray[np.intp]:
         order: NDArray[np.intp] = self._table[_ARRIVAL].argsort(kind="stable")
@@ -400,37 +404,49 @@ class Engine:
 
         A payload alone is broadcast with the scenario's power and bit rate.
         """
-        if not self._topology.is_up(node):
-            return
+        self.transmit_all(time_ns, [(node, frames)])
+
+    def transmit_all(self, time_ns: int, by_sender: Iterable[tuple[int, Sequence[SentFrame | bytes]]]) -> None:
+        """Enqueue the frames of several nodes, each as `transmit` does: what they need is drawn at once."""
         self._run(time_ns)
         self._topology.advance(time_ns)
-        for asked in frames:
-            payload = asked if isinstance(asked, bytes) else asked.payload
-            chosen: _Chosen = {"bitrate_mbps": self._radio.bitrate_mbps}
-            if isinstance(asked, SentFrame) and _choices(asked) != NO_CHOICES:
-                allowed = self._chosen(time_ns, node, asked)
-                if allowed is None:
-                    continue
-                chosen = allowed
-            frame = Frame(
-                sender=node,
-                seq=self._next_seq[node],
-                sent_ns=time_ns,
-                payload=payload,
-                topology=self._topology.now,
-                effects=self._links.effects,
-                name=self._node_ids[node],
-                **chosen,
-            )
-            self._next_seq[node] += 1
-            for take in self.on_payload:
-                take(time_ns, node, frame.seq, payload)
-            if not self._senders.misbehave:
-                self._enqueue(frame)
-                continue
+        sent = [
+            frame
+            for node, frames in by_sender
+            if self._topology.is_up(node)
+            for asked in frames
+            if (frame := self._numbered(time_ns, node, asked)) is not None
+        ]
+        if not self._senders.misbehave:
+            self._enqueue(sent)
+            return
+        for frame in sent:
             self._settle()  # duplicates of frames sent before are numbered before the copies sent now
             for each in self._senders.frames(frame):
-                self._enqueue(each)
+                self._enqueue([each])
+
+    def _numbered(self, time_ns: int, node: int, asked: SentFrame | bytes) -> Frame | None:
+        """Return the next frame of a node; None for one to nobody, which is not sent."""
+        payload = asked if isinstance(asked, bytes) else asked.payload
+        chosen: _Chosen | None = {"bitrate_mbps": self._radio.bitrate_mbps}
+        if isinstance(asked, SentFrame) and _choices(asked) != NO_CHOICES:
+            chosen = self._chosen(time_ns, node, asked)
+        if chosen is None:
+            return None
+        frame = Frame(
+            sender=node,
+            seq=self._next_seq[node],
+            sent_ns=time_ns,
+            payload=payload,
+            topology=self._topology.now,
+            effects=self._links.effects,
+            name=self._node_ids[node],
+            **chosen,
+        )
+        self._next_seq[node] += 1
+        for take in self.on_payload:
+            take(time_ns, node, frame.seq, payload)
+        return frame
 
     def _chosen(self, time_ns: int, node: int, asked: SentFrame) -> _Chosen | None:
         """Return what a program has chosen for a frame; None for one to nobody, which is not sent."""
@@ -454,15 +470,19 @@ class Engine:
             "period_ms": allowed_period_ms(self._radio, asked),
         }
 
-    def _enqueue(self, frame: Frame) -> None:
-        sent = Transmission(frame, attempt=int(frame.to != BROADCAST))
-        if frame.dropped or frame.size_bytes > self._max_payload_bytes:  # the MAC never sees it
-            sent.sender_outcome = Outcome.fault if frame.dropped else Outcome.oversize
-            sent.end_ns = frame.sent_ns
-            self._mac.sent.append(sent)
-        else:
-            self._mac.enqueue(sent)
-        if frame.effects.copy:  # its duplicates are numbered before those of the next frame
+    def _enqueue(self, frames: Sequence[Frame]) -> None:
+        """Give frames to the MAC; it never sees those that are dropped, or too large."""
+        heard: list[Transmission] = []
+        for frame in frames:
+            sent = Transmission(frame, attempt=int(frame.to != BROADCAST))
+            if frame.dropped or len(frame.payload) > self._max_payload_bytes:
+                sent.sender_outcome = Outcome.fault if frame.dropped else Outcome.oversize
+                sent.end_ns = frame.sent_ns
+                self._mac.sent.append(sent)
+            else:
+                heard.append(sent)
+        self._mac.enqueue(heard)
+        if frames and frames[0].effects.copy:  # their duplicates are numbered before copies sent after them
             self._settle()
 
     # Frames that have been sent.

@@ -299,6 +299,12 @@ def rows(transmissions: Sequence[Transmission], name: str) -> NDArray[Any]:
     return filled
 
 
+def frame_keys(transmissions: Sequence[Transmission]) -> NDArray[np.uint64]:
+    """Return what names the draws of each frame (K, 3): its sender, its number, and which copy it is."""
+    keys = [(frame.sender, frame.seq, frame.draw) for sent in transmissions for frame in (sent.frame,)]
+    return np.array(keys, np.uint64).reshape(-1, 3)
+
+
 def _column(numbers: Iterable[int]) -> NDArray[np.int64]:
     return np.array([*numbers], np.int64)[:, None]
 

@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+import numpy as np
+
 from emulator.radio.dot11p import airtime_ns
-from emulator.radio.frames import Frame, Receptions, Transmission
+from emulator.radio.frames import Frame, Receptions, Transmission, frame_keys
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio
@@ -40,8 +42,8 @@ class Mac:
         sent, self.sent = self.sent, []
         return sent
 
-    def enqueue(self, sent: Transmission) -> None:
-        """Take a frame sent at `sent_ns`; set `sender_outcome` and `end_ns` before it is in `sent`."""
+    def enqueue(self, transmissions: Sequence[Transmission]) -> None:
+        """Take frames sent at one instant, in order; set `sender_outcome` and `end_ns` of one that is in `sent`."""
         raise NotImplementedError
 
     def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
@@ -123,10 +125,15 @@ class TransmitQueue(Mac):
             self._unthrottled[sender] = _Backlog(backlog.starts_ns.copy(), backlog.busy_until_ns)
         self._throttled_mbps = dict(bitrate_mbps)
 
-    def enqueue(self, sent: Transmission) -> None:
-        """Decide `queue_full`, or the time at which the frame's transmission ends."""
+    def enqueue(self, transmissions: Sequence[Transmission]) -> None:
+        """Decide `queue_full`, or the time at which each frame's transmission ends."""
+        some = np.ones(len(transmissions), np.intp)
+        draws = self._draws.uniform_at(frame_keys(transmissions), some, some - 1)
+        for sent, draw in zip(transmissions, draws.tolist(), strict=True):
+            self._take(sent, int(self._access_jitter_ns * draw))
+
+    def _take(self, sent: Transmission, jitter_ns: int) -> None:
         frame = sent.frame
-        jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.draw)[0])
         bitrate_mbps = frame.bitrate_mbps
         if (unthrottled := self._unthrottled.get(frame.sender)) is not None:
             self._put(frame, unthrottled, jitter_ns, bitrate_mbps)

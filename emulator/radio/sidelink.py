@@ -162,8 +162,12 @@ class Sidelink(Mac):
         """Throttle exactly these senders from now on: their frames reach the MAC at these bitrates."""
         self._throttle.set(bitrate_mbps)
 
-    def enqueue(self, sent: Transmission) -> None:
-        """Take a frame; it is ready after its access jitter, and not before the sender's earlier frames."""
+    def enqueue(self, transmissions: Sequence[Transmission]) -> None:
+        """Take frames; each is ready after its access jitter, and not before the sender's earlier frames."""
+        for sent in transmissions:
+            self._take(sent)
+
+    def _take(self, sent: Transmission) -> None:
         frame = sent.frame
         station = self._stations.get(frame.sender)
         if station is None:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.frames import Receptions, Transmission, rows
+from emulator.radio.frames import Receptions, Transmission, frame_keys, rows
 from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.reception import latency_draws
 from emulator.scenario.random_streams import Draws
@@ -30,8 +30,7 @@ def frame_draws(draws: Draws, transmissions: Sequence[Transmission], receptions:
             drawn[index] = draws.uniform(sent.frame.sender, sent.frame.seq, count, sent.frame.draw)
         return drawn
     pending = receptions.outcome == PENDING
-    keys = np.array([(s.frame.sender, s.frame.seq, s.frame.draw) for s in transmissions], np.uint64)
-    drawn[pending] = draws.uniform_at(keys, pending.sum(axis=1), receptions.receiver[pending])
+    drawn[pending] = draws.uniform_at(frame_keys(transmissions), pending.sum(axis=1), receptions.receiver[pending])
     return drawn
 
 

@@ -67,7 +67,7 @@ def sent(
 def queued(queue: TransmitQueue, seq: int, sender: int = 0, time_ns: int = 0, size: int = 100) -> int | None:
     """Enqueue a frame of 8 Mb/s; return the end of its transmission, or None if the queue was full."""
     frame = frame_of(sender, seq, time_ns, size)
-    queue.enqueue(frame)
+    queue.enqueue([frame])
     assert queue.sent.pop() is frame
     return frame.end_ns if frame.sender_outcome == Outcome.pending else None
 
