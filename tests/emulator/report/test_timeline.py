@@ -11,12 +11,12 @@ import pytest
 from emulator.api import simulate_into
 from emulator.pages.page import render
 from emulator.records.events import Event
+from emulator.records.recorded_run import Emissions
 from emulator.report.source import Source
 from emulator.report.timeline import (
     Bar,
     Mark,
     Timeline,
-    TraceFrames,
     bars_of,
     choose,
     first_view,
@@ -125,7 +125,7 @@ def test_a_large_run_is_thinned_and_says_so(run: Source) -> None:
 @pytest.mark.parametrize("most", [50, 999, 4000])
 def test_frames_near_failures_are_kept_whole_and_the_rest_is_spread(most: int) -> None:
     sent_us = np.arange(2000) * 1000
-    frames = TraceFrames(np.arange(2000), np.full(2000, 5), np.repeat(np.arange(2000), 5))
+    frames = Emissions(np.arange(2000), np.repeat(np.arange(2000), 5), np.full(2000, 5))
     marks = [Mark(1_500_000, 0, "failure", "crashed")]
     kept, (radius_us, step) = choose(frames, sent_us, points_of(marks, [Bar("loss-0", 100_000, 300_000, ())]), most)
     assert 0.7 * most - 50 <= 5 * kept.sum() <= most
@@ -138,7 +138,7 @@ def test_frames_near_failures_are_kept_whole_and_the_rest_is_spread(most: int) -
 
 
 def test_all_frames_of_one_instant_are_more_than_there_is_room_for() -> None:
-    frames = TraceFrames(np.arange(100), np.full(100, 10), np.repeat(np.arange(100), 10))
+    frames = Emissions(np.arange(100), np.repeat(np.arange(100), 10), np.full(100, 10))
     kept, _ = choose(frames, np.zeros(100, dtype=np.int64), {}, 200)
     assert 0 < 10 * kept.sum() <= 200
 
