@@ -53,7 +53,7 @@ class LockstepProcess:
         self.waiting_gnss: Sequence[str] = ()
         self.steps: Sequence[wire.Step] = ()
         self.packets: dict[str, list[Packet]] = {}
-        """What the nodes that have any are yet to be granted."""
+        """Packets that have yet to be granted, by node."""
         self.next_fix = dict.fromkeys(self.nodes, 0)
         self.paused: set[str] = set()
         self.affected: set[str] = set()
