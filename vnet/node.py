@@ -116,8 +116,9 @@ class Node:
         radio: the vehicle's radio.
         gnss: the vehicle's GNSS receiver.
         map: the lanes of the area; it does not say which lane the vehicle is on.
-        rng: a generator with a seed of this node and incarnation, independent of the world's seed. It is the only
-            source of randomness that is reproducible.
+        seed: the seed of this node and incarnation, independent of the world's.
+        rng: a generator with this seed. What a program draws without a seed from `random`, `numpy.random`,
+            `secrets` or `uuid.uuid4` has it, too.
         options: the scenario's `[program.options]`.
         period_ns: time between two fixes in nanoseconds.
         control_ns: time between two control instants in nanoseconds; 0 where programs do not drive.
@@ -150,6 +151,7 @@ class Node:
         self.radio = Radio(node_id, transport, max_payload, abilities)
         self.gnss = GnssReceiver()
         self.map = lane_map
+        self.seed = seed
         self.rng = np.random.default_rng(seed)
         self.options = options
         self.period_ns = period_ns

@@ -1,4 +1,4 @@
-"""Tasks and futures of vnet's loops, and what stands in for parts of asyncio while programs run.
+"""Tasks and futures of vnet's loops, and what stands in for parts of asyncio while programs run (`stand_ins`).
 
 asyncio's own tasks and futures hash by their address, which decides the order of a set of them: the children of a
 task group, what `asyncio.wait` returns. Those of vnet's loops hash by a number of their node's. It depends on what
@@ -18,15 +18,11 @@ import asyncio
 import concurrent.futures
 import contextvars
 import inspect
-import threading
 from abc import ABCMeta
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextvars import Context
 from itertools import count
-from types import FunctionType
 from typing import TYPE_CHECKING, Any, cast
-
-from vnet.runtime import asyncio_internals
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -148,46 +144,11 @@ def wrap_future(future: Any, *, loop: asyncio.AbstractEventLoop | None = None) -
     return _wrap_future(future, loop=loop)
 
 
-_STAND_INS: dict[str, tuple[Any, Any]] = {
-    "Future": (asyncio.Future, Future),
-    "Task": (asyncio.Task, Task),
-    "all_tasks": (_all_tasks, all_tasks),
-    "as_completed": (_as_completed, as_completed),
-    "wrap_future": (_wrap_future, wrap_future),
-}
-_lock = threading.Lock()
-_users = 0
-
-
-def attach() -> None:
-    """Let these stand in for asyncio's own names, in all threads; each call is followed by one of `detach`."""
-    global _users
-    with _lock:
-        _users += 1
-        _set_names(1)
-        asyncio_internals.hash_gatherings_by(number_of)
-
-
-def detach() -> None:
-    """Give asyncio its own names back when no programs run any more."""
-    global _users
-    with _lock:
-        _users -= 1
-        if _users == 0:
-            _set_names(0)
-
-
-def _set_names(which: int) -> None:
-    for name, both in _STAND_INS.items():
-        for module in (asyncio, asyncio.futures, asyncio.tasks):
-            if vars(module).get(name) in both:
-                setattr(module, name, both[which])
-
-
-def use_stand_ins(function: Callable[..., Any]) -> None:
-    """Let the module of a program use these where it has imported asyncio's own by `from asyncio import`."""
-    names = function.__globals__ if isinstance(function, FunctionType) else {}
-    for name, value in list(names.items()):
-        for own, other in _STAND_INS.values():
-            if value is own:
-                names[name] = other
+STAND_INS: list[tuple[str, Any, Any]] = [
+    ("Future", asyncio.Future, Future),
+    ("Task", asyncio.Task, Task),
+    ("all_tasks", _all_tasks, all_tasks),
+    ("as_completed", _as_completed, as_completed),
+    ("wrap_future", _wrap_future, wrap_future),
+]
+"""Name, its own value, and the one while programs run (`stand_ins`)."""

@@ -1,0 +1,137 @@
+"""Chance without a seed: each node's own, and the same in any division into processes."""
+
+import asyncio
+import os
+import random
+import secrets
+import uuid
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from random import gauss
+from random import random as drawn_by_name
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.random import normal
+
+import emulator
+from vnet import Node
+from vnet.runtime import stand_ins
+from vnet.runtime.own_asyncio import current_node
+
+DRAWS: dict[str, Callable[[], Any]] = {
+    "random": lambda: random.random(),
+    "choice": lambda: random.choice(range(10**9)),
+    "by name": lambda: drawn_by_name(),
+    "gauss": lambda: gauss(0, 1),
+    "Random()": lambda: random.Random().random(),
+    "SystemRandom": lambda: random.SystemRandom().random(),
+    "urandom": lambda: os.urandom(8).hex(),
+    "secrets": lambda: secrets.token_hex(),
+    "uuid4": lambda: uuid.uuid4().int,
+    "normal": lambda: np.random.normal(),  # noqa: NPY002  # the shared generator is what is asked about
+    "by name of numpy": lambda: normal(),  # noqa: NPY002
+    "sample": lambda: np.random.sample(),  # noqa: NPY002
+    "default_rng": lambda: np.random.default_rng().integers(10**9),
+    "RandomState": lambda: np.random.RandomState().random_sample(),
+}
+
+
+async def draws(node: Node) -> None:
+    """Log one draw of each sort in each period, and one of a thread."""
+    while True:
+        await asyncio.sleep(0.1)
+        job = await asyncio.to_thread(random.random)
+        node.log(" ".join(map(repr, [*(draw() for draw in DRAWS.values()), job, node.rng.random()])))
+
+
+def drawn_in(folder: Path, **options: Any) -> list[tuple[str | None, str]]:
+    scenario = {"run": {"duration_s": 0.5}, "network": {"vehicles": 3}, "program": {"entry": f"{__name__}:draws"}}
+    run = emulator.simulate(scenario, out=folder, **options)
+    return [(event.node, event.text) for event in run.events if event.kind == "log"]
+
+
+@pytest.mark.slow
+def test_what_is_drawn_without_a_seed_is_that_of_the_run_in_any_division(tmp_path: Path) -> None:
+    alone, divided = drawn_in(tmp_path / "one"), drawn_in(tmp_path / "two", processes=2)
+    assert alone == divided
+    said = [text.split()[1:] for _, text in alone]  # the first word is the vehicle
+    assert len(said) >= 9
+    assert all(len({*column}) == len(said) for column in zip(*said, strict=True)), "nothing is drawn twice"
+
+
+class Fake:
+    """A node as far as chance asks for it."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+
+def as_node(node: Any, draw: Callable[[], Any]) -> Any:
+    """Draw on behalf of a node."""
+    before = current_node.set(node)
+    try:
+        return draw()
+    finally:
+        current_node.reset(before)
+
+
+@pytest.fixture(autouse=True)
+def attached() -> Any:
+    """Names as they are while programs run."""
+    stand_ins.attach()
+    stand_ins.use_stand_ins(draws)
+    yield
+    stand_ins.detach()
+
+
+@given(st.lists(st.tuples(st.sampled_from([1, 2]), st.sampled_from(sorted(DRAWS))), max_size=30))
+def test_a_node_draws_the_same_whatever_others_draw_between(drawn: list[tuple[int, str]]) -> None:
+    def all_of(*seeds: int) -> list[Any]:
+        nodes = {seed: Fake(seed) for seed in seeds}
+        return [repr(as_node(nodes[seed], DRAWS[name])) for seed, name in drawn if seed in nodes]
+
+    both, alone = all_of(1, 2), iter(all_of(1))
+    assert all(both[n] == next(alone) for n, (seed, _) in enumerate(drawn) if seed == 1)
+
+
+def test_a_seed_of_a_program_is_its_nodes_alone() -> None:
+    first, second = Fake(1), Fake(2)
+    for seed, draw in (random.seed, random.random), (np.random.seed, np.random.random_sample):
+        as_node(first, partial(seed, 7))
+        unseeded = as_node(second, draw)
+        own = as_node(first, draw)
+        seed(7)
+        assert draw() == own != unseeded
+
+
+@pytest.mark.slow
+def test_a_child_process_draws_other_numbers() -> None:
+    def draw() -> tuple[float, str]:
+        return random.random(), secrets.token_hex()
+
+    node = Fake(1)
+    as_node(node, draw)
+
+    def child() -> str:
+        ours, theirs = os.pipe()
+        if os.fork() == 0:
+            os.write(theirs, repr(draw()).encode())
+            os._exit(0)
+        os.wait()
+        return os.read(ours, 1000).decode()
+
+    assert len({as_node(node, child), as_node(node, child), repr(as_node(node, draw))}) == 3
+
+
+def test_names_are_the_modules_own_when_no_program_runs() -> None:
+    stand_ins.detach()
+    if stand_ins._users == 0:  # runs of other tests may not have been closed
+        assert random.random.__self__ is random._inst  # type: ignore[attr-defined]
+        assert os.urandom.__module__ == "posix"
+    stand_ins.attach()
+    assert not hasattr(random.random, "__self__")
