@@ -1,7 +1,7 @@
-"""Modules of an unmodified program, loaded for its vehicle alone, with time, threads and chance of that vehicle.
+"""Modules of an unmodified program, loaded for its vehicle alone, with time and threads of that vehicle.
 
 What is pure Python and outside the standard library (the script, its neighbours, packages) is loaded once a
-program, and so are the modules of the standard library that block or draw: they import what stands here for `time`,
+program, and so are the modules of the standard library that block: they import what stands here for `time`,
 `_thread`, `os` and others. All else is shared with the rest of the process, packages with compiled parts among it.
 """
 
@@ -30,7 +30,6 @@ from typing import Any, NoReturn
 
 from vnet.errors import ProgramError, shown
 from vnet.gateway import client_config, session_variables
-from vnet.gateway.emulated.chance import numpy_random, prepare_random, prepare_uuid
 from vnet.gateway.emulated.facade import Facade
 from vnet.gateway.emulated.loops import prepare_asyncio
 from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
@@ -59,14 +58,12 @@ _OWN_COPIES = (
     "logging",
     "optparse",
     "queue",
-    "random",
     "sched",
-    "secrets",
     "tempfile",
     "threading",
     "uuid",
 )
-"""Modules and packages of the standard library of which each program has its own: they block, draw, keep such
+"""Modules and packages of the standard library of which each program has its own: they block, keep such
 objects, or read the words of the command."""
 _ABSENT = ("_asyncio", "_queue")
 """Accelerators whose Python version is taken, as they block in C."""
@@ -110,7 +107,6 @@ class ProgramModules:
         self.environ = {**os.environ, **own}
         if "ros2" in node.options:
             self.environ["ROS_DOMAIN_ID"] = str(node.options["ros2"]["domain"])
-        self._random = random.Random(int.from_bytes(node.rng.bytes(16)))
         self.modules = OwnModules()
         self._builtins = {**vars(builtins), "__import__": self._import, "input": _no_input}
         self._facades: dict[str, Callable[[], ModuleType]] = {
@@ -119,7 +115,6 @@ class ProgramModules:
             "datetime": self._datetime,
             "importlib": lambda: Facade(importlib, import_module=self._import_module, __import__=self._import),
             "os": self._os,
-            "numpy": self._numpy,
             "select": lambda: Facade(select, select=_select),
             "signal": lambda: Facade(signal, **self.process.signal_functions()),
             "subprocess": lambda: Facade(subprocess, **subprocess_functions(self.environ)),
@@ -130,9 +125,8 @@ class ProgramModules:
             "asyncio": lambda module: prepare_asyncio(module, node, self.threads, self.process.set_handler),
             "concurrent.futures": self._prepare_futures,
             "queue": self._prepare_queue,
-            "random": lambda module: prepare_random(module, self._random),
             "threading": self._prepare_threading,
-            "uuid": lambda module: prepare_uuid(module, self._random),
+            "uuid": _prepare_uuid,
         }
 
     # Running.
@@ -315,7 +309,6 @@ class ProgramModules:
             os,
             environ=self.environ,
             getenv=self.environ.get,
-            urandom=self._random.randbytes,
             cpu_count=lambda: CORES,
             process_cpu_count=lambda: CORES,
             register_at_fork=lambda **hooks: None,
@@ -414,12 +407,6 @@ class ProgramModules:
         vars(module).update(register=register, unregister=unregister)
         return module
 
-    def _numpy(self) -> ModuleType:
-        import numpy
-
-        random_module = self.modules["numpy.random"] = numpy_random(self._random)
-        return Facade(numpy, random=random_module)
-
     def _prepare_threading(self, module: Any) -> None:
         module.local = self.load("_threading_local").local
         module.Event.is_set = module.Event.isSet = _looking(module.Event.is_set, nothing=False)
@@ -460,6 +447,12 @@ def _present_module(name: str) -> ModuleType | None:
 
 def _is_own_copy(name: str) -> bool:
     return name.partition(".")[0] in _OWN_COPIES
+
+
+def _prepare_uuid(module: Any) -> None:
+    """Have ids of version 1 drawn, where Python asks for the machine's address and the system."""
+    module._node = random.getrandbits(48) | 1 << 40
+    module._generate_time_safe = module._UuidCreate = None
 
 
 def _select(readers: Any, writers: Any, others: Any, timeout_s: float | None = None) -> Any:
