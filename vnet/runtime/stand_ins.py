@@ -1,4 +1,4 @@
-"""What stands in for names of Python and numpy while programs run: of asyncio, and of what draws without a seed.
+"""Stand-ins for names of Python and numpy while programs run: of asyncio, and of what draws without a seed.
 
 **Chance.** The functions of `random` and `numpy.random` that share a generator, and whatever asks the system for
 random bytes (`os.urandom`, `secrets`, `uuid.uuid4`, generators without a seed), draw from generators of the node on
