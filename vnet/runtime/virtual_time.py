@@ -235,7 +235,6 @@ class VirtualTimeLoop(SkewedLoop):
         self._collections_ns: dict[int, int] = {}
         """The next collection of each generation; one that is not in it is not due."""
         self._generators: dict[int, Node] = {}
-        self._job_runners: WeakKeyDictionary[Node, Callable[..., asyncio.Future[Any]]] = WeakKeyDictionary()
         self.before_job: Callable[[], None] = lambda: None
         super().__init__(_YieldingSelector(self._wait))
         self._queue = ReadyQueue(())
@@ -466,8 +465,6 @@ class VirtualTimeLoop(SkewedLoop):
         self, executor: Executor | None, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
         """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
-        if self._job_runners and (node := present_node()) in self._job_runners and node is not None:
-            return self._job_runners[node](executor, func, *args)
         self.before_job()
         if executor is None:
             executor, context = asyncio_internals.default_executor(self, "vnet"), Context()  # as above
@@ -484,12 +481,6 @@ class VirtualTimeLoop(SkewedLoop):
             self._ordered.add_job(node, name, job, partial(_copy_result, job, outer))
         job.add_done_callback(lambda _: asyncio_internals.wake(self))
         return outer
-
-    def run_jobs_by(self, run: Callable[..., asyncio.Future[Any]]) -> None:
-        """Have jobs of the program that asks run by `run(executor, function, *arguments)`, as its threads are."""
-        node = present_node()
-        assert node is not None
-        self._job_runners[node] = run
 
     def _wait_for_jobs(self, poll: Callable[[float | None], list[Any]]) -> list[Any]:
         pending = next((outer for job, outer in self._jobs if not job.done()), None)
