@@ -142,6 +142,7 @@ class RealTime:
         if message.final:
             self._awaited.discard(process_id)
         if now_ns < self._emulation.duration_ns:
+            self._change_by(now_ns)
             self._emulation.take(now_ns, [message.traffic])
         else:
             self._emulation.take_final(self._emulation.duration_ns, [message.traffic])
@@ -149,6 +150,7 @@ class RealTime:
     def take_messages(self, now_ns: int, messages: Sequence[SentMessage]) -> None:
         """Take messages of the backbone that have come later than the frames that refer to them."""
         if now_ns < self._emulation.duration_ns:
+            self._change_by(now_ns)
             self._emulation.take(now_ns, [wire.Traffic(messages=messages)])
 
     @property
@@ -186,9 +188,7 @@ class RealTime:
     def due(self, now_ns: int) -> dict[str, wire.Batch]:
         """Return what has become due by `now_ns`, by process."""
         self._emulation.drive_to(now_ns)
-        while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
-            self._collect(change_ns - 1)
-            self._act(change_ns)
+        self._change_by(now_ns)
         self._collect(now_ns)
         ready = self._present - self._paused
         informed = {self._process_of[node] for node, _ in self._news.firsts()}
@@ -209,6 +209,12 @@ class RealTime:
         """Return what is to be done to processes by now."""
         actions, self._actions = self._actions, []
         return actions
+
+    def _change_by(self, now_ns: int) -> None:
+        """Begin and end the faults that are due: messages that have waited must meet those of their time."""
+        while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
+            self._collect(change_ns - 1)
+            self._act(change_ns)
 
     def _act(self, time_ns: int) -> None:
         actions = self._emulation.act(time_ns, starts_at_once=False)

@@ -98,6 +98,17 @@ def test_a_process_is_told_of_frames_that_were_lost_until_it_has_taken_that() ->
     assert "v01" not in realtime.due(22 * MS)
 
 
+def test_a_frame_meets_the_faults_of_its_time_on_a_machine_that_is_late() -> None:
+    """While messages wait to be taken, `due` is not called."""
+    cut = {"kind": "partition", "at_s": 0.5, "duration_s": 0.5, "groups": [["v02"], ["v01", "v03", "v04"]]}
+    realtime, emulation = started(cut)
+    for seq, time_ns in enumerate((450 * MS, 700 * MS, 1200 * MS)):
+        traffic = wire.Traffic([SentFrame("v01", b"x")])
+        realtime.receive(time_ns, "v01", wire.Frames(b"n", seq, 1, [], traffic))
+    realtime.due(1300 * MS)
+    assert emulation.engine.counts[Outcome.fault] == 1, "of v02, and of the second frame alone"
+
+
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:
     return [(c.offset_ns, c.rate) for c in batches[node].clocks] if node in batches else []
 
