@@ -385,7 +385,7 @@ class Gateways:
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:
         if self._ros2 is not None and self._is_there(vehicle):
-            vehicle.gateway.show_clock(self._now_ns())
+            vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end
             self._loop.call_later(1 / self._ros2.clock_hz, self._tell_clock, vehicle)
 
     def _acknowledge(self, vehicle: _Vehicle) -> None:
