@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _SEED_BYTES = 16
 _system_bytes, _seed = os.urandom, random.Random.seed
+_numpy_state = np.random.mtrand._rand
 
 
 class Chance:
@@ -84,15 +85,26 @@ def _drawing(own: Callable[..., Any], name: str, kind: str) -> Callable[..., Any
     return draw
 
 
+class _SharedState:
+    """The generator of `numpy.random`, which scipy draws from without its functions: that of the present node."""
+
+    __class__ = np.random.RandomState  # type: ignore[assignment]
+
+    def __getattr__(self, name: str) -> Any:
+        node = present_node()
+        return getattr(_numpy_state if node is None else chance_of(node).numpy, name)
+
+
 def _of_chance() -> list[tuple[Any, str, Any, Any]]:
     found: list[tuple[Any, str, Any, Any]] = [
         (os, "urandom", _system_bytes, _random_bytes),
         (random, "_urandom", _system_bytes, _random_bytes),  # asked by `secrets`, and by numpy for its seeds
         (random.Random, "seed", _seed, _seeded),
+        (np.random.mtrand, "_rand", _numpy_state, _SharedState()),
     ]
     renamed = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
     for module, kind in (random, "python"), (np.random, "numpy"):
-        shared = random._inst if module is random else np.random.mtrand._rand
+        shared = random._inst if module is random else _numpy_state
         for name, own in vars(module).items():
             if getattr(own, "__self__", None) is shared:
                 found.append((module, name, own, _drawing(own, name, kind)))

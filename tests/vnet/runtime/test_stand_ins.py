@@ -36,6 +36,7 @@ DRAWS: dict[str, Callable[[], Any]] = {
     "normal": lambda: np.random.normal(),  # noqa: NPY002  # the shared generator is what is asked about
     "by name of numpy": lambda: normal(),  # noqa: NPY002
     "sample": lambda: np.random.sample(),  # noqa: NPY002
+    "scipy": lambda: np.random.mtrand._rand.standard_normal(),  # which scipy asks for at each draw
     "default_rng": lambda: np.random.default_rng().integers(10**9),
     "RandomState": lambda: np.random.RandomState().random_sample(),
 }
