@@ -94,13 +94,20 @@ class _SharedState:
         node = present_node()
         return getattr(_numpy_state if node is None else chance_of(node).numpy, name)
 
+    def __reduce__(self) -> str:
+        """Be the same object in a copy, and in a pickle."""
+        return "_shared_state"
+
+
+_shared_state = _SharedState()
+
 
 def _of_chance() -> list[tuple[Any, str, Any, Any]]:
     found: list[tuple[Any, str, Any, Any]] = [
         (os, "urandom", _system_bytes, _random_bytes),
         (random, "_urandom", _system_bytes, _random_bytes),  # asked by `secrets`, and by numpy for its seeds
         (random.Random, "seed", _seed, _seeded),
-        (np.random.mtrand, "_rand", _numpy_state, _SharedState()),
+        (np.random.mtrand, "_rand", _numpy_state, _shared_state),
     ]
     renamed = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
     for module, kind in (random, "python"), (np.random, "numpy"):

@@ -1,7 +1,9 @@
 """Chance without a seed: each node's own, and the same in any division into processes."""
 
 import asyncio
+import copy
 import os
+import pickle
 import random
 import secrets
 import uuid
@@ -108,6 +110,12 @@ def test_a_seed_of_a_program_is_its_nodes_alone() -> None:
         own = as_node(first, draw)
         seed(7)
         assert draw() == own != unseeded
+
+
+def test_what_scipy_keeps_of_numpy_can_be_copied_and_pickled() -> None:
+    kept = np.random.mtrand._rand
+    assert copy.deepcopy(kept) is pickle.loads(pickle.dumps(kept)) is kept
+    assert isinstance(kept, np.random.RandomState)
 
 
 @pytest.mark.slow
