@@ -187,7 +187,6 @@ class RealTime:
 
     def due(self, now_ns: int) -> dict[str, wire.Batch]:
         """Return what has become due by `now_ns`, by process."""
-        self._emulation.drive_to(now_ns)
         self._change_by(now_ns)
         self._collect(now_ns)
         ready = self._present - self._paused
@@ -212,6 +211,7 @@ class RealTime:
 
     def _change_by(self, now_ns: int) -> None:
         """Begin and end the faults that are due: messages that have waited must meet those of their time."""
+        self._emulation.drive_to(now_ns)
         while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
             self._collect(change_ns - 1)
             self._act(change_ns)

@@ -22,8 +22,9 @@ def fault(kind: str, at_s: float, duration_s: float, **more: Any) -> dict[str, A
     return {"kind": kind, "at_s": at_s, "duration_s": duration_s, "nodes": {"ids": ["v02"]}, **more}
 
 
-def started(*faults: dict[str, Any]) -> tuple[RealTime, Emulation]:
-    emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run={"pacing": "realtime"}))
+def started(*faults: dict[str, Any], **network: Any) -> tuple[RealTime, Emulation]:
+    plan = scenario_of(faults, "agents.beacon:main", run={"pacing": "realtime"}, network=network)
+    emulation = emulation_of(plan)
     realtime = RealTime(emulation, [[node] for node in IDS])
     realtime.start(0)
     return realtime, emulation
@@ -98,11 +99,12 @@ def test_a_process_is_told_of_frames_that_were_lost_until_it_has_taken_that() ->
     assert "v01" not in realtime.due(22 * MS)
 
 
-def test_a_frame_meets_the_faults_of_its_time_on_a_machine_that_is_late() -> None:
+@pytest.mark.parametrize("network", [{}, {"kind": "driven"}], ids=["given", "driven"])
+def test_a_frame_meets_the_faults_of_its_time_on_a_machine_that_is_late(network: dict[str, Any]) -> None:
     """While messages wait to be taken, `due` is not called."""
     cut = {"kind": "partition", "at_s": 0.5, "duration_s": 0.5, "groups": [["v02"], ["v01", "v03", "v04"]]}
-    realtime, emulation = started(cut)
-    for seq, time_ns in enumerate((450 * MS, 700 * MS, 1200 * MS)):
+    realtime, emulation = started(cut, **network)
+    for seq, time_ns in enumerate((10 * MS, 700 * MS, 1200 * MS)):
         traffic = wire.Traffic([SentFrame("v01", b"x")])
         realtime.receive(time_ns, "v01", wire.Frames(b"n", seq, 1, [], traffic))
     realtime.due(1300 * MS)
