@@ -15,7 +15,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from functools import wraps
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -30,12 +30,14 @@ if TYPE_CHECKING:
 _SEED_BYTES = 16
 _system_bytes, _seed = os.urandom, random.Random.seed
 _numpy_state = np.random.mtrand._rand
+_OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
+"""Functions of `numpy.random` that are no methods of its generator, and the methods that they call."""
 
 
 class Chance:
     """Generators in place of the system's random bytes, and of the shared ones of `random` and `numpy.random`."""
 
-    def __init__(self, seed: int | str) -> None:
+    def __init__(self, seed: str) -> None:
         self.system = random.Random(f"system {seed}")
         self.python = random.Random(f"python {seed}")
         words = random.Random(f"numpy {seed}").getrandbits(128)
@@ -45,18 +47,24 @@ class Chance:
 _chances: WeakKeyDictionary[Node, Chance] = WeakKeyDictionary()
 
 
+_child = ""
+"""What tells the generators of a program's child process from its own."""
+
+
 def chance_of(node: Node) -> Chance:
     """Return a node's generators."""
     chance = _chances.get(node)
     if chance is None:
-        chance = _chances[node] = Chance(node.seed)
+        chance = _chances[node] = Chance(f"{node.seed}{_child}")
     return chance
 
 
 def _begin_child() -> None:
-    """Let a child process draw other numbers than its program, as without vnet."""
-    for chance in _chances.values():
-        chance.__init__(_system_bytes(_SEED_BYTES).hex())  # type: ignore[misc]
+    """Let a process that a program has forked draw other numbers than the program, as without vnet."""
+    global _child
+    if present_node() is not None:
+        _child = _system_bytes(_SEED_BYTES).hex()
+        _chances.clear()
 
 
 os.register_at_fork(after_in_child=_begin_child)
@@ -73,15 +81,17 @@ def _seeded(generator: random.Random, a: Any = None, version: int = 2) -> None:
     _seed(generator, a, version)
 
 
-def _drawing(own: Callable[..., Any], name: str, kind: str) -> Callable[..., Any]:
-    """Return a function that draws by a method of a node's generator of this kind, or as ever."""
+def _drawing(own: Callable[..., Any], module: ModuleType, name: str, kind: str) -> Callable[..., Any]:
+    """Return a function of a module that draws by its node's generator of this kind, or as ever."""
+    method_name = _OTHER_NAMES.get(name, name)
 
     @wraps(own)
     def draw(*arguments: Any, **options: Any) -> Any:
         node = present_node()
-        method = own if node is None else getattr(getattr(chance_of(node), kind), name)
+        method = own if node is None else getattr(getattr(chance_of(node), kind), method_name)
         return method(*arguments, **options)
 
+    draw.__module__, draw.__qualname__ = module.__name__, own.__name__  # for pickle
     return draw
 
 
@@ -109,14 +119,11 @@ def _of_chance() -> list[tuple[Any, str, Any, Any]]:
         (random.Random, "seed", _seed, _seeded),
         (np.random.mtrand, "_rand", _numpy_state, _shared_state),
     ]
-    renamed = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
     for module, kind in (random, "python"), (np.random, "numpy"):
         shared = random._inst if module is random else _numpy_state
         for name, own in vars(module).items():
-            if getattr(own, "__self__", None) is shared:
-                found.append((module, name, own, _drawing(own, name, kind)))
-            elif module is np.random and name in renamed:
-                found.append((module, name, own, _drawing(own, renamed[name], kind)))
+            if getattr(own, "__self__", None) is shared or (kind == "numpy" and name in _OTHER_NAMES):
+                found.append((module, name, own, _drawing(own, module, name, kind)))
     return found
 
 

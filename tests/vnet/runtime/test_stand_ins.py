@@ -112,6 +112,11 @@ def test_a_seed_of_a_program_is_its_nodes_alone() -> None:
         assert draw() == own != unseeded
 
 
+def test_functions_can_be_pickled() -> None:
+    for function in (random.random, random.choice, np.random.normal, np.random.ranf, np.random.seed):
+        assert pickle.loads(pickle.dumps(function)) is function
+
+
 def test_what_scipy_keeps_of_numpy_can_be_copied_and_pickled() -> None:
     kept = np.random.mtrand._rand
     assert copy.deepcopy(kept) is pickle.loads(pickle.dumps(kept)) is kept
@@ -123,9 +128,6 @@ def test_a_child_process_draws_other_numbers() -> None:
     def draw() -> tuple[float, str]:
         return random.random(), secrets.token_hex()
 
-    node = Fake(1)
-    as_node(node, draw)
-
     def child() -> str:
         ours, theirs = os.pipe()
         if os.fork() == 0:
@@ -134,7 +136,10 @@ def test_a_child_process_draws_other_numbers() -> None:
         os.wait()
         return os.read(ours, 1000).decode()
 
-    assert len({as_node(node, child), as_node(node, child), repr(as_node(node, draw))}) == 3
+    node = Fake(1)
+    told = [as_node(node, child), as_node(node, child), repr(as_node(node, draw)), as_node(node, child)]
+    assert len({*told}) == 4
+    assert told[2] == repr(as_node(Fake(1), draw)), "what a child draws changes nothing"
 
 
 def test_names_are_the_modules_own_when_no_program_runs() -> None:
