@@ -134,15 +134,13 @@ class Deliveries(Sequence[Delivery]):
         """Return the packets of these columns (4, n) of the table, as they stand."""
         if not table.shape[1]:
             return []
-        first = int(table[_FRAME].min())
-        frames = [self._frames.get(number) for number in range(first, int(table[_FRAME].max()) + 1)]
-        index = table[_FRAME] - first
-        of_frames = np.array([_OF_PACKET(sent) if sent else (None,) * 3 for sent in frames], object)
+        numbers, index = np.unique(table[_FRAME], return_inverse=True)
+        frames = [self._frames[number] for number in numbers.tolist()]
+        of_frames = np.array([_OF_PACKET(sent) for sent in frames], object)
         names, sent_ns, payloads = of_frames[index].T.tolist()
-        if any(sent.altered for sent in frames if sent):
+        if any(sent.altered for sent in frames):
             receptions = zip(index.tolist(), table[_RECEIVER].tolist(), payloads, strict=True)
-            altered = [sent.altered if sent else {} for sent in frames]
-            payloads = [altered[number].get(receiver, payload) for number, receiver, payload in receptions]
+            payloads = [frames[number].altered.get(receiver, payload) for number, receiver, payload in receptions]
         powers = self._trace.powers(table[_ROW]) if self._trace.knows_power else ()
         return [*map(Packet, names, sent_ns, table[_ARRIVAL].tolist(), payloads, *powers)]
 

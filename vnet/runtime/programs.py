@@ -115,7 +115,9 @@ def leaves(error: BaseException) -> list[BaseException]:
 
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
     """The program of each node that is welcome. Raises ProgramError."""
-    return {welcome.node: load_program(welcome.entry) for welcome in welcomes}
+    entries = {welcome.node: welcome.entry for welcome in welcomes}
+    programs = {entry: load_program(entry) for entry in dict.fromkeys(entries.values())}
+    return {node: programs[entry] for node, entry in entries.items()}
 
 
 _added: list[str] = []

@@ -48,7 +48,7 @@ _chances: WeakKeyDictionary[Node, Chance] = WeakKeyDictionary()
 
 
 _child = ""
-"""What tells the generators of a program's child process from its own."""
+"""Part of all seeds in a process that a program has forked; else empty."""
 
 
 def chance_of(node: Node) -> Chance:
