@@ -117,7 +117,7 @@ class Node:
         gnss: the vehicle's GNSS receiver.
         map: the lanes of the area; it does not say which lane the vehicle is on.
         seed: the seed of this node and incarnation, independent of the world's.
-        rng: a generator with this seed. What a program draws without a seed from `random`, `numpy.random`,
+        rng: a generator with this seed. What tasks draw without a seed from `random`, `numpy.random`,
             `secrets` or `uuid.uuid4` has it, too.
         options: the scenario's `[program.options]`.
         period_ns: time between two fixes in nanoseconds.

@@ -186,7 +186,7 @@ def captured(command: Any, arguments: list[str]) -> tuple[str, int]:
 
 def _process(words: Sequence[str]) -> tuple[str, int]:
     started = process(words)
-    if started[1].startswith("docs/examples/"):
+    if len(started) > 1 and started[1].startswith("docs/examples/"):
         started = [*MODULE, started[1].removesuffix(".py").replace("/", "."), *started[2:]]
     elif started[1:3] == ["-m", "pytest"]:
         started = [*MODULE, *started[2:]]

@@ -1,9 +1,8 @@
 """Stand-ins for names of Python and numpy while programs run: of asyncio, and of what draws without a seed.
 
-**Chance.** The functions of `random` and `numpy.random` that share a generator, and whatever asks the system for
-random bytes (`os.urandom`, `secrets`, `uuid.uuid4`, generators without a seed), draw from generators of the node on
-whose behalf the code runs. They have the seed of `node.rng`, and are other streams. All other code of the process
-draws as ever.
+**Chance.** The functions of `random` and `numpy.random` that share a generator, and what asks `os.urandom` for
+bytes (`secrets`, `uuid.uuid4`, generators without a seed), draw from generators of the node whose code runs on a
+loop. They have the seed of `node.rng`, and are other streams. All other code draws as ever.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "see
 class Chance:
     """Generators in place of the system's random bytes, and of the shared ones of `random` and `numpy.random`."""
 
-    def __init__(self, seed: str) -> None:
+    def __init__(self, seed: int) -> None:
         self.system = random.Random(f"system {seed}")
         self.python = random.Random(f"python {seed}")
         words = random.Random(f"numpy {seed}").getrandbits(128)
@@ -47,36 +46,26 @@ class Chance:
 _chances: WeakKeyDictionary[Node, Chance] = WeakKeyDictionary()
 
 
-_child = ""
-"""Part of all seeds in a process that a program has forked; else empty."""
-
-
 def chance_of(node: Node) -> Chance:
     """Return a node's generators."""
     chance = _chances.get(node)
     if chance is None:
-        chance = _chances[node] = Chance(f"{node.seed}{_child}")
+        chance = _chances[node] = Chance(node.seed)
     return chance
 
 
-def _begin_child() -> None:
-    """Let a process that a program has forked draw other numbers than the program, as without vnet."""
-    global _child
-    if present_node() is not None:
-        _child = _system_bytes(_SEED_BYTES).hex()
-        _chances.clear()
-
-
-os.register_at_fork(after_in_child=_begin_child)
+def _drawing_node() -> Node | None:
+    """Return the node whose code draws; None in threads, whose order nothing decides, and in child processes."""
+    return None if asyncio._get_running_loop() is None else present_node()
 
 
 def _random_bytes(size: int, /) -> bytes:
-    node = present_node()
+    node = _drawing_node()
     return _system_bytes(size) if node is None else chance_of(node).system.randbytes(size)
 
 
 def _seeded(generator: random.Random, a: Any = None, version: int = 2) -> None:
-    if a is None and present_node() is not None:
+    if a is None and _drawing_node() is not None:
         a = _random_bytes(_SEED_BYTES)
     _seed(generator, a, version)
 
@@ -87,7 +76,7 @@ def _drawing(own: Callable[..., Any], module: ModuleType, name: str, kind: str) 
 
     @wraps(own)
     def draw(*arguments: Any, **options: Any) -> Any:
-        node = present_node()
+        node = _drawing_node()
         method = own if node is None else getattr(getattr(chance_of(node), kind), method_name)
         return method(*arguments, **options)
 
@@ -101,7 +90,7 @@ class _SharedState:
     __class__ = np.random.RandomState  # type: ignore[assignment]
 
     def __getattr__(self, name: str) -> Any:
-        node = present_node()
+        node = _drawing_node()
         return getattr(_numpy_state if node is None else chance_of(node).numpy, name)
 
     def __reduce__(self) -> str:
@@ -145,8 +134,7 @@ def attach() -> None:
     """Let these stand in for the names, in all threads; each call is followed by one of `detach`."""
     global _users
     with _lock:
-        if _users == 0:
-            _settle_shared()
+        _settle_shared()
         _users += 1
         _set_names(own=False)
         asyncio_internals.hash_gatherings_by(own_asyncio.number_of)

@@ -45,11 +45,11 @@ DRAWS: dict[str, Callable[[], Any]] = {
 
 
 async def draws(node: Node) -> None:
-    """Log one draw of each sort in each period, and one of a thread."""
+    """Log one draw of each sort in each period, between draws of threads."""
     while True:
         await asyncio.sleep(0.1)
-        job = await asyncio.to_thread(random.random)
-        node.log(" ".join(map(repr, [*(draw() for draw in DRAWS.values()), job, node.rng.random()])))
+        await asyncio.gather(*(asyncio.to_thread(random.random) for _ in range(3)))
+        node.log(" ".join(map(repr, [*(draw() for draw in DRAWS.values()), node.rng.random()])))
 
 
 def drawn_in(folder: Path, **options: Any) -> list[tuple[str | None, str]]:
@@ -75,12 +75,13 @@ class Fake:
 
 
 def as_node(node: Any, draw: Callable[[], Any]) -> Any:
-    """Draw on behalf of a node."""
-    before = current_node.set(node)
-    try:
+    """Draw on behalf of a node, on a loop."""
+
+    async def program() -> Any:
+        current_node.set(node)
         return draw()
-    finally:
-        current_node.reset(before)
+
+    return asyncio.run(program())
 
 
 @pytest.fixture(autouse=True)
@@ -142,10 +143,10 @@ def test_a_child_process_draws_other_numbers() -> None:
     assert told[2] == repr(as_node(Fake(1), draw)), "what a child draws changes nothing"
 
 
-def test_names_are_the_modules_own_when_no_program_runs() -> None:
+def test_names_are_the_modules_own_when_no_program_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stand_ins, "_users", 1)  # runs of other tests may not have been closed
     stand_ins.detach()
-    if stand_ins._users == 0:  # runs of other tests may not have been closed
-        assert random.random.__self__ is random._inst  # type: ignore[attr-defined]
-        assert os.urandom.__module__ == "posix"
+    assert random.random.__self__ is random._inst  # type: ignore[attr-defined]
+    assert os.urandom.__module__ == "posix"
     stand_ins.attach()
     assert not hasattr(random.random, "__self__")

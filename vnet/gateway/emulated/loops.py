@@ -5,6 +5,7 @@ A loop waits where it asks its selector, in the thread of the program that runs 
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from itertools import count
 from typing import Any
@@ -71,7 +72,8 @@ def prepare_asyncio(module: Any, node: Node, threads: Threads, set_handler: Call
             set_handler(number, lambda *_: self.call_soon_threadsafe(callback, *args))
 
         def remove_signal_handler(self, number: int) -> bool:
-            return callable(set_handler(number, 0))
+            default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+            return callable(set_handler(number, default))
 
     for name, refuse in _WITHOUT_SOCKETS.items():
         setattr(Loop, name, refuse)
