@@ -470,7 +470,7 @@ class Engine:
 
     def _enqueue(self, frames: Sequence[Frame]) -> None:
         """Give frames to the MAC; it never sees those that are dropped, or too large."""
-        heard: list[Transmission] = []
+        offered: list[Transmission] = []
         for frame in frames:
             sent = Transmission(frame, attempt=int(frame.to != BROADCAST))
             if frame.dropped or len(frame.payload) > self._max_payload_bytes:
@@ -478,8 +478,8 @@ class Engine:
                 sent.end_ns = frame.sent_ns
                 self._mac.sent.append(sent)
             else:
-                heard.append(sent)
-        self._mac.enqueue(heard)
+                offered.append(sent)
+        self._mac.enqueue(offered)
         if frames and frames[0].effects.copy:  # their duplicates are numbered before copies sent after them
             self._settle()
 
