@@ -133,9 +133,10 @@ def test_a_command_that_fails_is_a_crash_of_its_vehicle_alone(vnet: Vnet, tmp_pa
 def test_a_session_at_another_vehicles_endpoint_is_no_isolation(vnet: Vnet, tmp_path: Path) -> None:
     """The cheater finds the endpoint of another vehicle in the run's folder, and puts a sample there."""
     (tmp_path / "cheater.py").write_text(
-        "import json, pathlib, sys, time\n"
+        "import json, os, pathlib, sys, time\n"
         "import zenoh\n"
         "own = zenoh.open(zenoh.Config.from_env())\n"
+        "del os.environ['ZENOH_CONFIG_OVERRIDE']\n"
         "if sys.argv[1] == 'v01':\n"
         "    while not (found := list(pathlib.Path(sys.argv[2]).rglob('endpoints.json'))):\n"
         "        time.sleep(0.1)\n"
@@ -163,7 +164,7 @@ def test_a_peer_that_others_find_by_multicast_is_no_isolation(vnet: Vnet, tmp_pa
     if not has_multicast:
         pytest.skip("no multicast on this machine: peers do not find each other")
     program = (
-        "import json, sys, time, zenoh; config = zenoh.Config(); "
+        "import json, os, sys, time, zenoh; config = zenoh.Config(); del os.environ['ZENOH_CONFIG_OVERRIDE']; "
         "config.insert_json5('connect/endpoints', json.dumps([sys.argv[1]])); session = zenoh.open(config); "
         "time.sleep(100)"
     )
@@ -175,6 +176,21 @@ def test_a_peer_that_others_find_by_multicast_is_no_isolation(vnet: Vnet, tmp_pa
     client = json.dumps(["python", "-c", program.replace("config.insert", CLIENT, 1), "{endpoint}"])
     done = vnet("run", scenario(tmp_path, (words[0], client), ("duration_s = 8.0", "duration_s = 4.0")))
     assert not done.events_of("found_session")
+
+
+def test_programs_in_python_are_clients_of_their_vehicle_whatever_they_open(vnet: Vnet, tmp_path: Path) -> None:
+    """Two are peers by default, two connect and listen elsewhere: they reach others by the radio alone."""
+    elsewhere = {"connect": {"endpoints": ["tcp/localhost:7447"]}, "listen": {"endpoints": ["tcp/127.0.0.1:0"]}}
+    other = f"zenoh.Config() if name < 'v03' else zenoh.Config.from_json5(str({elsewhere}))"
+    path = scenario(tmp_path, ("duration_s = 8.0", "duration_s = 4.0"), ("loss = 0.1", "loss = 0.5"))
+    talker = tmp_path / "talker.py"
+    talker.write_text(talker.read_text().replace("zenoh.Config.from_env()", other))
+    done = vnet("run", path)
+    assert done.status in SLOW
+    assert not done.events_of("found_session") + done.events_of("extra_session")
+    delivered = Counter((row["receiver"], row["sender"]) for row in done.trace() if row["outcome"] == "delivered")
+    assert 0 < heard(done, "v01")["v02"] <= delivered["v01", "v02"]
+    assert 0 < heard(done, "v03")["v04"] <= delivered["v03", "v04"]
 
 
 def test_a_program_that_never_connects_and_a_port_that_is_taken_are_named(vnet: Vnet, tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+STARTUP = Path(__file__).with_name("startup")
+"""Folder on `PYTHONPATH` by which programs in Python heed `ZENOH_CONFIG_OVERRIDE`, whatever they open."""
 FILLED_IN = ("{id}", "{endpoint}", "{port}")
 """Words of a command that vnet fills in."""
 
@@ -36,10 +38,15 @@ def session_variables(node: str, endpoint: str, config: Mapping[str, Any], path:
     """
     return {
         "ZENOH_CONFIG": str(path),
-        "ZENOH_CONFIG_OVERRIDE": ";".join(f"{key}={json.dumps(value)}" for key, value in _leaves(config)),
+        "ZENOH_CONFIG_OVERRIDE": ";".join(f"{key}={_json(value)}" for key, value in _leaves(config)),
         "VNET_ENDPOINT": endpoint,
         "VNET_NODE": node,
     }
+
+
+def _json(value: object) -> str:
+    """Return a value without the character that ends it."""
+    return json.dumps(value).replace(";", "\\u003b")
 
 
 def _leaves(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +23,7 @@ import zenoh
 
 from emulator.drivers.agent_keys import Hear
 from emulator.scenario.program import ZenohSessions
-from vnet.gateway import client_config, session_variables
+from vnet.gateway import STARTUP, client_config, session_variables
 from vnet.gateway.frames import (
     CrossingQuery,
     CrossingReply,
@@ -353,7 +354,8 @@ def session_environment(
     path = folder / f"{node}.json5"
     path.write_text(json.dumps(client))
     path.chmod(0o600)
-    return {**inherited, **session_variables(node, endpoint, client, path)}
+    python_path = os.pathsep.join(filter(None, [str(STARTUP), inherited.get("PYTHONPATH")]))
+    return {**inherited, **session_variables(node, endpoint, client, path), "PYTHONPATH": python_path}
 
 
 def _options(sample: CrossingSample) -> dict[str, Any]:

@@ -47,8 +47,8 @@ from vnet.units import NS_PER_S
 ENDPOINTS = "endpoints.json"
 """File of a run's folder with the endpoint of each vehicle."""
 HIGHEST_PORT = 65_535
-HOW = "zenoh.Config.from_env() finds the endpoint by ZENOH_CONFIG, and zenoh.Config() does not"
-"""Most frequent cause of a program that does not connect."""
+HOW = "ZENOH_CONFIG, VNET_ENDPOINT and {endpoint} have the endpoint; in Python zenoh.open() finds it by itself"
+"""Hint for those whose program does not connect."""
 
 
 @dataclass
