@@ -3,12 +3,14 @@
 import json
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from tests.vnet.gateway.conftest import Drive, events, log
 from vnet.gateway import client_config
 from vnet.gateway.emulated.modules import CLIENT_CONFIG, ENDPOINT
+from vnet.gateway.emulated.shown import hide, show
 
 pytestmark = pytest.mark.slow
 
@@ -73,6 +75,32 @@ def test_classes_of_a_program_are_found_by_the_names_of_their_modules(drive: Dri
         ]
     assert sys.modules["__main__"] is before["__main__"]
     assert "shapes" not in sys.modules, "what a run has shown is gone after it"
+
+
+def test_what_is_kept_of_a_module_that_was_shown_has_nothing_afterwards() -> None:
+    """As `multiprocessing` keeps `__main__` under another name, where the end of a forked process finds it."""
+    show("brief", lambda name: ModuleType(name))
+    kept = sys.modules["brief"]
+    assert vars(kept)["__name__"] == "brief"
+    hide("brief")
+    with pytest.raises(TypeError):
+        vars(kept)
+
+
+def test_workers_that_wait_when_the_run_ends_say_nothing(drive: Drive) -> None:
+    run = drive(
+        """
+        import logging, time
+        from concurrent.futures import ThreadPoolExecutor
+
+        logging.basicConfig()
+        pool = ThreadPoolExecutor(2)
+        print(pool.submit(lambda: 7).result())
+        time.sleep(100)
+        """
+    )
+    assert log(run)[0] == "7"
+    assert not any("Exception in worker" in line for line in log(run))
 
 
 def test_configuration_is_where_a_gateway_gives_it(drive: Drive) -> None:

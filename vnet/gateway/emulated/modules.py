@@ -28,6 +28,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
 
+from greenlet import GreenletExit
+
 from vnet.errors import ProgramError, shown
 from vnet.gateway import client_config, session_variables
 from vnet.gateway.emulated.facade import Facade
@@ -424,7 +426,10 @@ class ProgramModules:
             kind.empty = _looking(kind.empty, nothing=True)
 
     def _prepare_futures(self, module: Any) -> None:
-        """Have jobs of processes run in threads: a child process has a time of its own."""
+        """Have jobs of processes run in threads: a child process has a time of its own.
+
+        Workers that wait when their program is ended have not failed.
+        """
 
         class ProcessPoolExecutor(module.ThreadPoolExecutor):  # type: ignore[misc]
             def __init__(
@@ -437,6 +442,7 @@ class ProgramModules:
                 return super().map(function, *iterables, timeout=timeout)
 
         module.ProcessPoolExecutor = ProcessPoolExecutor
+        module._base.LOGGER.addFilter(lambda _: not isinstance(sys.exception(), GreenletExit))
 
 
 def _present_module(name: str) -> ModuleType | None:

@@ -19,8 +19,8 @@ class _Proxy(ModuleType):
 
     def __getattribute__(self, attribute: str) -> Any:
         name = object.__getattribute__(self, "__name__")
-        entry = _shown[name]
-        module = entry.present(name) or entry.real
+        entry = _shown.get(name)
+        module = None if entry is None else entry.present(name) or entry.real
         if module is None:
             raise AttributeError(f"module {name!r} is a program's, and none runs")
         return getattr(module, attribute)
