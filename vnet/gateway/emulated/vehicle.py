@@ -136,9 +136,11 @@ class Vehicle:
 
     def matches_queryable(self, key: zenoh.KeyExpr, complete: bool) -> bool:
         """Return whether anybody may answer a query there."""
+        if self._is_asked_by_radio(key, complete):
+            return True
         if complete:
             return any(each.is_complete and each.key.includes(key) for each in self._queryables)
-        return self.crosses(str(key)) or any(each.key.intersects(key) for each in self._queryables)
+        return any(each.key.intersects(key) for each in self._queryables)
 
     # Samples.
 
@@ -200,10 +202,9 @@ class Vehicle:
         if to_others:
             others = [each for each in intersecting if each.session is not session and each.is_remote]
             complete = [each for each in others if each.is_complete and each.key.includes(asking.key)]
-            crosses = session is not None and self.crosses(str(asking.key))
+            crosses = session is not None and self._is_asked_by_radio(asking.key, all_complete)
             if all_complete:
-                # Clients of ROS 2's services ask none but complete queryables.
-                others, crosses = complete, crosses and self._ros2 is not None
+                others = complete
             elif complete and asking.target == zenoh.QueryTarget.BEST_MATCHING:
                 nearest = complete[0].session
                 others, crosses = [each for each in others if each.session is nearest], False
@@ -216,6 +217,10 @@ class Vehicle:
                 if entity.session is session and entity.is_local and (entity.is_complete or not all_complete):
                     asking.begun().put_to(entity)
         asking.done()  # of the asking itself
+
+    def _is_asked_by_radio(self, key: zenoh.KeyExpr, all_complete: bool) -> bool:
+        """Return whether queries there cross. Clients of ROS 2's services ask none but complete queryables."""
+        return self.crosses(str(key)) and (not all_complete or self._ros2 is not None)
 
     def _ask_by_radio(self, asking: Asking) -> None:
         number = next(self._query_numbers)
