@@ -70,16 +70,8 @@ FEW = 4
 WORLD_COLUMNS = ["array", "type", "shape", "unit", "what"]
 KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
-`format` in `verdict.json` is the version of the whole folder.
-
-- 4: `states.parquet` and `metrics.parquet` have the columns that the run's program declares, and no other's.
-- 3: the folder has a `manifest.json`. Without one, checks that compare files with each other are *unknown*
-  instead of *invalid*.
-- 2: the folder has a `world.npz`, and `scenario.toml` a section `[code]`.
-- 1 (vnet 0.1.0): it has neither. `render`, `play` and, with `radio.links` in a file, checks and radio figures need
-  the run's input files. Names of checks that began with `bit:` are read as `effect:`.
-
-A folder of a later format is refused, with the version of vnet that wrote it.
+`format` in `verdict.json` is the version of the whole folder: 4. A folder of another format is refused, with the
+version of vnet that wrote it. Its `scenario.toml` makes the run again.
 """
 WORLD = {
     "node_ids": "ids of the vehicles, in the order of the scenario's network and of the tables' rows",
