@@ -93,30 +93,14 @@ def default(
     live: LiveOption = False,
 ) -> None:
     """vnet's own profile on the same networks, against the hears-all bound. Takes hours for all."""
-    from studies import reports, result_figures
+    from studies import reports
 
     with one_line_errors():
         folder = _folder(out, "default")
         cells = paper.default_cells(paper.network_sections(networks), range(1, seeds + 1))
         results = paper.with_bound(_run(cells, folder, "default", only, live))
         if any(row["mechanism"] == "bound" for row in results):
-            result_figures.ratio_bars(results, folder / "default")
             _show(reports.default_profile(results), folder / "default.md")
-
-
-@app.command()
-def tempering(
-    networks: NetworksOption = None, seeds: SeedsOption = 10, out: OutOption = None, only: OnlyOption = None
-) -> None:
-    """Consistency (ANEES) and error of the hears-all bound against lateral_tau_s, on N3 of the default too."""
-    from studies import tempering as study
-
-    with one_line_errors():
-        folder = _folder(out, "tempering")
-        cells = study.tempering_cells(paper.network_sections(networks), range(1, seeds + 1))
-        results = _run(cells, folder, "tempering", only)
-        print(study.tempering_curve(results, folder / "tempering"))
-        _show(study.report(results), folder / "tempering.md")
 
 
 @app.command()
@@ -275,27 +259,6 @@ def roads(
         _show(study.report(results, duration, rate), folder / "roads.md")
 
 
-@app.command()
-def decomposition(
-    networks: NetworksOption = None,
-    seeds: SeedsOption = 5,
-    duration: DurationOption = 100.0,
-    out: OutOption = None,
-) -> None:
-    """Decomposition: what loss, hops, caps and shares each cost, by oracles that give them back one at a time."""
-    from studies import decomposition as study
-
-    with one_line_errors():
-        folder = _folder(out, "decomposition")
-        results = [
-            {"network": name, **row}
-            for name, section in paper.network_sections(networks).items()
-            for row in study.decompose(section, range(1, seeds + 1), duration)
-        ]
-        write_results(results, folder, "decomposition")
-        _show(study.report(results, duration), folder / "decomposition.md")
-
-
 @app.command("figures")
 def draw_figures(
     networks: NetworksOption = None,
@@ -304,19 +267,10 @@ def draw_figures(
     cells_from: Annotated[Path, typer.Option(metavar="FOLDER", help="Where Table II keeps its cells.")] = FOLDER
     / "table2",
 ) -> None:
-    """The paper's pictures: degrees, road angles, graphs; RMSE and deviation against time on N2 and N3."""
-    from studies import result_figures
-
+    """The paper's pictures of N2 and N3: RMSE and deviation against time."""
     with one_line_errors():
         folder = _folder(out, "figures")
         sections = paper.network_sections(networks)
-        found = {name.upper(): paper.load_positions(section) for name, section in sections.items()}
-        for draw in (
-            result_figures.degree_histogram,
-            result_figures.road_angle_histogram,
-            result_figures.graphs,
-        ):
-            print(draw(found, folder / draw.__name__))
         cells = paper.table2_cells({n: sections[n] for n in ("n2", "n3")}, range(1, seeds + 1), sides=(1,))
         run_cells(cells, cells_from, title="figures")
         _draw_against_time(cells, cells_from, folder)

@@ -15,7 +15,6 @@ import numpy as np
 
 from emulator.cells.cells import Cell
 from emulator.scenario.scenario import Scenario
-from emulator.world.networks import generate_network, load_network
 from emulator.world.world import build_world, components
 from studies.measure import REFERENCE, study_cell
 from studies.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
@@ -214,12 +213,3 @@ def everybody(linked: Any) -> dict[str, Any]:
         "max_payload_bytes": 65_000,
         "bitrate_mbps": 1000.0,
     }
-
-
-def load_positions(section: dict[str, Any]) -> Any:
-    """Positions (N, 2) and headings (N,) of a network section, for figures."""
-    if section["kind"] == "file":
-        network = load_network(Path(section["path"]))
-    else:
-        network = generate_network("urban", section["vehicles"], section.get("seed", 1))
-    return network.position_m, network.heading_rad

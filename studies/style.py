@@ -47,29 +47,27 @@ styled = matplotlib.rc_context(
 
 @dataclass(frozen=True)
 class Look:
-    """Colour, line, marker and hatch of a mechanism."""
+    """Colour, line and marker of a mechanism."""
 
     colour: str
     line: Any
     marker: str
-    hatch: str
 
 
 LOOKS = {
-    "centralized": Look(BLACK, "-", "s", ""),
-    "bound": Look(GREY, (0, (1, 1)), "D", "...."),
-    "optimized": Look(BLUE, "-", "o", "////"),
-    "random": Look(RED, (0, (5, 2)), "^", "xxxx"),
-    "none": Look(GREEN, (0, (4, 1.5, 1, 1.5)), "v", "----"),
+    "centralized": Look(BLACK, "-", "s"),
+    "bound": Look(GREY, (0, (1, 1)), "D"),
+    "optimized": Look(BLUE, "-", "o"),
+    "random": Look(RED, (0, (5, 2)), "^"),
+    "none": Look(GREEN, (0, (4, 1.5, 1, 1.5)), "v"),
 }
 OTHER_LOOKS = (
-    Look(PURPLE, (0, (1, 1.5)), "P", "++++"),
-    Look(ORANGE, (0, (7, 2, 1, 2, 1, 2)), "X", "oooo"),
-    Look(SKY, (0, (9, 3)), "<", "\\\\\\\\"),
-    Look(YELLOW, (0, (3, 1)), ">", "||||"),
+    Look(PURPLE, (0, (1, 1.5)), "P"),
+    Look(ORANGE, (0, (7, 2, 1, 2, 1, 2)), "X"),
+    Look(SKY, (0, (9, 3)), "<"),
+    Look(YELLOW, (0, (3, 1)), ">"),
 )
 VARIANT_LINES = ((0, (2, 1)), (0, (1, 3)), (0, (6, 1, 1, 1)))
-COMPONENT_LOOKS = ((BLUE, "o"), (RED, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANGE, "v"))
 
 
 @styled
@@ -120,15 +118,11 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
         elif base in LOOKS:
             line = VARIANT_LINES[variants % len(VARIANT_LINES)]
             variants += 1
-            looks[name] = Look(LOOKS[base].colour, line, f"${'abcdefgh'[variants % 8]}$", "")
+            looks[name] = Look(LOOKS[base].colour, line, f"${'abcdefgh'[variants % 8]}$")
         else:
             looks[name] = OTHER_LOOKS[others % len(OTHER_LOOKS)]
             others += 1
     return looks
-
-
-def counted(number: int, thing: str) -> str:
-    return f"{number} {thing}" + ("" if number == 1 else "s")
 
 
 def shown(name: str) -> str:

@@ -1,7 +1,6 @@
 """Capacity of the channel: what is measured, and where loss begins."""
 
 import gc
-from pathlib import Path
 
 import pytest
 
@@ -9,7 +8,7 @@ from emulator.radio.dot11p import airtime_ns
 from emulator.radio.engine import Engine
 from emulator.radio.frames import Frame
 from studies import capacity
-from studies.capacity import HOPELESS, RATE_HZ, VARIANTS, Point, measure, onset, reach_m, report
+from studies.capacity import RATE_HZ, VARIANTS, Point, measure, onset, reach_m
 
 HERE, ROAD, ETSI, _ = VARIANTS
 
@@ -61,22 +60,3 @@ def test_a_road_has_hidden_terminals_and_a_control_that_gives_way() -> None:
     free, open_, held = (measure(variant, 1400, 30, seconds=0.5, seed=1) for variant in (HERE, ROAD, ETSI))
     assert free.delivered > open_.delivered + 0.1
     assert held.busy < open_.busy - 0.1
-
-
-@pytest.mark.slow
-def test_the_report_ends_each_series_where_it_is_hopeless(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def measured(variant: capacity.Variant, size_bytes: int, peers: int, seconds: float, seed: int) -> Point:
-        share = max(0.0, 1.0 - peers / (400 if size_bytes == 300 else 40) - 0.02 * seed)
-        return Point(variant.name, size_bytes, peers, share, 0.25)
-
-    monkeypatch.setattr(capacity, "measure", measured)
-    found = capacity.study(1.0, [1, 2])
-    tried = [point for point in found if point.size_bytes == 1400 and point.variant == "road"]
-    assert [point.delivered < HOPELESS for point in tried] == [False] * (len(tried) - 1) + [True]
-    assert tried[0].delivered == pytest.approx(1 - 5 / 40 - 0.03)
-    text = report(found)
-    assert "| 5 | 0.958 (0.25) |" in text and "| 200 | 0.470 (0.25) |" in text
-    assert "less than 90% from | **28** |" in text
-    path = capacity.run_capacity(1.0, [1, 2], tmp_path)
-    assert path.read_text() == text
-    assert (tmp_path / "capacity.png").stat().st_size > 10_000

@@ -5,20 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pytest
 
-from emulator.cells.cells import compute, keep, read_result, read_series
 from studies.comparisons import (
     STUDIES,
-    _with_bound,
     comparison_cells,
-    draw,
     full_ablation,
     recorded_common,
     report,
 )
-from studies.paper import BOUND, BOUND_POSITION
 from vnet.errors import VnetError
 
 TINY = {"n1": {"kind": "generated", "vehicles": 5}}
@@ -92,31 +87,3 @@ def test_a_report_has_ratios_tests_and_their_number() -> None:
     assert "+0.1040 ± 0.0050" in text and "< 0.001" in text
     assert "1 comparisons" not in text
     assert "3 seeds" in text
-
-
-def test_without_one_bound_for_all_there_is_no_row_of_it() -> None:
-    rows = [row("reference", 1, 0.24), row("multipath", 1, 0.3, reference_common_error_rmse_m=0.25)]
-    assert "| bound " not in report("receivers", rows, 100.0)
-    rows = [row("reference", 1, 0.24, reference_common_error_rmse_m=None)]
-    assert "| bound " not in report("receivers", rows, 100.0)
-
-
-@pytest.mark.slow
-def test_a_study_leaves_a_table_and_a_picture_with_the_bound(tmp_path: Path) -> None:
-    cells = comparison_cells("baselines", TINY, [1], 8.0)[1:4:2]
-    for cell in cells:
-        (tmp_path / "cells").mkdir(exist_ok=True)
-        keep(cell, compute(cell), tmp_path / "cells")
-    rows = [read_result(cell, tmp_path) for cell in cells]
-    assert "alone" in report("baselines", rows, 8.0)
-    assert read_series(cells[0], tmp_path)[BOUND].to_numpy()[-1] > 0
-    (picture,) = draw(cells, tmp_path)
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-def test_where_worlds_differ_no_bound_is_drawn() -> None:
-    def table(bound_m: float) -> pa.Table:
-        return pa.table({"time_ns": [0], BOUND: [bound_m], BOUND_POSITION: [2 * bound_m]})
-
-    assert list(_with_bound({"a": [table(0.5)], "b": [table(0.5)]})) == ["a", "b", "bound"]
-    assert list(_with_bound({"a": [table(0.5)], "b": [table(0.6)]})) == ["a", "b"]
