@@ -36,8 +36,8 @@ CHAPTERS = {
     "Run a scenario": ("run", "simulate", "demo", "new", "emulator", "host", "access"),
     "A running emulator": ("status", "fault"),
     "Judge and compare runs": ("check", "report", "compare", "diff", "radio", "trace"),
-    "Look at runs": ("view", "play", "record", "render", "export"),
-    "Many runs": ("campaign", "sweep", "conformance"),
+    "Look at runs": ("view", "record", "render", "export"),
+    "Many runs": ("campaign", "sweep"),
     "Networks and maps": ("analyze", "map"),
 }
 """Commands of `vnet` by chapter. `vnet experiment` is not vnet's own: `studies/` registers it."""

@@ -6,6 +6,8 @@ Importing this module takes longer than reading a scenario: commands import it o
 from __future__ import annotations
 
 import json
+import shlex
+import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -22,6 +24,7 @@ from emulator.cli.report import report_at_end
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.determinism import calls_recorded, run_again
 from emulator.drivers.emulation import Emulation
+from emulator.drivers.launch import PLACEHOLDERS
 from emulator.drivers.observers import Messages
 from emulator.drivers.router import SeparateRouter
 from emulator.drivers.session import Local, Programs, Session
@@ -88,8 +91,14 @@ class Request:
         return prepare_folder(self.out, self.file, scenario, self.asked.log_format, world.notes)
 
 
-def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[str]) -> None:
-    """Run the emulator, these hosts, if any, and a process a vehicle; exits with the verdict's status."""
+def run_with_processes(
+    request: Request, separate_router: bool, hosts: Sequence[str], agent: str | None = None
+) -> None:
+    """Run the emulator, these hosts, if any, and a process a vehicle; exits with the verdict's status.
+
+    `agent` is the command that each process is, unless it is vnet's own.
+    """
+    words = () if agent is None else _agent_words(agent, request.scenario)
     with ExitStack() as stack:
 
         def programs(emulation: Emulation) -> LiveOptions:
@@ -99,11 +108,32 @@ def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
             return LiveOptions(
-                access, router=separate, record=request.sinks, start_hosts=True, debug=request.asked.debug
+                access,
+                router=separate,
+                record=request.sinks,
+                start_hosts=True,
+                debug=request.asked.debug,
+                agent=words,
             )
 
-        session = request.session(programs).open()
+        session = request.session(programs, loads_programs=not words).open()
         _run_live(session, request.asked, request.output)
+
+
+def _agent_words(command: str, scenario: Scenario) -> list[str]:
+    """Return the words of `--agent`. Raises VnetError for a command that cannot be started, or cannot join."""
+    if scenario.has_gateways or scenario.run.nodes_per_process > 1:
+        raise VnetError('--agent: needs a process for each vehicle, and no program of kind = "zenoh"')
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise VnetError(f"--agent {command!r}: {error}") from None
+    for placeholder in PLACEHOLDERS:
+        if placeholder not in command:
+            raise VnetError(f"--agent: the command has no {placeholder}; it needs all of {' '.join(PLACEHOLDERS)}")
+    if (program := shutil.which(words[0])) is None:
+        raise VnetError(f"--agent {printable(words[0])!r}: no such command")
+    return [program, *words[1:]]
 
 
 def run_simulated(request: Request, processes: str, on_folder: Callable[[Path], None], apart: str | None) -> None:

@@ -184,6 +184,14 @@ DebugOption = Annotated[
         help="Stop a debugger (pdb) in this vehicle's program, at its first line, or as v03:hello.py:12.",
     ),
 ]
+AgentOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="COMMAND",
+        help="Have each vehicle be this command in place of vnet-agent, with {endpoint}, {run}, {node} and "
+        "{credentials} where it needs them.",
+    ),
+]
 ProcessesOption = Annotated[
     str,
     typer.Option(

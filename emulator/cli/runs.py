@@ -14,6 +14,7 @@ import typer
 
 from emulator.cli.options import (
     DEFAULT_LISTEN,
+    AgentOption,
     ChecksOption,
     DebugOption,
     DeterminismOption,
@@ -92,6 +93,7 @@ def run(
             metavar="N", min=1, help="Start the vehicles from N hosts (vnet host) on this machine (experimental)."
         ),
     ] = None,
+    agent: AgentOption = None,
     debug: DebugOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
@@ -109,15 +111,16 @@ def run(
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         if debug is not None and hosts is not None:
             raise VnetError("--debug and --hosts exclude each other")
+        if agent is not None and (debug is not None or hosts is not None or check_determinism is not None):
+            raise VnetError("--agent excludes --debug, --hosts and --check-determinism")
         asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
         _announce(loaded, asked)
         with ended_at_once():
             from emulator.cli.execution import Request, run_with_processes
 
         request = Request(loaded, scenario, out, sinks, asked, output)
-        run_with_processes(
-            request, router is RouterKind.SEPARATE, [str(1 + number) for number in range(hosts or 0)]
-        )
+        own_hosts = [str(1 + number) for number in range(hosts or 0)]
+        run_with_processes(request, router is RouterKind.SEPARATE, own_hosts, agent)
 
 
 def simulate(

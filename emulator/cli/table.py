@@ -76,7 +76,6 @@ COMMANDS = (
     ),
     Command("trace", Panel.LOOK, "folders", "trace", "Show who sent what to whom, and what became of it."),
     Command("view", Panel.LOOK, "viewing", "view", "Open a run's recording in Rerun, or serve it."),
-    Command("play", Panel.LOOK, "viewing", "play", "Play a finished run in Rerun."),
     Command("fault", Panel.BREAK, "fault", "app", "Inject faults into a run that is on, and heal them."),
     Command(
         "campaign",
@@ -86,7 +85,6 @@ COMMANDS = (
         "Run it many times under random faults, and shrink failures.",
         runs_programs=True,
     ),
-    Command("conformance", Panel.BREAK, "conformance", "conformance", "Check an agent of your own (experimental)."),
     Command(
         "sweep",
         Panel.STUDY,

@@ -1,14 +1,12 @@
-"""`vnet view`, `vnet record`, `vnet render` and `vnet play`: a run in Rerun, while it is on or from its files."""
+"""`vnet view`, `vnet record` and `vnet render`: a run in Rerun, while it is on or from its files."""
 
 from __future__ import annotations
 
 import contextlib
-import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -26,8 +24,7 @@ from emulator.cli.options import (
 )
 from emulator.drivers.control import read_control_file
 from emulator.records.run_folder import RECORDING, RunFolder, check_is_finished, check_is_run
-from emulator.stream.playback import Message, messages, schedule
-from emulator.stream.playback import play as play_scheduled
+from emulator.stream.playback import Message, messages
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.live import SafeConsole
 from emulator.viewer.sinks import (
@@ -43,13 +40,9 @@ from emulator.viewer.sinks import (
 from vnet.errors import VnetError
 from vnet.extras import require
 from vnet.transport.credentials import Credentials
-from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:
     from emulator.viewer.recorder import Recorder
-
-SEEN_APART_S = 0.2
-"""Periods that are so far apart are shown each when it is due; closer ones some at a time, which costs less."""
 
 
 def render(
@@ -86,70 +79,6 @@ def _write_recording(played: Iterator[Message], sinks: Sinks) -> None:
             played, "drawing", total, console=console, transient=True, disable=not console.is_terminal
         ):
             recorder.take(stream, message)
-
-
-def play(
-    run: RunArgument = LATEST,
-    speed: Annotated[float, typer.Option(help="How many times as fast as real time.")] = 1.0,
-    start: Annotated[float, typer.Option("--from", min=0.0, help="Emulated second to begin at.")] = 0.0,
-    end: Annotated[float | None, typer.Option("--to", help="Emulated second to stop at.")] = None,
-    serve: Annotated[bool, typer.Option("--serve", help="Serve it even where there is a display.")] = False,
-    rerun_bind: RerunBindOption = None,
-    rerun_port: RerunPortOption = None,
-    rerun_vehicle: RerunVehicleOption = None,
-) -> None:
-    """Play a run into a viewer here, or serve it as it plays, until Ctrl-C."""
-    with one_line_errors():
-        if not speed > 0:
-            raise VnetError(f"--speed {speed:g}: more than 0 is needed")
-        if end is not None and not end > start:
-            raise VnetError(f"--to {end:g}: must come after --from {start:g}")
-        require("vnet play", "rerun")
-        played = messages(run)
-        stream, scene = next(played)
-        if start >= (over_s := scene["duration_ns"] / NS_PER_S):
-            raise VnetError(f"--from {start:g}: the run is over at {over_s:g} s")
-        scheduled = schedule(played, speed, round(start * NS_PER_S), None if end is None else round(end * NS_PER_S))
-        place = place_to_serve(rerun_bind, rerun_port)
-        sinks = Sinks(serve=place, spawn=has_display() and not serve, vehicle=rerun_vehicle)
-        sleep = _sleep_until_interrupted()
-        with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
-            recorder.take(stream, scene)
-            print(f"playing {run} at {speed:g}× real time\n{place.announcement()}", flush=True)
-            apart_s = scene["period_ns"] / NS_PER_S / speed
-
-            def show(message: Message) -> None:
-                recorder.take(*message)
-                if apart_s >= SEEN_APART_S:
-                    recorder.draw()
-
-            if play_scheduled(scheduled, show, sleep=sleep) == 0:
-                raise VnetError(f"{run}: there is nothing to play from {start:g} s on")
-            print("played; it can be looked at until Ctrl-C", flush=True)
-            while True:
-                sleep(1.0)
-
-
-def _sleep_until_interrupted() -> Callable[[float], None]:
-    """Have SIGINT and SIGTERM raise KeyboardInterrupt; return a `time.sleep` that raises it after either, too.
-
-    An exception that is raised within a callback of the viewer's library is lost.
-    """
-    told: list[int] = []
-
-    def interrupt(number: int, frame: object) -> None:
-        told.append(number)
-        raise KeyboardInterrupt
-
-    def sleep(seconds: float) -> None:
-        if told:
-            raise KeyboardInterrupt
-        time.sleep(seconds)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as of a job in a shell's background
-            signal.signal(number, interrupt)
-    return sleep
 
 
 def _recorder(sinks: Sinks, name: str) -> Recorder:

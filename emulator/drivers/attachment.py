@@ -6,6 +6,7 @@ is kept elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +29,8 @@ class LiveOptions:
     `listen` (embedded router), or `connect` (client of one that is there), or `router` (one started with the run).
     `launch` starts the agents, which are on hosts if `access` names some; `start_hosts` starts those here as well.
     `record` is where a recorder process writes its recording (a file in the run's folder, unless its path is
-    absolute), or None. `debug` has a debugger stop in a program.
+    absolute), or None. `debug` has a debugger stop in a program. `agent` are the words of the command that an agent
+    is, with `{endpoint}`, `{run}`, `{node}` and `{credentials}`; without any, agents are those of vnet.
     """
 
     access: Access
@@ -39,6 +41,7 @@ class LiveOptions:
     router: SeparateRouter | None = None
     start_hosts: bool = False
     debug: DebugTarget | None = None
+    agent: Sequence[str] = ()
 
 
 class Attachment:

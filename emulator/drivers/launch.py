@@ -37,6 +37,11 @@ STARVED = 0.1
 STARVED_LOOKS = 10
 STARVED_LOOK_S = 0.02
 """Looks at a process, and seconds between two, until it counts as starved."""
+CREDENTIALS = "{credentials}"
+PLACEHOLDERS = ("{endpoint}", "{run}", "{node}", CREDENTIALS)
+"""Words in an agent's command that stand for what differs from one to the next."""
+TIED = (sys.executable, "-P", "-m", "vnet.runtime.die_with_parent")
+"""Words before a command that is to end when this process does."""
 MOST_ZYGOTES = 3
 """Attempts to fork an agent: a zygote that has ended is started again."""
 
@@ -119,6 +124,8 @@ class Launcher:
         """The debugger of a vehicle, and where its user answers."""
         self.agent_environment: Mapping[str, str] = AGENT_ENVIRONMENT
         """The environment of agents that are not forked, beside this process's own."""
+        self.agent_command: Sequence[str] = ()
+        """The words of the command that an agent is, with placeholders, unless agents are those of vnet."""
         self._folders = folders
         self._zygote = zygote
         self._patience_s = patience_s
@@ -144,6 +151,13 @@ class Launcher:
 
         `nice` lowers their priority, so that on a full machine the emulator, which all wait for, comes first.
         """
+        if self.agent_command:
+            for name in (nodes[0] for nodes in groups):
+                given = {"{endpoint}": endpoint, "{run}": access.run, "{node}": name}
+                words = [*TIED, *(_filled(word, given) for word in self.agent_command)]
+                self._start_with(name, words, access.credentials(node_user(name)), {})
+                self._lower_priority(name, nice)
+            return
         agents = {nodes[0]: self._agent_arguments(endpoint, access.run, nodes) for nodes in groups}
         if self._zygote is not None:
             for names in forking.split(agents):
@@ -219,12 +233,23 @@ class Launcher:
 
         In a session of its own it gets processor time even where the run could use all of it, if autogroups act.
         """
+        command = [sys.executable, *arguments, *(["--credentials", CREDENTIALS] if credentials else [])]
+        self._start_with(name, command, credentials, environment, own_session)
+
+    def _start_with(
+        self,
+        name: str,
+        command: Sequence[str],
+        credentials: Credentials | None,
+        environment: Mapping[str, str],
+        own_session: bool = False,
+    ) -> None:
+        """Start a command, with the path of a pipe that holds the credentials in place of `CREDENTIALS`."""
         read_end, write_end = os.pipe()
-        command = [sys.executable, *arguments]
         if credentials is not None:
             os.write(write_end, credentials.dumps().encode())
-            command += ["--credentials", f"/dev/fd/{read_end}"]
         os.close(write_end)
+        command = [_filled(word, {CREDENTIALS: f"/dev/fd/{read_end}"}) for word in command]
         try:
             self._start(name, command, {**SAME_ARITHMETIC, **os.environ, **environment}, own_session, [read_end])
         finally:
@@ -232,8 +257,7 @@ class Launcher:
 
     def start_command(self, name: str, words: Sequence[str], environment: Mapping[str, str], nice: int) -> None:
         """Start a command in a group of its own that ends with this process; it prints to `logs/{name}.log`."""
-        tied = [sys.executable, "-P", "-m", "vnet.runtime.die_with_parent"]
-        self._start(name, [*tied, *words], environment)
+        self._start(name, [*TIED, *words], environment)
         self._lower_priority(name, nice)
 
     def _start(
@@ -286,8 +310,8 @@ class Launcher:
         return "\n".join(text.splitlines()[-LOG_TAIL_LINES:])
 
     def request_stack(self, name: str) -> None:
-        """Have a process write its stacks to its log (its faulthandler answers SIGUSR1)."""
-        if name in self._processes:
+        """Have a process write its stacks to its log (its faulthandler answers SIGUSR1), if it is one of vnet's."""
+        if name in self._processes and not self.agent_command:
             self._processes[name].send_signal(signal.SIGUSR1)
 
     def start_service(self, name: str, arguments: Sequence[str]) -> None:
@@ -397,6 +421,13 @@ def _state_of(pid: int) -> str:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
         return "R"
+
+
+def _filled(word: str, given: Mapping[str, str]) -> str:
+    """Return a word of a command with what stands for its placeholders."""
+    for placeholder, value in given.items():
+        word = word.replace(placeholder, value)
+    return word
 
 
 def _cannot_start(name: str, reason: str | None) -> VnetError:

@@ -68,14 +68,7 @@ class Stalled(Exception):
 
 
 class ProtocolError(VnetError):
-    """A message that does not fit what its process was told, or speaks for others.
-
-    `rule` is the check of `vnet conformance` that an agent which sends it does not pass.
-    """
-
-    def __init__(self, text: str, rule: str = "yields") -> None:
-        super().__init__(text)
-        self.rule = rule
+    """A message that does not fit what its process was told, or speaks for others."""
 
 
 def check_ownership(nodes: Sequence[str], *traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
@@ -83,10 +76,10 @@ def check_ownership(nodes: Sequence[str], *traffic: wire.Traffic, waiting: Seque
     own = frozenset(nodes)  # of a simulation a thousand, each of which is looked for several times
     for node in [*waiting, *(part.node for each in traffic for parts in _told(each) for part in parts)]:
         if node not in own:
-            raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own", "own_node")
+            raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")
     for action in (action for each in traffic for action in each.actions):
         if not action.is_sound:
-            raise ProtocolError(f"{action.node} asks for an acceleration that is no number", "numbers")
+            raise ProtocolError(f"{action.node} asks for an acceleration that is no number")
 
 
 def _told(traffic: wire.Traffic) -> Sequence[Sequence[Any]]:
@@ -99,16 +92,14 @@ def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_
     if message.next_timer_ns is not None and message.next_timer_ns < end_ns:
         raise ProtocolError(
             f"yield {message.seq} of {nodes[0]}: its next timer, {message.next_timer_ns}, lies before the end "
-            f"of its window, {end_ns}",
-            "timers",
+            f"of its window, {end_ns}"
         )
     earliest_ns = granted_ns
     for step in message.steps:
         if not earliest_ns <= step.time_ns < end_ns:
             raise ProtocolError(
                 f"yield {message.seq} of {nodes[0]}: a step at {step.time_ns}, where {earliest_ns} to "
-                f"{end_ns - 1} are allowed",
-                "steps",
+                f"{end_ns - 1} are allowed"
             )
         earliest_ns = step.time_ns + 1
     waiting = [*message.waiting_radio, *message.waiting_gnss]

@@ -105,21 +105,13 @@ def _candidates(position_m: Array, range_m: float) -> tuple[NDArray[np.intp], ND
     return np.repeat(np.arange(len(key)), each), order[stretch + np.arange(len(stretch))]
 
 
-def weak_components(linked: Mask) -> NDArray[np.intp]:
-    """Return the component (N,) of each node of a graph (N, N), links in one direction counting too.
+def components_of_links(sender: NDArray[np.intp], receiver: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """Return the component (N,) of each of `count` nodes linked by pairs (n,), in one direction or both.
 
     Components are numbered from 0 in the order of their first nodes, as scipy.sparse.csgraph does; importing that
-    takes longer than many a run.
-    """
-    sender, receiver = np.nonzero(linked)
-    return components_of_links(sender, receiver, len(linked))
-
-
-def components_of_links(sender: NDArray[np.intp], receiver: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return the component (N,) of each of `count` nodes linked by pairs (n,), numbered as by `weak_components`.
-
-    Each round gives the first node of a component to those that it is linked with, and follows the first nodes' own
-    first nodes to the end, so that the number of rounds grows with the logarithm of the diameter.
+    takes longer than many a run. Each round gives the first node of a component to those that it is linked with,
+    and follows the first nodes' own first nodes to the end, so that the number of rounds grows with the logarithm
+    of the diameter.
     """
     first = np.arange(count)
     while True:

@@ -38,8 +38,8 @@ HERE = (
 )
 """Commands of vnet that are run in this process."""
 APART = (
-    *("run", "emulator", "host", "campaign", "sweep", "conformance"),  # they start processes
-    *("fault", "status", "render", "play", "view"),  # they open sessions and recordings
+    *("run", "emulator", "host", "campaign", "sweep"),  # they start processes
+    *("fault", "status", "render", "view"),  # they open sessions and recordings
     "experiment",
 )
 """Commands of vnet that are run in a process of their own."""

@@ -1,6 +1,5 @@
 """A run in which a vehicle sends frames to single vehicles, with losses, and faults that send some again."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +24,6 @@ async def sends(node: Node) -> None:
                 node.event("result", to=to, delivered=result.delivered, attempts=result.attempts)
     async for _ in node.radio:
         pass
-
-
-async def ends_with_results(node: Node) -> None:
-    """Send three frames, of which the second fails; then end the process with 10 and the number of its attempts."""
-    results = [await node.radio.send("v02", b"x") for _ in range(3)]
-    assert [result.delivered for result in results] == [True, False, True]
-    os._exit(10 + results[1].attempts)
 
 
 def exchange_run(folder: Path, faults: list[dict[str, Any]], **sections: Any) -> OpenedRun:

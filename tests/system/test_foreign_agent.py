@@ -1,6 +1,7 @@
 """Whole runs in which an agent that imports no vnet takes part, beside those of vnet, in both pacings."""
 
 import ast
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,10 +14,10 @@ import pytest
 from tests.support.paths import ROOT
 from tests.support.processes import wait_until
 from tests.system.by_hand import NODES, finish, start_emulator
-from tests.system.conftest import AGENT, TIMEOUT_S, Finished, heard_by
+from tests.system.conftest import AGENT, TIMEOUT_S, Finished, Vnet, heard_by, run_until
 
 FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py"]
-WRONG = [sys.executable, "-P", "-m", "tests.emulator.testing.conformance.wrong_agent"]
+WRONG = [sys.executable, "-P", "-m", "tests.system.wrong_agent"]
 LISTEN = ("--listen", "tcp/127.0.0.1:0")
 
 
@@ -116,27 +117,112 @@ def test_a_killed_foreign_agent_is_named_and_the_others_go_on(tmp_path: Path) ->
     assert done.check("progress")["verdict"] == "valid"
 
 
-def test_misbehaving_foreign_agents_are_refused_and_the_run_is_unknown(tmp_path: Path) -> None:
-    mistakes = {
-        "v01": ("SaysTextForInteger", "Expected `int`, got `str`"),
-        "v02": ("ForgetsItsNonce", "without the nonce of its process"),
-        "v03": ("CountsByItself", "yield 1 of v03: expected 0"),
-        "v04": ("SpeaksForOthers", "speaks for v02, which is not its own"),
-    }
+GIVEN = ["--connect", "{endpoint}", "--run", "{run}", "--node", "{node}", "--credentials", "{credentials}"]
+EACH_FOREIGN = ("--agent", shlex.join([*FOREIGN, *GIVEN]))
+
+
+def each_wrong(mistake: str) -> tuple[str, str]:
+    return "--agent", shlex.join([*WRONG, mistake, *GIVEN])
+
+
+MISTAKES = {
+    "SaysTextForInteger": "Expected `int`, got `str`",
+    "ForgetsItsNonce": "without the nonce of its process",
+    "CountsByItself": "yield 1 of v03: expected 0",
+    "SpeaksForOthers": "speaks for v02, which is not its own",
+    "TimerInThePast": "its next timer, 0, lies before the end of its window",
+    "StepsAfterItsWindow": "a step at 2000000, where 0 to 1999999 are allowed",
+}
+
+
+def test_misbehaving_agents_are_refused_with_the_reason_and_the_run_is_unknown(tmp_path: Path) -> None:
+    mistakes = {f"v{number:02}": mistake for number, mistake in enumerate(MISTAKES, 1)}
+    agents = each_wrong(",".join(f"{node}={mistake}" for node, mistake in mistakes.items()))
     folder = tmp_path / "run"
-    with ExitStack() as stack:
-        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--set", "run.stall_timeout_s=3600")
-        for node, (mistake, _) in mistakes.items():
-            start(stack, [*WRONG, mistake], node, endpoint, folder)
+
+    def are_refused() -> bool:
         events = folder / "events.jsonl"
-        wait_until(lambda: events.read_text().count('"refused"') >= len(mistakes), emulator)
-        emulator.send_signal(signal.SIGINT)
-        done = finish(emulator, folder)
+        return events.exists() and events.read_text().count('"refused"') >= len(mistakes)
+
+    vehicles = ("--set", f"network.vehicles={len(mistakes)}", "--set", "run.stall_timeout_s=3600")
+    done = run_until(are_refused, folder, "scenarios/beacon.toml", *vehicles, *agents)
     assert done.verdict["verdict"] == "unknown", done.stdout
     refused = {event["node"]: event["reason"] for event in done.events_of("refused")}
     assert refused.keys() == mistakes.keys()
-    for node, (_, reason) in mistakes.items():
-        assert reason in refused[node]
+    for node, mistake in mistakes.items():
+        assert MISTAKES[mistake] in refused[node]
+
+
+FAULTS = """
+[run]
+name = "faults"
+duration_s = 3.0
+settle_s = 0.5
+
+[network]
+vehicles = 3
+
+[program]
+entry = "agents.beacon:main"
+
+[[fault]]
+kind = "restart"
+nodes = ["v01"]
+at_s = 0.3
+duration_s = 0.5
+
+[[fault]]
+kind = "pause"
+nodes = ["v02"]
+at_s = 0.5
+duration_s = 0.6
+
+[[fault]]
+kind = "skew"
+nodes = ["v03"]
+at_s = 0.5
+duration_s = 0.5
+offset_ms = 5.0
+"""
+
+
+def test_a_run_starts_foreign_agents_and_does_to_them_what_faults_do(vnet: Vnet, tmp_path: Path) -> None:
+    (tmp_path / "faults.toml").write_text(FAULTS)
+    done = vnet("run", str(tmp_path / "faults.toml"), *EACH_FOREIGN)
+    assert done.verdict["verdict"] == "valid", done.stdout
+    assert [event["node"] for event in done.events_of("restarted")] == ["v01"]
+    assert done.events_of("refused") == done.events_of("died") == []
+    assert {row["sender"] for row in done.trace()} == {"v01", "v02", "v03"}
+
+
+@pytest.mark.parametrize(
+    ("mistake", "pacing", "check", "verdict"),
+    [
+        ("EndsWithAnError", "lockstep", "agents_alive", "invalid"),
+        ("NeverAcknowledges", "realtime", "transport", "unknown"),
+    ],
+)
+def test_what_is_no_message_is_judged(vnet: Vnet, mistake: str, pacing: str, check: str, verdict: str) -> None:
+    few = ("--duration", "1.5", "--set", "network.vehicles=2", "--pacing", pacing)
+    assert vnet("run", "scenarios/beacon.toml", *each_wrong(mistake), *few).check(check)["verdict"] == verdict
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (each_wrong("KnowsNoWindows"), "speaks version 1 of the messages"),
+        (("--agent", "./agent {endpoint} {run} {node}"), "the command has no {credentials}"),
+        (("--agent", f"./no-such-agent {' '.join(GIVEN)}"), "'./no-such-agent': no such command"),
+        ((*EACH_FOREIGN, "--hosts", "1"), "--agent excludes"),
+        ((*EACH_FOREIGN, "--set", "run.nodes_per_process=2"), "needs a process for each vehicle"),
+        (("--agent", f"{sys.executable} -c 'print(1); exit(4)' {' '.join(GIVEN)}"), "(exit status 4): 1"),
+    ],
+)
+def test_an_agent_that_cannot_be_started_is_told_in_one_line(
+    vnet: Vnet, options: tuple[str, ...], told: str
+) -> None:
+    done = vnet("run", "scenarios/beacon.toml", "--set", "network.vehicles=2", *options)
+    assert done.status == 2 and told in done.stderr.splitlines()[-1]
 
 
 def test_a_message_of_a_hundred_megabytes_is_refused_by_name(tmp_path: Path) -> None:

@@ -68,10 +68,12 @@ async def run_live(
     the run's folder.
     """
     with ExitStack() as stack:
-        zygote = _zygote(emulation.scenario) if options.launch and not options.access.hosts else None
+        forks = options.launch and not options.access.hosts and not options.agent
+        zygote = _zygote(emulation.scenario) if forks else None
         scenario = emulation.scenario
         launcher = Launcher(emulation.folder.logs, scenario.program.folders, zygote, scenario.run.join_timeout_s)
         launcher.agent_environment = _agent_environment(scenario)
+        launcher.agent_command = options.agent
         stack.callback(launcher.stop)
         if emulation.scenario.run.pacing == "realtime":
             set_time_slice(PROMPT_SLICE_NS)

@@ -37,21 +37,6 @@ def test_show_says_how_long_roads_are_and_what_is_odd(town: Path) -> None:
 
 
 @pytest.mark.slow
-def test_show_draws_a_picture(town: Path, tmp_path: Path) -> None:
-    status, text = vnet_map("show", town, "--out", tmp_path / "town.png")
-    assert status == 0 and f"wrote {tmp_path / 'town.png'}" in text.replace("\n", "")
-    assert (tmp_path / "town.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.slow
-def test_show_a_part(town: Path) -> None:
-    arguments = ("--origin", "42.28,-83.74", "--side-km", "0.1")
-    assert "1 roads, 2 points" in vnet_map("show", town, "--at", "200,120", *arguments)[1]
-    status, text = vnet_map("show", town, "--at", "9000,0", *arguments)
-    assert status == 2 and "no road within 0.1 km around --at 9000,0" in text
-
-
-@pytest.mark.slow
 def test_convert_writes_what_show_reads(town: Path, tmp_path: Path) -> None:
     assert vnet_map("convert", town, tmp_path / "town.npz") == (0, f"wrote {tmp_path / 'town.npz'}\n")
     assert read_roads(tmp_path / "town.npz").length_m.sum() == pytest.approx(550, abs=0.01)
@@ -137,10 +122,3 @@ def test_problems_of_a_map_are_found() -> None:
     assert found["segments without length"] == "1"
     assert found["isolated pieces"].startswith("3, 0.3 km") or found["isolated pieces"].startswith("3, ")
     assert any(what.startswith("ends within 1 m") for what in found)
-
-
-def test_a_map_without_problems_has_none() -> None:
-    builder = RoadsBuilder("ring")
-    ring = [(100 * float(np.cos(a)), 100 * float(np.sin(a))) for a in np.linspace(0, 6, 20)]
-    builder.add("ring", [(point, point) for point in [*ring, ring[0]]], 0, (1, 1), 3.0)
-    assert examine(builder.build(builder.coordinates(), None)).problems == {}

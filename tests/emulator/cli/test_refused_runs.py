@@ -88,23 +88,9 @@ def test_an_empty_path_is_none(arguments: list[str], capsys: pytest.CaptureFixtu
     assert stderr.count("\n") == 1
 
 
-def test_a_url_is_no_folder(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(app, ["simulate", BEACON, "--out", "s3://bucket/x"]) == 2
-    stderr = capsys.readouterr().err
-    assert "'s3://bucket/x': a path of this machine is needed, not a URL" in stderr
-    assert stderr.count("\n") == 1
-    assert not Path("s3:").exists()
-
-
 def test_users_of_a_run_are_made_for_its_program(here: Path) -> None:
     assert vnet("access", BEACON, "--program", "good:main", "--out", "access")[0] == 0
     assert (here / "access" / "credentials").is_dir()
-
-
-def test_an_error_of_the_file_names_the_file(here: Path) -> None:
-    (here / "own.toml").write_text("[run]\nseed = -1\n")
-    status, stderr = vnet("simulate", "own.toml", "--set", "radio.loss=0.1")
-    assert (status, stderr.startswith("vnet: own.toml: run.seed = -1")) == (2, True), stderr
 
 
 def test_the_number_is_not_used_up_and_latest_stays() -> None:
@@ -117,14 +103,6 @@ def test_the_number_is_not_used_up_and_latest_stays() -> None:
     assert sorted(path.name for path in Path("runs").iterdir()) == ["beacon-1", "latest"]
     assert vnet("simulate", BEACON, *SHORT, "--program", "good:main")[0] == UNKNOWN
     assert Path("runs/latest").readlink() == Path("beacon-1-2")
-
-
-def test_out_is_not_made() -> None:
-    for out in ("run", "there"):
-        Path("there").mkdir(exist_ok=True)
-        assert vnet("simulate", BEACON, *SHORT, "--out", out, "--program", "godo:main")[0] == 2
-    assert list(Path("there").iterdir()) == []
-    assert not Path("run").exists()
 
 
 def test_an_import_that_does_not_end_is_ended(here: Path) -> None:

@@ -87,18 +87,6 @@ def test_a_function_decodes_and_may_fail(kept: Path, capsys: pytest.CaptureFixtu
     assert lines[-1][4].startswith("ff00 (UnicodeDecodeError: ")
 
 
-def test_a_function_is_named_by_its_file(
-    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "decode_of_trace_test.py").write_text("def first(payload):\n    return payload[:3]\n")
-    monkeypatch.chdir(tmp_path)
-    lines = trace(capsys, str(kept), "--to", "0.1", "--decode", "sub/decode_of_trace_test.py:first")
-    assert lines[1][4] == "b'v01'"
-    ((line, *_),) = trace(capsys, str(kept), "--decode", "gone.py:first", status=2)
-    assert line == "vnet: --decode gone.py:first: gone.py: no such file"
-
-
 def test_without_payloads_there_are_digests(bare: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = trace(capsys, str(bare), "--from", "0.2", "--to", "0.3")
     assert len(lines) == 4 and lines[1][4].startswith("digest ")

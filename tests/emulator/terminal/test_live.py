@@ -95,14 +95,12 @@ def of_states(folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("edits", [[of_events, of_verdict, of_states], [of_manifest]], ids=["records", "manifest"])
-@pytest.mark.parametrize("command", ["check", "report", "compare", "radio", "trace", "play"])
+@pytest.mark.parametrize("command", ["check", "report", "compare", "radio", "trace", "diff"])
 def test_no_command_sends_what_a_folder_holds(run: Path, tmp_path: Path, edits: list[Edit], command: str) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     for edit in edits:
         edit(copy)
-    arguments = [command, str(copy), *([str(run)] if command == "compare" else [])]
-    if command == "play":
-        arguments = ["diff", str(copy), str(run)]
+    arguments = [command, str(copy), *([str(run)] if command in ("compare", "diff") else [])]
     done = CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, arguments)
     assert done.exit_code in (0, 1, 2), done.output
     assert is_plain(done.output), repr(done.output)

@@ -1,23 +1,16 @@
-"""`vnet render` and `vnet play`, as one types them: what they make, what they refuse, and how they end."""
+"""`vnet render` and `vnet view`, as one types them: what they make, and what they refuse."""
 
-import contextlib
 import shutil
-import signal
-import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli import viewing
 from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
 from tests.emulator.stream.test_playback import Watched, watch
-from tests.support.forked_commands import VNET, Command
 
 pytestmark = pytest.mark.slow
 
@@ -66,11 +59,6 @@ def test_what_was_there_stays_until_the_new_one_is_whole(watched: Watched, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["play", "RUN", "--speed", "0"], "--speed 0: more than 0"),
-        (["play", "RUN", "--speed", "nan"], "--speed nan: more than 0"),
-        (["play", "RUN", "--from", "3"], "--from 3: the run is over at 2 s"),
-        (["play", "RUN", "--from", "1", "--to", "1"], "--to 1: must come after --from 1"),
-        (["play", "NOWHERE"], "not a run's folder"),
         (["render", "NOWHERE"], "not a run's folder"),
         (["view", "NOWHERE"], "not a run's folder"),
         (["render", "RUN", "--out", "NOWHERE.rrd", "--rerun-vehicle", "v77"], "no such vehicle: v77"),
@@ -88,57 +76,11 @@ def test_what_cannot_be_is_said_in_one_line(
     assert output.count("\n") == 1
 
 
-@contextmanager
-def playing(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    command = [*VNET, "play", str(folder), "--serve", *arguments]
-    with Command(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def until(process: subprocess.Popen[str], beginning: str) -> None:
-    assert process.stdout is not None
-    assert any(line.startswith(beginning) for line in process.stdout), "it ended before"
-
-
-@pytest.mark.usefixtures("default_signals")
-def test_a_played_run_stays_until_it_is_ended(watched: Watched) -> None:
-    with playing(watched.folder, "--speed", "inf") as process:
-        until(process, "played")
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
-
-
-@pytest.mark.usefixtures("default_signals")
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_playing_can_be_ended_at_any_time(watched: Watched, end: signal.Signals) -> None:
-    with playing(watched.folder, "--speed", "0.001", "--from", "0.5") as process:
-        until(process, "playing")
-        process.send_signal(end)
-        assert process.wait(30) == 0
-
-
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_that_a_library_has_lost_ends_playing(end: signal.Signals) -> None:
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        sleep = viewing._sleep_until_interrupted()
-        with contextlib.suppress(KeyboardInterrupt):  # as the viewer's library does within its callbacks
-            signal.raise_signal(end)
-        with pytest.raises(KeyboardInterrupt):
-            sleep(3600.0)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def test_nothing_asks_to_render_a_run_that_was_killed(watched: Watched, tmp_path: Path) -> None:
     for name in ("scenario.toml", "events.jsonl"):
         shutil.copy(watched.folder / name, tmp_path)
     again = f"vnet run {tmp_path / 'scenario.toml'} makes the run again\n"
-    for command in ("view", "render", "play"):
+    for command in ("view", "render"):
         status, told = vnet(command, tmp_path)
         assert status == 2 and told.endswith(again) and told.count("\n") == 1, told
     recording = tmp_path / "recording.rrd"
