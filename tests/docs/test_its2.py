@@ -30,8 +30,6 @@ from docs.examples.its2.standard_messages import (
 )
 from emulator import SensedTruth
 from tests.support.paths import ROOT
-from vnet.errors import VnetError
-from vnet.runtime.programs import load_program
 
 pytestmark = pytest.mark.slow
 
@@ -166,21 +164,6 @@ def test_other_bytes_are_no_message(data: bytes) -> None:
             assert decoded is None or isinstance(decoded, Message)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        (None, "a file of ASN.1, or a folder with"),
-        ("Broken DEFINITIONS ::= BEGIN x END", "program.options.asn1 = "),
-    ],
-)
-def test_a_schema_that_cannot_be_is_one_line(text: str | None, line: str, tmp_path: Path) -> None:
-    if text is not None:
-        (tmp_path / "broken.asn").write_text(text)
-    with pytest.raises(VnetError, match=line) as raised:
-        schema(tmp_path)
-    assert "\n" not in str(raised.value)
-
-
 def test_a_vehicle_and_a_building_hide_what_is_behind() -> None:
     place_m = np.array([[-40.0, 0.0], [-10.0, 0.0], [30.0, 0.0], [0.0, -40.0], [0.0, 5.0]])
     truth = SensedTruth(
@@ -248,12 +231,3 @@ def test_a_car_that_heeds_vams_does_not_run_into_a_cyclist(listens: bool, tmp_pa
     }
     run = emulator.simulate(scenario, out=tmp_path / "run")
     assert any(event.kind == "collision" for event in run.events) is not listens
-
-
-def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "asn1tools", None)
-    for name in ("standard_messages", "vulnerable"):
-        monkeypatch.delitem(sys.modules, f"docs.examples.its2.{name}", raising=False)
-    with pytest.raises(VnetError, match=r"needs asn1tools: pip install 'vnet-emulator\[its\]'") as raised:
-        load_program("docs.examples.its2.vulnerable:main")
-    assert "\n" not in str(raised.value)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import html
 import inspect
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -97,15 +94,6 @@ def test_another_seed_is_another_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("fit")
-def test_simulate_works_inside_a_running_event_loop(tmp_path: Path) -> None:
-    async def main() -> emulator.Run:
-        return emulator.simulate(SMALL, out=tmp_path / "run")
-
-    assert asyncio.run(main()).verdict == "valid"
-
-
-@pytest.mark.slow
 def test_a_function_that_no_command_can_import_runs_here_and_replay_is_not_warranted(tmp_path: Path) -> None:
     heard: list[str] = []
 
@@ -183,18 +171,6 @@ def nested() -> Any:
     async def main(node: Node) -> None: ...
 
     return main
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("fit")
-def test_a_notebook_shows_the_report_in_a_frame_that_cannot_reach_it(tmp_path: Path) -> None:
-    shown = emulator.simulate(SMALL, out=tmp_path / "run")._repr_html_()
-    assert shown is not None
-    frame = re.fullmatch(
-        r'<iframe title="vnet report" sandbox="allow-scripts" style="[^"]*" srcdoc="([^"]*)">.*', shown
-    )
-    assert frame and "<" not in frame[1]
-    assert "vnet run run" in html.unescape(frame[1])
 
 
 @pytest.mark.slow

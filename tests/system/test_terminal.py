@@ -23,7 +23,7 @@ from emulator.terminal.console import run_app
 from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.screen import Screen
-from tests.system.conftest import TIMEOUT_S, Vnet
+from tests.system.conftest import TIMEOUT_S
 from tests.system.test_failures import long_run
 from vnet.errors import TransportError
 from vnet.transport import session
@@ -82,19 +82,6 @@ def test_a_picture_is_shown_and_the_summary_follows_on_a_clean_screen(tmp_path: 
     assert f"files        {tmp_path}" in shown
 
 
-def test_json_for_machines(vnet: Vnet) -> None:
-    done = vnet("run", *SHORT, "--log-format", "json")
-    lines = [json.loads(line) for line in done.stderr.splitlines()]
-    assert {line["kind"] for line in lines} == {"state", "event", "progress", "ended"}
-    assert [line["phase"] for line in lines if line["kind"] == "state"][-2:] == ["running", "judging"]
-    assert any("listening at" in line.get("text", "") for line in lines)
-    assert any(line.get("phase") == "joining" and len(line["missing"]) == 4 for line in lines)
-    ended = lines[-1]
-    assert (ended["verdict"], ended["exit_status"], ended["folder"]) == ("valid", 0, str(done.folder))
-    assert done.stdout.count("\n") == 1
-    assert json.loads(done.stdout) == done.verdict
-
-
 def fields_in_the_docs(heading: str) -> set[str]:
     """The names in the first column of the table under a heading of docs/viewing.md."""
     _, _, after = DOCS.partition(heading)
@@ -122,13 +109,6 @@ def test_the_docs_name_every_field(tmp_path: Path) -> None:
     assert kinds <= fields_in_the_docs("## JSON for machines")
 
 
-def test_json_of_a_run_that_is_had_twice_is_that_of_one(vnet: Vnet) -> None:
-    done = vnet("simulate", *SHORT, "--log-format", "json", "--check-determinism")
-    lines = [json.loads(line) for line in done.stderr.splitlines()]
-    assert [line["kind"] for line in lines].count("ended") == 1
-    assert "replay" in {check["name"] for check in json.loads(done.stdout)["checks"]}
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -136,14 +116,9 @@ def test_json_of_a_run_that_is_had_twice_is_that_of_one(vnet: Vnet) -> None:
         (["run"], "missing argument 'SCENARIO' (vnet run --help says more)"),
         (["run", "x", "--sed", "3"], "no such option: --sed; did you mean --seed or --set?"),
         (["run", "x", "--seed", "y"], "invalid value for '--seed': a whole number is needed"),
-        (["run", "x", "--pacing", "fast"], "invalid value for '--pacing': 'fast' is not one of 'lockstep'"),
-        (["run", "x", "--out"], "option '--out' requires an argument"),
         (["run", "x", "y"], "got unexpected extra argument(s) (y)"),
-        (["analyze", "scenarios/quikstart.toml"], "scenarios/quikstart.toml: cannot be read: No such file"),
         (["analyze", "scenarios"], "scenarios: cannot be read: Is a directory; in it there are 80211p.toml"),
-        (["fault", "inject", "dos"], "fault: kind = 'dos' (did you mean DoS?): must be one of Const"),
         (["fault", "inject", "loss", "--set", "probabilty=1"], "fault: loss.probabilty: unknown key (did you mean"),
-        (["status", "--json", "--watch"], "--json and --watch exclude each other"),
     ],
 )
 def test_a_mistake_gets_one_line(
@@ -155,20 +130,6 @@ def test_a_mistake_gets_one_line(
     assert told.out == ""
     assert told.err.startswith(f"vnet: {said}")
     assert told.err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "arguments", [["simulate", "nowhere.toml", "--log-format", "json"], ["run", "--log-format=json", "--sed", "1"]]
-)
-def test_a_mistake_of_a_machine_gets_an_object(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    if arguments[0] == "simulate":  # which starts anew, for its hash seed
-        arguments = ["run", *arguments[1:]]
-    assert run_app(app, arguments) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    error = json.loads(told.err)
-    assert (error["kind"], error["exit_status"]) == ("error", 2)
-    assert "nowhere.toml: cannot be read" in error["message"] or "no such option: --sed" in error["message"]
 
 
 def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
@@ -15,8 +14,7 @@ from emulator.cells import sweep as subject
 from emulator.cells.cells import WALL_CLOCK, Cell, compute, judged_figures
 from emulator.cells.sweep import SweepPlan, parse_shard
 from emulator.cli.studies import sweep as command
-from emulator.report.index import write_index
-from emulator.report.sweep_page import Mean, differences, figures_of, heading, mean_of, sweep_page, too_few
+from emulator.report.sweep_page import Mean, differences, mean_of
 from emulator.scenario.loading import scenario_of
 from tests.support.cells import compute_here
 from tests.support.cli import command_app
@@ -231,52 +229,6 @@ def test_differences_are_of_pairs_in_each_combination() -> None:
         {"loss": 1, "programs": "c − a", "pairs": 2, "PDR": "0 ± 0"},
     ]
     assert differences(rows, ["loss"], {"pdr": "PDR"}) == []
-
-
-def test_few_seeds_are_told() -> None:
-    assert too_few(1).startswith("1 seed: ") and too_few(4) and not too_few(5)
-
-
-def test_the_list_of_runs_has_the_sweeps(tmp_path: Path) -> None:
-    rows = [{"radio.loss": 0, "seed": n, "verdict": verdict} for n, verdict in enumerate(["valid", "invalid"])]
-    for name in ("sweep-one", "empty", "odd", "broken"):
-        (tmp_path / name).mkdir()
-    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "sweep-one" / "sweep.parquet")
-    pq.write_table(pa.Table.from_pylist([{"a": 1}]), tmp_path / "odd" / "sweep.parquet")
-    (tmp_path / "broken" / "sweep.parquet").write_text("none")
-    (tmp_path / "sweep-one" / "sweep.html").touch()
-    index = write_index(tmp_path).read_text()
-    assert '<a href="./sweep-one/sweep.html">sweep-one</a>' in index
-    assert '<td class="number">2</td><td class="number invalid">1</td>\n<td>radio.loss</td>' in index
-    assert index.count("sweep.parquet: not the table of a sweep") == 2
-
-
-@pytest.mark.slow
-def test_the_page_shows_own_figures_first_and_no_constants() -> None:
-    rows: list[dict[str, Any]] = [
-        {
-            "kind": kind,
-            "radio.loss": loss,
-            "seed": seed,
-            "verdict": "valid",
-            "failed": "",
-            "pdr": 1 - loss + seed / 9,
-        }
-        | {"same": 3.0, "frames_lost": seed, "delay_ms": seed, "last.delay_ms": 4.0, "wall_s": seed / 7}
-        for kind in ("a", "b")
-        for loss in (0, 0.5)
-        for seed in (1, 2)
-    ]
-    rows[0]["last.delay_ms"] = None
-    assert figures_of(rows, ["kind", "radio.loss"]) == ["delay_ms", "last.delay_ms", "pdr", "same"]
-    assert heading("last.delay_ms") == "delay (ms), at the end"
-    tiny = scenario_of(TINY, {})
-    page = sweep_page(tiny.run, [tiny.program], rows, ["kind", "radio.loss"])
-    assert page.count("<figure") == 2, "neither what is constant nor the wall clock"
-    assert "1.17 ± 0.71" in page and "kind a" in page
-    by_name = sweep_page(tiny.run, [tiny.program], [row for row in rows if row["radio.loss"] == 0], ["kind"])
-    assert by_name.count("<figure") == 2
-    assert "<figure" not in sweep_page(tiny.run, [tiny.program], rows[:2], [])
 
 
 def test_columns_of_several_kinds_are_texts() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
@@ -186,27 +185,6 @@ def test_a_frame_to_one_vehicle_has_its_address_retries_and_acknowledgements(tmp
     assert len(heard) > 30 and acks == sent | heard
 
 
-async def changes_its_rate(node: Any) -> None:
-    """Send frames by turns at the scenario's bit rate, and at 27 Mbit/s."""
-    async for fix in node.gnss:
-        await node.radio.broadcast(b"x", rate_mbps=27 if fix.time_ns % 200_000_000 else None)
-
-
-def test_a_packet_has_the_bit_rate_of_its_own_frame(tmp_path: Path) -> None:
-    radio = {"path_loss": {"kind": "free_space", "floor_dbm": -150.0}, "bitrate_mbps": 3.0}
-    scenario = {"run": {"duration_s": 1.0, "settle_s": 0.1}, "network": {"vehicles": 2, "layout": "dense"}}
-    program = {"entry": f"{__name__}:changes_its_rate"}
-    run_scenario(tmp_path / "run", Scenario.model_validate({**scenario, "radio": radio, "program": program}))
-    file = io.BytesIO()
-    recorded = RecordedRun.open(tmp_path / "run")
-    write_pcapng(recorded, file)
-    rates = {row["seq"]: row["bitrate_mbps"] for row in recorded.trace.to_pylist()}
-    assert set(rates.values()) == {3.0, 27.0}
-    for packet in packets(file.getvalue()):
-        seq = int(packet["comment"].split(";")[0].split(" frame ")[1])
-        assert packet["bytes"][9] / 2 == rates[seq]
-
-
 def test_a_frame_of_c_v2x_has_an_ethernet_header(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "winner_b1", "floor_dbm": -150.0}, "mac": {"kind": "lte-mode4"}}
     run = {"duration_s": 1.0, "settle_s": 0.1, "keep_payloads": True}
@@ -222,22 +200,6 @@ def test_a_frame_of_c_v2x_has_an_ethernet_header(tmp_path: Path) -> None:
         sender = recorded.node_ids.index(packet["comment"].split(" ")[0])
         header = b"\xff" * 6 + bytes([2, 0, 0, 0, 0, sender + 1]) + b"\x88\xb5"
         assert packet["bytes"].startswith(header) and packet["length"] == len(packet["bytes"]) > len(header)
-
-
-def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRun) -> None:
-    for packet in packets(capture):
-        fields = packet["comment"].split("; ")
-        if packet["direction"] == 1:
-            continue
-        told = dict(part.rsplit(" ", 1) for part in fields[-1].split(", "))
-        name, seq = fields[0].split(", ")[0].split(" frame ")
-        copy = int(fields[0].split("copy ")[1]) if "copy" in fields[0] else 0
-        rows = [
-            row["outcome"]
-            for row in recorded.trace.to_pylist()
-            if (row["sender"], row["seq"], row["copy"]) == (name, int(seq), copy)
-        ]
-        assert {outcome: int(count) for outcome, count in told.items()} == {o: rows.count(o) for o in set(rows)}
 
 
 # MCAP.
@@ -271,21 +233,6 @@ def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> 
     assert [m["kind"] for _, m in messages["/events"] if m["node"]] == ["entered", "left"]
     (attachment,) = reader.iter_attachments()
     assert attachment.name == "scenario.toml" and b"[network]" in attachment.data
-
-
-def test_mcap_shows_who_is_there_where_it_is(recorded: OpenedRun) -> None:
-    file = io.BytesIO()
-    write_mcap(recorded, file)
-    file.seek(0)
-    reader = make_reader(file)
-    truth, fixes = ([json.loads(m.data) for _, _, m in reader.iter_messages(topics=[topic])] for topic in TOPICS)
-    assert [t["child_frame_id"] for t in truth[0]["transforms"]] == ["v1", "v2", "v4"]
-    assert [t["child_frame_id"] for t in truth[-1]["transforms"]] == ["v1", "v2", "v3"]
-    assert truth[5]["transforms"][0]["translation"] == {"x": pytest.approx(10.0), "y": 0.0, "z": 0.0}
-    assert len(fixes[0]["poses"]) == 3 and len(fixes[12]["poses"]) == 2, "v4 has left, v1 has no fix"
-
-
-TOPICS = ("/tf", "/vehicles/fix")
 
 
 # CSV.
@@ -322,19 +269,6 @@ def test_without_to_the_file_s_name_says_the_format(
     out = tmp_path / name
     assert RUNNER.invoke(app, ["export", str(folder), "--out", str(out)]).exit_code == 0
     assert out.is_dir() if begins is None else out.read_bytes().startswith(begins)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--to", "mcap", "--out", "x.pcapng"], "--out x.pcapng: ends like a file of pcapng, and --to is mcap"),
-        (["--every", "2"], "--every 2: of links, and not of csv"),
-        (["--out", "x.pcap"], "--out x.pcap: of captures pcapng is written; let it end with .pcapng"),
-    ],
-)
-def test_a_name_of_another_format_is_refused(folder: Path, options: list[str], message: str) -> None:
-    done = RUNNER.invoke(app, ["export", str(folder), *options])
-    assert (done.exit_code, done.stderr) == (2, f"vnet: {message}\n")
 
 
 @pytest.mark.parametrize("to", ["pcapng", "mcap", "csv", "links"])
@@ -387,12 +321,3 @@ def test_what_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
     for command in (["export", str(tmp_path)], ["radio", str(tmp_path)]):
         done = RUNNER.invoke(app, command)
         assert done.exit_code == 2 and done.stderr.count("\n") == 1 and "not a run's folder" in done.stderr
-
-
-def test_radio_prints_its_figures_and_keeps_its_tables(folder: Path, tmp_path: Path) -> None:
-    done = RUNNER.invoke(app, ["radio", str(folder), "--bin", "25", "--out", str(tmp_path / "tables")])
-    assert done.exit_code == 0, done.stderr
-    assert "pairs on" in done.stdout and "the worst links" in done.stdout
-    names = sorted(path.name for path in (tmp_path / "tables").iterdir())
-    assert names == ["distances.parquet", "links.parquet", "vehicles.parquet"]
-    assert pq.read_table(tmp_path / "tables" / "distances.parquet")["to_m"].to_pylist()[0] in (25.0, 50.0)

@@ -1,6 +1,5 @@
 """`emulator.environment`: PettingZoo's own tests, what agents see and do, and how episodes end."""
 
-import sys
 import threading
 from collections.abc import Sequence
 from itertools import count
@@ -87,18 +86,6 @@ def test_actions_drive_vehicles_and_frames_are_heard() -> None:
         assert heard == 3
         assert rewards[agent] == pytest.approx(speed, abs=0.5)
         assert (terminated[agent], truncated[agent], infos[agent]) == (False, True, {})
-
-
-@pytest.mark.slow
-def test_an_agent_without_an_action_does_nothing() -> None:
-    env = make()
-    env.reset(seed=1)
-    for _ in range(15):
-        observed, *_ = env.step({"v01": np.array([2.0])})
-    env.close()
-    assert observed["v01"][0] > 11
-    assert observed["v02"].tolist() == pytest.approx([10, 1], abs=0.5)
-    assert observed["v01"][1] == 0
 
 
 @pytest.mark.slow
@@ -202,25 +189,6 @@ def test_an_error_in_a_reward_ends_the_episode_too(which: str, step: int) -> Non
     env.close()
 
 
-def test_a_reward_cannot_change_the_truth() -> None:
-    def spoil(agent: str, moment: Moment) -> float:
-        with pytest.raises(ValueError, match="read-only"):
-            moment.position_m[agent][:] = 0.0
-        return 0.0
-
-    play(make(duration_s=0.3, reward=spoil))
-
-
-@pytest.mark.parametrize("seed", [-1, 2**63, 1.5, "1"])
-def test_a_seed_that_no_scenario_can_have_is_refused(seed: Any) -> None:
-    env = make()
-    with pytest.raises(VnetError, match=r"reset: seed = .*: a whole number from 0 to"):
-        env.reset(seed=seed)
-    assert threads() == 0
-    env.reset(seed=np.int64(7))
-    env.close()
-
-
 @pytest.mark.parametrize("name", ["observe", "act", "reward"])
 def test_what_is_no_function_or_space_is_refused(name: str) -> None:
     with pytest.raises(VnetError, match=f"environment: {name} = 3: a function is needed"):
@@ -235,19 +203,6 @@ def test_what_is_no_function_or_space_is_refused(name: str) -> None:
             observation_space=Box(0, 1),
             action_space=space,
         )
-
-
-def test_what_is_wrong_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = make()
-    env.reset()
-    with pytest.raises(VnetError, match="step: v09 is no living agent; there are: v01, v02, v03, v04"):
-        env.step({"v09": 0})
-    with pytest.raises(VnetError, match="agent 'v09': there are v01, v02, v03, v04"):
-        env.action_space("v09")
-    env.close()
-    monkeypatch.setitem(sys.modules, "pettingzoo", None)
-    with pytest.raises(VnetError, match=r"an environment needs pettingzoo: pip install 'vnet-emulator\[rl\]'"):
-        make()
 
 
 def test_an_environment_that_is_dropped_ends_its_episode() -> None:

@@ -12,7 +12,7 @@ from mpe2 import simple_reference_v3, simple_speaker_listener_v4
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import emulator
-from docs.examples.highway import FEATURES, Crossing
+from docs.examples.highway import Crossing
 from vnet import Packet
 from vnet.errors import VnetError
 
@@ -60,32 +60,6 @@ def particles(world: Any, scenario: Mapping[str, Any], continuous: bool = False)
 
     send, receive = spoken(env, WORDS[world]), heard(WORDS[world])
     return emulator.radio_for(env, scenario, position_m=position_m, send=send, receive=receive)
-
-
-def cars(scenario: Mapping[str, Any], vehicles: int = 4) -> Any:
-    """Return the crossing, where each vehicle observes itself and what it has received of each other."""
-    env = Crossing(vehicles)
-
-    def send(agent: str, observation: Any, action: Any) -> bytes:
-        return bytes(observation[0].tobytes())
-
-    def receive(agent: str, observation: Any, packets: Sequence[Packet]) -> Any:
-        rows = np.zeros((1 + vehicles, len(FEATURES)), np.float32)
-        rows[0] = observation
-        for packet in packets:
-            rows[1 + env.possible_agents.index(packet.sender)] = np.frombuffer(packet.payload, np.float32)
-        return rows
-
-    space = Box(-np.inf, np.inf, (1 + vehicles, len(FEATURES)), np.float32)
-    return emulator.radio_for(
-        env,
-        scenario,
-        position_m=env.position_m,
-        send=send,
-        receive=receive,
-        observation_space=space,
-        step_s=env.step_s,
-    )
 
 
 def both(plain: Any, radio: Any, seed: int) -> None:
@@ -154,61 +128,6 @@ def test_the_share_that_arrives_is_the_disc_s_closed_form() -> None:
         observations, *_ = radio.step({"speaker_0": 1, "listener_0": 0})
         received += int(observations["listener_0"][-2])
     assert received / episodes == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / episodes))
-
-
-def test_with_a_perfect_radio_vehicles_of_a_crossing_have_each_other_s_observation() -> None:
-    radio, plain = cars(PERFECT), Crossing()
-    before, _ = plain.reset(seed=3)
-    assert radio.reset(seed=3)[0]["car_1"][0].tolist() == before["car_1"].tolist()
-    while radio.agents:
-        actions = dict.fromkeys(radio.agents, 1)
-        observations, *rest = radio.step(actions)
-        after, *plain_rest = plain.step(actions)
-        for car, rows in observations.items():
-            np.testing.assert_array_equal(rows[0], after[car])
-            for number, other in enumerate(plain.possible_agents, start=1):
-                np.testing.assert_array_equal(rows[number], before[other] * (other != car))
-        assert_same(rest, plain_rest)
-        before = after
-
-
-def test_vehicles_of_a_crossing_receive_those_within_the_disc() -> None:
-    radio = cars({"radio": {"range_m": 60.0}})
-    shares = set()
-    for seed in range(3):
-        radio.reset(seed=seed)
-        while radio.agents:
-            place_m = {car: np.array(radio.env.position_m(car)) for car in radio.possible_agents}
-            observations, *_ = radio.step(dict.fromkeys(radio.agents, 1))
-            for number, sender in enumerate(radio.possible_agents, start=1):
-                for car in radio.possible_agents:
-                    within = car != sender and np.hypot(*(place_m[car] - place_m[sender])) <= 60.0
-                    assert observations[car][number, 0] == within
-                    shares.add(bool(within))
-    assert shares == {True, False}
-
-
-def test_vehicles_share_the_medium_of_80211p() -> None:
-    physical = {"path_loss": {"kind": "free_space"}, "mac": {}, "access_jitter_ms": 0.0}
-    radio = cars({"radio": physical})
-    radio.reset(seed=1)
-    radio.step(dict.fromkeys(radio.agents, 1))
-    assert radio.outcomes == {"collided": 12}  # all begin at the same slot
-    apart = cars({"radio": physical | {"access_jitter_ms": 100.0}})
-    apart.reset(seed=1)
-    apart.step(dict.fromkeys(apart.agents, 1))
-    assert apart.outcomes == {"delivered": 12}
-
-
-@pytest.mark.parametrize("kind", ["lte-mode4", "nr-mode2"])
-def test_vehicles_share_the_grid_of_cv2x(kind: str) -> None:
-    grid = {"path_loss": {"kind": "free_space"}, "mac": {"kind": kind}}
-    radio = cars({"radio": grid})
-    radio.reset(seed=1)
-    for _ in range(5):
-        radio.step(dict.fromkeys(radio.agents, 1))
-    assert sum(radio.outcomes.values()) >= 4 * 12 and radio.outcomes["delivered"] >= 3 * 12
-    assert set(radio.outcomes) <= {"delivered", "half_duplex", "collided"}
 
 
 def test_a_message_that_is_late_arrives_in_a_later_step() -> None:

@@ -12,7 +12,7 @@ from jinja2 import UndefinedError
 from markupsafe import Markup
 
 from emulator.pages.canvas import canvas, styled, to_svg
-from emulator.pages.page import Table, render, table
+from emulator.pages.page import render, table
 from emulator.pages.text import LONGEST_TEXT, as_text, cell
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import Chart
@@ -113,17 +113,6 @@ def test_as_text() -> None:
     assert as_text("abcdef", 4) == "abc…" and as_text("abcd", 4) == "abcd"
     assert as_text(Markup("<b>") * 20_000) == "<b>" * 20_000, "a page's own markup is whole"
     assert cell(0.123456789) == "0.123457" and cell(None) == "" and cell("x") == "x"
-
-
-def test_tables_drop_empty_columns_and_align_numbers() -> None:
-    rows: list[dict[str, object]] = [
-        {"name": "a", "none": None, "value": 1.25},
-        {"name": "b", "none": "", "value": None, "more": 3},
-    ]
-    assert table(rows) == Table(
-        "", ["name", "value", "more"], [False, True, True], [["a", "1.25", ""], ["b", "", "3"]]
-    )
-    assert table(rows, decimals=1).rows[0] == ["a", "1.2", ""]
 
 
 def test_a_value_that_is_missing_is_an_error_and_not_an_empty_page() -> None:

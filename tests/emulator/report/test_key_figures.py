@@ -2,7 +2,7 @@
 
 import io
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,12 @@ from emulator.api import simulate_into
 from emulator.checks.judge import check_run
 from emulator.drivers.session import Session
 from emulator.drivers.status import Course
-from emulator.records.period_figures import KeyFigure, program_figures
-from emulator.records.verdicts import read_record
+from emulator.records.period_figures import program_figures
 from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.index import index_page
 from emulator.report.source import Source
 from emulator.report.sweep_page import heading
-from emulator.report.write import key_figures, report_page
+from emulator.report.write import report_page
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.stream.playback import messages
@@ -71,19 +70,6 @@ def test_a_figure_is_declared_in_one_place(run: Path) -> None:
     assert not [page for page, text in shown.items() if "middle, RMSE" not in text]
     assert "Middle of all vehicles" in shown["report"]
     assert "middle (m)" in index_page(run.parent)
-
-
-@pytest.mark.parametrize(("name", "text"), [("age_ms", "2.500 ms"), ("seen_percent", "2.500 %"), ("seen", "2.500")])
-def test_a_declared_figure_has_the_unit_that_ends_its_name(run: Path, name: str, text: str) -> None:
-    record = read_record(run / "verdict.json")
-    record = replace(record, key_figures=[KeyFigure(name, "own figure")], figures={name: 2.5})
-    verdict = json.loads((run / "verdict.json").read_text())
-    verdict |= {"key_figures": [asdict(each) for each in record.key_figures], "figures": record.figures}
-    console = Console(file=io.StringIO(), width=120)
-    console.print(summary._figures(verdict))
-    assert key_figures(record)["own figure"] == text
-    row = next(line for line in console.file.getvalue().splitlines() if "own figure" in line)  # type: ignore[attr-defined]
-    assert row.rstrip("│ ").endswith(text)
 
 
 def test_a_declared_figure_is_what_its_function_gives(run: Path) -> None:

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from emulator.pages.canvas import canvas
 from emulator.report.drawing import draw_charts
-from emulator.report.map_figures import _draw_names, classes, map_charts
+from emulator.report.map_figures import classes
 from emulator.report.program_figures import points, program_charts, text_shares, usual_periods
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
@@ -75,28 +73,6 @@ def test_vehicles_that_report_in_turns_have_one_curve() -> None:
     at_s, _ = points(np.arange(12.0), value.max(axis=1, initial=-1.0, where=np.isfinite(value)), 4.0)
     assert np.isfinite(at_s).all()
     assert usual_periods(value[:4]) == 1.0, "nobody reports twice"
-
-
-def test_names_on_a_map_do_not_overlap() -> None:
-    made = canvas("east (m)", "north (m)")
-    made.axes.set(xlim=(0, 100), ylim=(0, 50))
-    position = np.random.default_rng(1).uniform(0, 50, (30, 2))
-    told = _draw_names(made, [f"vehicle-{number}" for number in range(30)], position)
-    renderer = FigureCanvasAgg(made.figure).get_renderer()  # type: ignore[no-untyped-call]
-    boxes = [text.get_window_extent(renderer) for text in made.axes.texts]
-    assert not any(box.count_overlaps(boxes[:number]) for number, box in enumerate(boxes))
-    assert 10 < len(boxes) < 30 and told == " Names without room are left out."
-    assert _draw_names(canvas("x", "y"), ["a", "b"], np.array([[0.2, 0.5], [np.nan, 0.5]])) == ""
-
-
-@pytest.mark.slow
-def test_vehicles_are_coloured_by_values_that_differ(source: Source) -> None:
-    charts, _ = draw_charts(map_charts(source))
-    found = {chart.title: chart for chart in charts}
-    assert set(found) == {"Map", "Map: load"}, "all others end with one value for all vehicles"
-    assert "v04" in found["Map"].svg and "links that delivered frames" in found["Map"].caption
-    legend = ["10 – 15", "16 – 21", "22 – 27", "28 – 33", "34 – 40"]
-    assert [text for text in legend if text in found["Map: load"].svg] == legend
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,12 @@
 """Reports, the index and comparisons: what stands in the pages, and what must not."""
 
 import json
-import os
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -18,7 +16,7 @@ from emulator.cli import report as report_cli
 from emulator.cli.commands import app
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
-from emulator.report.comparison import Comparison, _delivered, comparison_page
+from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.index import write_index
 from emulator.report.write import key_figures, write_report
 from tests.support.paths import ROOT
@@ -115,22 +113,6 @@ def test_a_figure_with_nothing_to_show_is_left_out_with_the_reason(beacon: Path)
         assert word not in page.text, "nothing is said of what the program does not do"
 
 
-def test_what_the_program_reports_has_curves_and_maps_and_comes_before_the_checks(beacon: Path) -> None:
-    page = page_of(beacon)
-    assert page.ids.index("program") < page.ids.index("network") < page.ids.index("checks")
-    assert {"own-0", "map", "map-0"} <= set(page.ids)
-    assert "figure mean 5 – 95 % at the end neighbours" in page.text
-    assert "Map: neighbours" in page.text and "mean of the vehicles" in page.text
-
-
-def test_samples_of_memory_are_no_news(beacon: Path) -> None:
-    event = {"time_ns": 0, "kind": "memory", "node": "v01", "time_s": [0.0], "private_kb": [1000]}
-    with (beacon / "events.jsonl").open("a") as file:
-        file.write(json.dumps(event) + "\n")
-    page = page_of(beacon)
-    assert "private_kb" not in page.text and "ended" in page.words
-
-
 def test_checks_that_failed_come_first(beacon: Path) -> None:
     verdict = json.loads((beacon / "verdict.json").read_text())
     verdict["verdict"] = verdict["checks"][0]["verdict"] = "invalid"
@@ -139,19 +121,6 @@ def test_checks_that_failed_come_first(beacon: Path) -> None:
     assert page.ids.index("problems") < page.ids.index("program") < page.ids.index("checks")
     first = page.text[page.text.index("What is not valid ✗") :]
     assert first.split("Reported by the program")[0].count("valid") == 2, "the checks that are valid come later"
-
-
-def test_what_a_run_cost_is_a_table_of_its_vehicles(beacon: Path) -> None:
-    page = page_of(beacon)
-    cost = json.loads((beacon / "verdict.json").read_text())["cost"]
-    slowest = cost["vehicles"][0]
-    row = f"{slowest['node']} {slowest['cpu_s']:.3f} {slowest['wake_ups']} {slowest['payload']['frames']}"
-    assert page.ids.index("checks") < page.ids.index("cost") < page.ids.index("events")
-    assert "vehicle CPU time (s) wake-ups frames payload: mean (bytes) 95 % most" in page.text
-    assert row in page.text and f"most by {slowest['node']}" in page.text
-    verdict = json.loads((beacon / "verdict.json").read_text()) | {"cost": None}
-    (beacon / "verdict.json").write_text(json.dumps(verdict))
-    assert "cost" not in page_of(beacon).ids
 
 
 def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
@@ -192,13 +161,6 @@ def test_what_others_wrote_is_text(beacon: Path) -> None:
     assert "the first offending rows" in page.text
 
 
-def test_a_folder_whose_name_is_no_text_is_listed(beacon: Path) -> None:
-    beacon.rename(beacon.with_name(os.fsdecode(b"\xff & more")))
-    page = Page(write_index(beacon.parent).read_text())
-    assert "\\udcff & more" in page.text
-    assert "./%FF%20%26%20more/" in page.references
-
-
 @pytest.mark.parametrize(
     "lost", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json", "events.jsonl"]
 )
@@ -223,28 +185,6 @@ def test_what_a_program_reports_is_a_column_of_the_index(beacon: Path) -> None:
     _, mean, spread, _ = figure.words("neighbours")
     assert "neighbours" in page.text and mean in page.words and spread in page.words
     assert "RMSE (m)" not in page.text, "the program knows nothing of a common error"
-
-
-def test_runs_of_programs_that_report_other_values_are_compared(beacon: Path, tmp_path: Path) -> None:
-    other = Path(shutil.copytree(beacon, tmp_path / "runs" / "other"))
-    states = pq.read_table(other / "states.parquet")
-    states = states.rename_columns(["hops" if name == "neighbours" else name for name in states.column_names])
-    pq.write_table(states, other / "states.parquet")
-    verdict = json.loads((other / "verdict.json").read_text())
-    verdict["reported"] = {"hops": verdict["reported"]["neighbours"]}
-    (other / "verdict.json").write_text(json.dumps(verdict))
-    done = vnet(["compare", str(beacon), str(other)])
-    assert done.exit_code == 0, done.output
-    assert "neighbours" in done.stdout and "hops" in done.stdout
-    page = Page(comparison_page(Comparison.of(beacon, other)))
-    assert {"own-0", "own-1"} <= set(page.ids)
-    assert "Mean of the vehicles. B is not shown: its programs do not report neighbours." in page.text
-    rows = Comparison.of(beacon, other).reported
-    assert [row["figure"] for row in rows] == ["neighbours", "hops"]
-    assert [(row["A"], row["B"], row["B − A"]) for row in rows] == [
-        (rows[0]["A"], "–", ""),
-        ("–", rows[0]["A"], ""),
-    ]
 
 
 def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Path) -> None:
@@ -321,14 +261,6 @@ def test_compare_says_which_keys_differ_and_by_how_much(cooperative: Path, tmp_p
     assert comparison.figures[0]["B − A"] == "+0.250"
     page = Page(comparison_page(comparison))
     assert "RMSE of the common error (m)" in page.text and "run.seed 1 5" in page.text
-
-
-def test_compare_draws_the_delivery_ratio_of_short_runs_without_gaps(beacon_run: Path) -> None:
-    drawing = _delivered(Comparison.of(beacon_run, beacon_run))
-    first, second = drawing.canvas.axes.get_lines()
-    ratio = np.asarray(first.get_ydata(), dtype=float)
-    assert len(ratio) >= 20 and np.isfinite(ratio).all(), "2 s are 20 periods"
-    assert 80 < ratio.mean() < 100 and np.array_equal(ratio, np.asarray(second.get_ydata()))
 
 
 def test_a_report_of_an_unfinished_run_says_so(beacon: Path, tmp_path: Path) -> None:

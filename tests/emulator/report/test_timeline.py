@@ -19,7 +19,6 @@ from emulator.report.timeline import (
     Timeline,
     bars_of,
     choose,
-    first_view,
     marks_of,
     points_of,
     timeline,
@@ -135,19 +134,6 @@ def test_frames_near_failures_are_kept_whole_and_the_rest_is_spread(most: int) -
     assert kept[near_fault].all()
     rest = np.flatnonzero(kept & ~near & ~near_fault)
     assert step > 1 and rest[0] < 100 and rest[-1] > 1900 - step
-
-
-def test_all_frames_of_one_instant_are_more_than_there_is_room_for() -> None:
-    frames = Emissions(np.arange(100), np.repeat(np.arange(100), 10), np.full(100, 10))
-    kept, _ = choose(frames, np.zeros(100, dtype=np.int64), {}, 200)
-    assert 0 < 10 * kept.sum() <= 200
-
-
-def test_the_first_view_shows_the_slope_of_arrows_and_lies_in_the_run() -> None:
-    assert first_view(8_000_000, 20_000_000, 3000) == [7_892_000, 8_072_000]
-    assert first_view(None, 20_000_000, 3000) == [0, 1_000_000]
-    assert first_view(50_000, 300_000, 100_000) == [0, 300_000]
-    assert first_view(19_990_000, 20_000_000, 0) == [19_000_000, 20_000_000]
 
 
 def test_a_fault_that_does_not_end_lasts_until_the_end_and_unknown_nodes_are_left_out() -> None:

@@ -10,12 +10,9 @@ import pytest
 
 import emulator
 from emulator.cells.cells import judged_figures
-from emulator.radio.outcomes import Outcome
 from emulator.records.radio_metrics import radio_metrics, unicast_figures
 from emulator.records.recorded_run import RecordedRun
-from emulator.report import radio_figures
 from emulator.report.comparison import Comparison, _delivered
-from emulator.report.figures import links
 from emulator.report.index import index_page
 from emulator.report.radio_figures import radio_section
 from emulator.report.source import Source
@@ -84,44 +81,3 @@ def test_a_run_without_broadcasts_has_its_frames_to_one_vehicle(tmp_path: Path) 
     section = radio_section(Source(tmp_path / "run"))
     assert not isinstance(section, str), section
     assert section.totals["frames to one vehicle"].startswith("2 sent, 2 acknowledged")
-
-
-def test_figures_count_receptions_in_range_and_links_broadcasts(run: Path) -> None:
-    source = Source(run)
-    assert "of the one link" in links(source).caption
-    attempted = int((~source.outcome_is("out_of_range")).sum())
-    assert attempted < len(source.trace)
-    for drawing in (radio_figures.outcomes(source), radio_figures.totals(source)):
-        assert f"{attempted:,} attempted receptions" in drawing.caption
-
-
-def test_outcomes_over_time_stack_up_to_all_receptions(run: Path) -> None:
-    made = radio_figures.outcomes(Source(run)).canvas
-    layers = made.axes.collections
-    tops = [np.asarray(path.vertices)[:, 1].max() for layer in layers for path in layer.get_paths()]
-    assert max(tops) == pytest.approx(100)
-    assert Outcome.duplicate.name in {layer.get_label() for layer in layers}
-
-
-def test_times_on_the_edge_of_a_bin_are_on_their_side(tmp_path: Path) -> None:
-    async def beacon(node: Node) -> None:
-        async for _ in node.gnss:
-            await node.radio.broadcast(b"x")
-
-    run = {"duration_s": 2.0, "settle_s": 0.0}  # what is lost is decided as it is sent, at the start of a period
-    scenario = {"network": {"vehicles": 2}, "run": run, "radio": {"range_m": 9000.0, "loss": 1.0}}
-    emulator.simulate(scenario, program=beacon, out=tmp_path / "run")
-    assert "20 to 20 a second" in radio_figures.outcomes(Source(tmp_path / "run")).caption
-
-
-def test_the_axis_of_distances_holds_all_frames_of_vehicles_that_drive(tmp_path: Path) -> None:
-    async def beacon(node: Node) -> None:
-        async for _ in node.gnss:
-            await node.radio.broadcast(b"x")
-
-    road = {"start_m": [200.0, 100.0], "speed_mps": [40.0, 10.0]}
-    scenario = {"network": {"kind": "driven", "vehicles": 2, "driven": road}, "run": {"duration_s": 5.0}}
-    emulator.simulate(scenario, program=beacon, out=tmp_path / "run")
-    axes = links(Source(tmp_path / "run")).canvas.axes
-    drawn_km = max(np.max(line.get_xdata()) for line in axes.get_lines() if "all frames" in str(line.get_label()))
-    assert drawn_km <= axes.get_xlim()[1]

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.records.events import Event
-from emulator.terminal.dashboard import Dashboard, sparkline
+from emulator.terminal.dashboard import Dashboard
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
 FAULTS = (
@@ -166,62 +166,3 @@ def test_nothing_moves_while_events_and_frames_come(height: int) -> None:
             (len(lines), *(labels.index(name) for name in ("time", "vehicles", "common", "frames", "events")))
         )
     assert len(places) == 1
-
-
-@pytest.mark.parametrize(
-    ("changes", "later_s", "said"),
-    [
-        ({"idle_s": 3.0}, 1.0, "2.5× real time · 4 s left"),
-        ({"idle_s": 3.0}, 9.0, "no period for 12 s"),
-        ({"remaining_s": 0.0}, 0.0, "2.5× real time · ending"),
-        ({"remaining_s": 600.0}, 0.0, "2.5× real time · 10 min left"),
-        ({"remaining_s": 9000.0}, 0.0, "2.5× real time · 2 h 30 min left"),
-        ({"phase": "judging", "idle_s": 60.0}, 0.0, "judging the run"),
-    ],
-)
-def test_the_headline_says_how_fast_it_is_or_that_it_stands(
-    changes: dict[str, object], later_s: float, said: str
-) -> None:
-    lines = render(Dashboard(make(**changes), later_s)).export_text().splitlines()
-    assert lines[0].endswith(said)
-
-
-def test_colours_and_none() -> None:
-    """Styles, not codes: Rich keeps a style's codes for the first kind of terminal that it was written to."""
-    console = Console(width=100, height=30, force_terminal=True, file=io.StringIO(), color_system="truecolor")
-    styles = {segment.text: segment.style for segment in console.render(Dashboard(make()))}
-    for text in ("v04 died: SIGKILL", "  1 down: "):
-        style = styles[text]
-        assert style is not None and style.bold and style.color is not None
-        assert style.color.triplet == (213, 94, 0), "what is bad is red"
-    plain = written(render(Dashboard(make()), color_system=None))
-    assert "\x1b" not in plain
-    (bar,) = [line for line in plain.splitlines() if line.startswith("frames")]
-    assert bar.split()[1] == "█" * 28 + "▒" * 13 + "▤" * 5, "signs tell outcomes apart"
-
-
-def test_a_status_has_no_room_for_what_is_to_come() -> None:
-    steady = render(Dashboard(make())).export_text().splitlines()
-    fleeting = render(Dashboard(make(), steady=False)).export_text().splitlines()
-    assert fleeting == steady[: len(fleeting)]
-    assert fleeting[-1].endswith("SIGKILL")
-    assert set(steady[len(fleeting) :]) == {""}
-
-
-@pytest.mark.parametrize("width", [1, 7, 46, 60, 119, 120])
-def test_a_sparkline_rises_and_falls_with_its_values(width: int) -> None:
-    rising = sparkline(tuple(1.1**n for n in range(BINS)), width)
-    assert len(rising) == width
-    assert list(rising) == sorted(rising)
-    if width > 6:
-        assert (rising[0], rising[-1]) == ("▁", "▇")
-    assert set(sparkline((0.3,) * BINS, width)) == {"▄"}, "what is steady does not look wild"
-    assert len(sparkline((1.0,) * (BINS // 2), width)) == math.ceil(width / 2)
-
-
-def test_a_sparkline_of_odd_values() -> None:
-    assert sparkline((None,) * 50, 20) == ""
-    assert sparkline((), 20) == ""
-    assert sparkline((None,) * 60 + (1.0,) * 60, 4) == "  ▄▄"
-    assert sparkline((1.0,) * 60 + (math.inf,) * 60, 4) == "▄▄▇▇"
-    assert sparkline((0.0,) * 60 + (1.0,) * 60, 4) == "▁▁▇▇"

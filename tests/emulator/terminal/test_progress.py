@@ -120,18 +120,6 @@ def test_what_goes_wrong_has_a_line_at_once(tmp_path: Path) -> None:
     assert "   0.5 s  v02 crashed: RuntimeError: the battery is flat, programs.py:" in file.getvalue()
 
 
-def test_plain_lines_of_joining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(PlainLines, "every_s", 0.0)
-    file = io.StringIO()
-    with PlainLines(emulate(tmp_path / "run"), file) as progress:
-        for missing in (["v01", "v02", "v05"], ["v02"], []):
-            progress.awaits(missing)
-    assert file.getvalue().splitlines() == [
-        "3 of 6 vehicles have joined; missing: v01, v02, v05",
-        "5 of 6 vehicles have joined; missing: v02",
-    ]
-
-
 @pytest.mark.slow
 def test_lines_of_json_hold_the_figures_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(JsonLines, "every_s", 0.0)
@@ -167,16 +155,6 @@ def test_lines_of_json_hold_the_figures_of_the_run(tmp_path: Path, monkeypatch: 
     }
 
 
-def test_lines_of_json_of_joining(tmp_path: Path) -> None:
-    file = io.StringIO()
-    with JsonLines(emulate(tmp_path / "run"), file) as progress:
-        progress.awaits(["v01", "v02"])
-        progress.awaits([])
-    states = [json.loads(line) for line in file.getvalue().splitlines()]
-    told = [(state["phase"], state["missing"], state["vehicles"]) for state in states]
-    assert told == [("starting", [], 6), ("joining", ["v01", "v02"], 6), ("running", [], 6)]
-
-
 @pytest.mark.slow
 def test_a_picture_of_a_run_leaves_nothing_but_what_was_said(tmp_path: Path) -> None:
     screen = Terminal(80, 24)
@@ -184,15 +162,3 @@ def test_a_picture_of_a_run_leaves_nothing_but_what_was_said(tmp_path: Path) -> 
     assert verdict["verdict"] == "valid"
     assert "lockstep · seed 1" in "".join(screen.written), "it was there"
     assert screen.screen.text == "all set"
-
-
-def test_a_picture_follows_who_joins(tmp_path: Path) -> None:
-    screen = Terminal(80, 24)
-    with Picture(emulate(tmp_path / "run"), screen.console) as picture:
-        picture.awaits(["v02"])
-        picture._live.refresh()
-        assert "5 of 6" in screen.screen.text
-        assert "v02" in screen.screen.text
-        picture.judging()
-        picture._live.refresh()
-        assert "judging the run" in screen.screen.text

@@ -212,36 +212,6 @@ async def test_of_nobody():
     result.stdout.fnmatch_lines(["*async def functions are not natively supported*"])
 
 
-def test_a_test_that_another_plugin_has_taken_stays_with_it(pytester: pytest.Pytester) -> None:
-    pytester.makeconftest(
-        """
-import asyncio, pytest
-
-def pytest_configure(config):
-    config.addinivalue_line("markers", "asyncio: taken")
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call(pyfuncitem):
-    if pyfuncitem.get_closest_marker("asyncio"):
-        print("taken by the other")
-        asyncio.run(pyfuncitem.obj(**{n: pyfuncitem.funcargs[n] for n in pyfuncitem._fixtureinfo.argnames}))
-        return True
-"""
-    )
-    result = run_tests(
-        pytester,
-        """
-@pytest.mark.asyncio
-async def test_taken(vnet_emulation):
-    async with vnet_emulation(BEACON, vehicles=2, duration=1) as emu:
-        await emu.run_until(0.1)
-""",
-        "-s",
-    )
-    result.assert_outcomes(passed=1)
-    result.stdout.fnmatch_lines(["*taken by the other*"])
-
-
 def test_a_step_that_was_cancelled_goes_on_and_the_next_waits_for_it(pytester: pytest.Pytester) -> None:
     result = run_tests(
         pytester,
@@ -360,11 +330,6 @@ async def test_live(vnet_emulation):
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*ProgramError: program.entry = 'nothing:main': cannot import*"])
     assert not list((pytester.path.parent / "basetemp").glob("**/vnet-1"))
-
-
-def test_the_plugin_is_installed_with_vnet() -> None:
-    text = (ROOT / "pyproject.toml").read_text()
-    assert '[project.entry-points.pytest11]\nvnet = "emulator.testing.plugin"' in text
 
 
 def test_the_plugin_imports_nothing_heavy() -> None:

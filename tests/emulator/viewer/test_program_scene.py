@@ -65,14 +65,6 @@ def test_a_value_is_a_curve_of_mean_band_and_vehicle(entities: dict[str, Entity]
     assert next(iter(entities["/program/curve/warned"].at["Scalars:scalars"])) == pytest.approx(0.3)
 
 
-def test_vehicles_are_coloured_by_a_value(entities: dict[str, Entity]) -> None:
-    colours = entities["/program/map/delay_ms"].at["Points2D:colors"][0.0]
-    assert len(set(colours)) == 4
-    parts = np.array([[colour >> 24, colour >> 16 & 255, colour >> 8 & 255] for colour in colours], dtype=int)
-    assert (np.ptp(parts, axis=1) > 100).sum() == 3  # all but the grey one are far from grey
-    assert len(entities["/program/map/delay_ms"].at["Points2D:positions"][0.0]) == 4
-
-
 def test_a_text_is_a_state_of_the_vehicle(entities: dict[str, Entity]) -> None:
     assert entities["/program/texts/state"].at["StateChange:state"] == {0.0: ["early"], 0.5: ["late"]}
 

@@ -9,7 +9,6 @@ import pytest
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import pack, unpack
 from emulator.viewer.overview_scene import DrawnReference
 from tests.support.recorded import prepared
 from vnet.node import Node
@@ -61,26 +60,9 @@ def test_it_finds_the_common_error_as_well_as_cooperation_does(told: list[dict[s
     assert late(steps(told)) < 0.3 * late([period["figures"]["fix_rmse_m"] for period in told[1:]])
 
 
-def test_it_is_the_same_each_time(told: list[dict[str, Any]]) -> None:
-    assert steps(told) == steps(told)
-
-
 def test_it_says_nothing_where_nobody_speaks_of_a_common_error(tmp_path: Path) -> None:
     told = tell(tmp_path / "run", f"{__name__}:say_nothing", run={"duration_s": 0.5})
     assert steps(told) == [None] * 5
-
-
-def test_fixes_that_are_missing_and_periods_that_were_left_out_are_bridged(told: list[dict[str, Any]]) -> None:
-    periods = [dict(period) for period in told[1:]]
-    for number, period in enumerate(periods):
-        fix_m = unpack(period["fix_m"], 2).copy()
-        fix_m[number % 12] = np.nan
-        period["fix_m"] = pack(fix_m)
-        period["up"] = bytes(number != 3 for _ in range(12))
-    del periods[5:9]
-    found = steps([told[0], *periods])
-    assert np.isfinite(late(found))
-    assert late(found) < 2.0
 
 
 def test_each_component_has_a_filter_of_its_own(told: list[dict[str, Any]]) -> None:

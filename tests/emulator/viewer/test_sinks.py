@@ -16,10 +16,8 @@ import pytest
 import rerun as rr
 
 from emulator.viewer import sinks as sinks_module
-from emulator.viewer import watch
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import (
-    ServeAt,
     Sinks,
     choose_sinks,
     is_closed,
@@ -126,19 +124,6 @@ def test_a_port_that_another_program_took_in_between_is_said_in_one_line() -> No
         raise AssertionError("it was opened")
 
 
-def test_addresses_as_they_are_told() -> None:
-    here = ServeAt("127.0.0.1", 9000)
-    assert here.announcement() == (
-        "viewer: rerun --connect rerun+http://127.0.0.1:9000/proxy\n"
-        "browser: http://127.0.0.1:9001/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9000%2Fproxy"
-    )
-    everywhere = ServeAt("0.0.0.0", 9000)
-    assert everywhere.url == f"rerun+http://{socket.gethostname()}:9000/proxy"
-    assert everywhere.announcement().endswith("whoever can reach port 9000 of this machine can watch")
-    assert everywhere.origin == "http://*:9001"
-    assert ServeAt("::1", 9000).web_url.startswith("http://[::1]:9001/")
-
-
 def draw(recording: rr.RecordingStream, count: int) -> None:
     for number in range(count):
         recording.set_time("emulated time", duration=number)
@@ -210,11 +195,6 @@ def test_a_viewer_is_opened_on_what_is_served_and_outlives_the_recording(
     wait_for(lambda: Path(f"{noted}-native").read_text() != "")
     assert Path(f"{noted}-native").read_text().startswith(f"--bind 127.0.0.1 --connect {place.url} ")
     assert Path(f"{noted}-web").read_text().startswith("--bind 127.0.0.1 --serve-web ")
-
-
-def test_the_viewers_own_port_is_bound_to_the_loopback_interface() -> None:
-    assert viewer_command("x")[1:] == ["--bind", "127.0.0.1", "x"]
-    assert Path(viewer_command("x")[0]).exists()
 
 
 KILLED = """
@@ -337,17 +317,6 @@ def test_what_waits_is_drawn_by_an_observer_that_a_signal_ends() -> None:
     finally:
         signal.signal(signal.SIGTERM, before)
     assert recorder.drawn == [0, 1, 2, 3, 4]
-
-
-def test_an_observer_that_is_ended_with_much_to_draw_draws_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    inbox = Inbox()
-    recorder = Drawn(inbox)
-    for number in range(5):
-        inbox.put("period", wire.encode_observation({"period": number}))
-    inbox.close()
-    monkeypatch.setattr(watch, "CLOSING_S", -1.0)
-    _record_all(inbox, recorder)
-    assert recorder.drawn == []
 
 
 def test_what_a_lost_emulator_said_last_does_not_make_it_be_waited_for() -> None:

@@ -108,20 +108,12 @@ BOMB = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]>'
 BAD_OSM = {
     "no node at all": (maps.osm_xml(nodes=()), "it lacks the nodes of its"),
     "a way of one node": (maps.osm_xml({5: ((1,), {"highway": "primary"})}), "way 5: 1 nodes; a road needs two"),
-    "a way of no node": (maps.osm_xml({5: ((), {"highway": "primary"})}), "way 5: 0 nodes; a road needs two"),
-    "a way along one point": (
-        maps.osm_xml({5: ((1, 1), {"highway": "primary"})}),
-        "no roads that vehicles may use",
-    ),
     "no road": (maps.osm_xml({5: ((1, 2), {"highway": "footway"})}), "no roads that vehicles may use"),
     "a latitude that is none": (node('lat="north" lon="-83.7"'), "line 3: wrong format for coordinate: 'north'"),
-    "a latitude that is not a number": (node('lat="nan" lon="-83.7"'), "line 3: "),
     "a latitude beyond the pole": (node('lat="95" lon="-83.7"'), "way 10: node 1 is not on the earth"),
     "metres": (node('lat="4682000" lon="271000"'), "line 3: wrong format for coordinate: '4682000'"),
-    "a node of the other side": (node('lat="-83.74" lon="42.28"'), "way 10: 9,341 km from the origin"),
     "a node at 0°, 0°": (node('lat="0" lon="0"'), "way 10: 5,146 km from the origin"),
     "entities": (maps.osm_xml().replace("<osm ", BOMB + "<osm "), "XML entities are not"),
-    "text that is not closed": (maps.osm_xml().replace("</osm>", ""), ""),
     "a network of SUMO": (maps.sumo_net(), ""),
 }
 
@@ -174,10 +166,8 @@ def lines(*features: Any) -> str:
 BAD_GEOJSON = {
     "no JSON": ("{", "not a GeoJSON feature collection: "),
     "a feature alone": (json.dumps(maps.line([HERE, THERE])), "not a GeoJSON feature collection: "),
-    "another type": (json.dumps({"type": "Topology", "features": []}), "type = 'Topology'"),
     "no feature": (maps.collection(), "no roads"),
     "no line": (maps.collection({"type": "Feature", "geometry": None}), "no roads"),
-    "a feature that is none": (lines(3), "$.features[1]"),
     "nested without end": ('{"type": "FeatureCollection", "features": ' + "[" * 100_000, ""),
     "metres": (lines(maps.line([[271000.0, 4682000.0], HERE])), "feature 1: longitude = 271000: not within ±180"),
     "swapped": (lines(maps.line([[42.28, -93.74], HERE])), "feature 1: latitude = -93.74: not within ±90"),
@@ -187,19 +177,14 @@ BAD_GEOJSON = {
     ),
     "one point": (lines(maps.line([HERE])), "feature 1: its coordinates are not a line"),
     "a point of one number": (lines(maps.line([HERE, [1.0]])), "feature 1: its coordinates are not a line"),
-    "text": (lines(maps.line([HERE, ["-83.7", "42"]])), "feature 1: its coordinates are not a line"),
-    "null": (lines(maps.line([HERE, [None, 42.0]])), "feature 1: its coordinates are not a line"),
     "a number without end": (lines(maps.line([HERE, [10**400, 42]])), "feature 1: its coordinates are not a line"),
-    "NaN": (lines(maps.line([HERE, [float("nan"), 42.0]])), "not a GeoJSON feature collection: "),
     "no length": (maps.collection(maps.line([HERE, HERE])), "no roads"),
     "a class": (
         lines(maps.line([HERE, THERE], **{"class": "path"})),
         "feature 1: class = 'path': allowed are motorway",
     ),
-    "a class that is a list": (lines(maps.line([HERE, THERE], **{"class": []})), "feature 1: class = []"),
     "lanes": (lines(maps.line([HERE, THERE], lanes_forward=17)), "feature 1: lanes_forward = 17: 0 to 16 allowed"),
     "half a lane": (lines(maps.line([HERE, THERE], lanes_forward=0.5)), "feature 1: lanes_forward, lanes_backward"),
-    "no lane": (lines(maps.line([HERE, THERE], lanes_forward=0, lanes_backward=0)), "feature 1: lanes_forward, "),
     "a width": (lines(maps.line([HERE, THERE], lane_width_m=1)), "feature 1: lane_width_m = 1: 2 to 20 allowed"),
     "another projection": (
         json.dumps({"type": "FeatureCollection", "features": [], "crs": {"properties": {"name": "EPSG:3857"}}}),
@@ -220,24 +205,12 @@ LOCATION = '<location netOffset="{}" projParameter="{}"/>'
 BAD_LANE = '<edge id="e" from="1" to="2"><lane id="e_0" index="0" {}/></edge>'
 BAD_SUMO = {
     "not XML": (maps.sumo_net(more="<edge>"), "line 22: not XML: mismatched tag"),
-    "another file of SUMO": ("<routes>\n</routes>", "line 1: <routes>: a network of SUMO starts with <net>"),
     "an unknown encoding": ('<?xml version="1.0" encoding="klingon"?><net/>', "not XML: "),
-    "an encoding of two bytes": ('<?xml version="1.0" encoding="shift_jis"?><net/>', "not XML: "),
     "entities": (maps.sumo_net().replace("<net ", BOMB + "\n<net "), "line 2: a document type"),
     "no lane": ("<net/>", "no roads that vehicles may use"),
     "a lane outside of an edge": ("<net>\n<lane id='a'/></net>", "line 2: <lane> outside of an <edge>"),
     "no shape": (maps.sumo_net(more=BAD_LANE.format("")), "line 21: lane e_0: a shape of two points or more"),
-    "a shape of one point": (
-        maps.sumo_net(more=BAD_LANE.format('shape="1,2"')),
-        "line 21: lane e_0: a shape of two",
-    ),
     "a shape of text": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 a,b"')), "line 21: lane e_0: shape: 'a,b'"),
-    "not a number": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 nan,3"')), "line 21: lane e_0: shape: 'nan,3'"),
-    "an infinite x": (
-        maps.sumo_net(more=BAD_LANE.format('shape="1,2 inf,3"')),
-        "line 21: lane e_0: shape",
-    ),
-    "one coordinate": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 3"')), "line 21: lane e_0: shape: '3'"),
     "a width": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 3,4" width="-1"')), "line 21: width = '-1'"),
     "no length": (
         '<net><edge id="e"><lane id="e_0" shape="1,2 1,2"/></edge></net>',
@@ -248,12 +221,7 @@ BAD_SUMO = {
         "lane e_0: the map spans 4682 km",
     ),
     "an offset": (maps.sumo_net(LOCATION.format("a", maps.UTM)), "line 3: netOffset: 'a'"),
-    "two offsets": (maps.sumo_net(LOCATION.format("1,2 3,4", maps.UTM)), "line 3: netOffset: one x,y"),
     "a projection": (maps.sumo_net(LOCATION.format("0,0", "+proj=flat")), "line 3: projection +proj=flat: not one"),
-    "a projection in degrees": (
-        maps.sumo_net(LOCATION.format("0,0", "+proj=longlat")),
-        "line 3: projection +proj=lon",
-    ),
     "a projection from a file": (
         maps.sumo_net(LOCATION.format("0,0", "+init=/etc/passwd:a")),
         "line 3: projection",
@@ -278,8 +246,6 @@ LON = maps.arrays()["node_lon_deg"]
 METRES = {"node_lon_deg": None, "node_lat_deg": None, "node_x_m": np.arange(4.0) * 100, "node_y_m": np.zeros(4)}
 BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     "no nodes": ({"node_lon_deg": None}, "neither 'node_lon_deg' nor 'node_x_m' is among its arrays"),
-    "no latitudes": ({"node_lat_deg": None}, "no array 'node_lat_deg'"),
-    "no edges": ({"edges": None}, "no array 'edges'"),
     "no node": ({"node_lon_deg": np.zeros(0), "node_lat_deg": np.zeros(0)}, "no nodes"),
     "no edge": ({"edges": np.zeros((0, 2), dtype=int)}, "no roads that vehicles may use"),
     "one node": (
@@ -288,12 +254,10 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "fewer latitudes": ({"node_lat_deg": np.zeros(3)}, "node_lat_deg: numbers of shape (4,) are needed"),
     "longitudes as text": ({"node_lon_deg": np.array(["a"] * 4)}, "node_lon_deg: numbers"),
-    "longitudes as a matrix": ({"node_lon_deg": LON.reshape(2, 2)}, "node_lon_deg: numbers"),
     "not a number": (
         {"node_lon_deg": np.where(np.arange(4) == 2, np.nan, LON)},
         "node_lon_deg[2]: a finite number",
     ),
-    "infinite": ({"node_lon_deg": np.where(np.arange(4) == 1, np.inf, LON)}, "node_lon_deg[1]: a finite number"),
     "metres as degrees": ({"node_lon_deg": LON * 1000}, "node_lon_deg[0] = -83740: -180 to 180 allowed"),
     "swapped": (
         {"node_lon_deg": np.full(4, 42.3), "node_lat_deg": LON - 10},
@@ -304,9 +268,7 @@ BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
         {"edges": np.array([(0, 1), (1, 4)])},
         "edges[1]: node 4 does not exist; nodes are 0 to 3",
     ),
-    "an edge from below": ({"edges": np.array([(0, 1), (-1, 2)])}, "edges[1]: node -1 does not exist"),
     "edges of three": ({"edges": np.zeros((4, 3), dtype=int)}, "edges: pairs of integers"),
-    "edges in fractions": ({"edges": np.zeros((4, 2))}, "edges: pairs of integers"),
     "loops only": ({"edges": np.array([(1, 1), (2, 2)])}, "no roads that vehicles may use"),
     "classes that are numbers": ({"edge_class": np.zeros(5)}, "edge_class: texts of shape (5,)"),
     "a class": ({"edge_class": np.array(["road"] * 4 + ["path"])}, "edge_class[4] = 'path': allowed are motorway"),
