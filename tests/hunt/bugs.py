@@ -1,14 +1,12 @@
-"""Registry of planted bugs: twelve small vehicle programs, each with one bug that is hard to meet.
+"""Registry of planted bugs: six small vehicle programs, each with one bug that is hard to meet.
 
-They were planted before orders of events could be explored, so that an explorer can be judged by them. Six follow
+They were planted before orders of events could be explored, so that an explorer can be judged by them. They follow
 published reports; their programs, sentences and code are our own. Each module of `programs` says what its bug is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
@@ -25,12 +23,10 @@ RADIO = {
 """Radio that reaches all, and delivers in ticks of 10 ms: what is sent at one tick arrives at the next."""
 FAULTS = "kill,restart,pause,partition,block,loss,burst_loss,delay,jitter,reorder,duplicate,throttle,skew,drift"
 """Faults of processes, links and clocks. The programs trust what they receive: they meet no misbehaviour."""
-SILENCING_FAULTS = "kill,restart,pause,partition,block,loss,burst_loss,skew,drift"
-"""Faults that delay no frame: the cooperative program rejects a frame that another has overtaken, as it should."""
-COOPERATIVE = {"program.options": {"particles": 20}}
-"""Few particles, for short runs: the bugs are not the filter's."""
-CRASHED, UNHANDLED = "agents_alive", "no_exceptions"
-"""Checks of vnet's own that judge a bug that is an exception: in main, or in a task or callback."""
+DURATION_S = 2.0
+"""Emulated length of a run; its second half is free of faults."""
+CRASHED = "agents_alive"
+"""The check of vnet's own that judges a bug that is an exception in main."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,18 +43,8 @@ class Bug:
     needs_order: bool
     """True if FIFO does not show it without faults. Some of these bugs show in FIFO with faults, too."""
     vehicles: int = 3
-    duration_s: float = 2.0
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """Further keys of the scenario."""
-    faults: str = FAULTS
-    """Faults that the repaired program withstands, and with which the bug is looked for."""
-    report: str = ""
-    """Published report after which the bug was planted: repository, number and title; "" for a bug of our own."""
-
-    @property
-    def is_cooperative(self) -> bool:
-        """True for a bug of the cooperative program."""
-        return self.program.startswith("cooperative:")
+    report: str
+    """Published report after which the bug was planted: repository, number and title."""
 
     def scenario(self, repaired: bool = False) -> Scenario:
         """Return the scenario, with the program with or without the bug."""
@@ -68,12 +54,12 @@ class Bug:
             "checks": [] if own == self.judged_by else [f"{CHECKS}:{own}"],
         }
         data = {
-            "run": {"name": self.name, "duration_s": self.duration_s, "settle_s": self.duration_s / 2},
+            "run": {"name": self.name, "duration_s": DURATION_S, "settle_s": DURATION_S / 2},
             "network": {"vehicles": self.vehicles},
             "radio": RADIO,
             "program": program,
         }
-        return make_scenario(data, self.settings)
+        return make_scenario(data, {})
 
 
 BUGS = (
@@ -126,53 +112,5 @@ BUGS = (
         judged_by="own:one_session",
         needs_order=True,
         report="alisaifee/coredis#182: Connection initialization synchronization fix",
-    ),
-    Bug(
-        name="forgotten_duplicate",
-        program="repeated_warning:main",
-        repaired="repeated_warning:repaired",
-        judged_by="own:warned_once",
-        needs_order=True,
-    ),
-    Bug(
-        name="crossing_acknowledgement",
-        program="acknowledged_data:main",
-        repaired="acknowledged_data:repaired",
-        judged_by=UNHANDLED,
-        needs_order=True,
-    ),
-    Bug(
-        name="second_token",
-        program="token_ring:main",
-        repaired="token_ring:repaired",
-        judged_by="own:one_token",
-        needs_order=True,
-        vehicles=4,
-        duration_s=3.0,
-    ),
-    Bug(
-        name="endless_reckoning",
-        program="dead_reckoning:main",
-        repaired="dead_reckoning:repaired",
-        judged_by="own:reckons_without_fixes",
-        needs_order=True,
-    ),
-    Bug(
-        name="fix_sent_twice",
-        program="cooperative:by_the_clock",
-        repaired="cooperative:repaired",
-        judged_by="own:each_fix_once",
-        needs_order=True,
-        settings=COOPERATIVE,
-        faults=SILENCING_FAULTS,
-    ),
-    Bug(
-        name="burst_after_pause",
-        program="cooperative:every_fix",
-        repaired="cooperative:repaired",
-        judged_by="own:few_at_once",
-        needs_order=False,
-        settings=COOPERATIVE,
-        faults=SILENCING_FAULTS,
     ),
 )

@@ -14,10 +14,6 @@ from vnet.units import NS_PER_S
 
 MOST_ABSENT = 5
 """Periods for which a permit may be neither free nor used: it is passed on within an instant."""
-CALM_S = 0.8
-"""Length in s of the end of a run, in which a ring that has healed has one token."""
-MOST_FRAMES = 3
-"""Frames of a vehicle at one instant: after a pause, what is left of a period, and the next."""
 
 
 def shown(run: Run) -> Iterator[Result]:
@@ -66,56 +62,6 @@ def one_session(run: Run) -> Iterator[Result]:
                 rows.append({"node": event.node, "time_s": event.time_ns / NS_PER_S})
             is_open[event.node] = opens
     yield _result("one_session", rows, "one session at a time", "sessions opened beside another")
-
-
-def warned_once(run: Run) -> Iterator[Result]:
-    """Judge whether no driver is warned twice of the same hazard, but by a program that has restarted."""
-    warned: set[tuple[str | None, int]] = set()
-    rows: list[dict[str, Any]] = []
-    for event in run.events:
-        if event.kind == "restarted":
-            warned = {(node, number) for node, number in warned if node != event.node}
-        elif event.kind == "event":
-            key = event.node, event.details["details"]["number"]
-            if key in warned:
-                rows.append({"node": event.node, "number": key[1], "time_s": event.time_ns / NS_PER_S})
-            warned.add(key)
-    yield _result("warned_once", rows, f"{len(warned)} warnings, each shown once", "warnings shown again")
-
-
-def one_token(run: Run) -> Iterator[Result]:
-    """Judge whether at the end of the run one vehicle has the token, at most."""
-    calm = run.times_s >= run.scenario.run.duration_s - CALM_S
-    several = (run.reported("holds") == 1).sum(axis=1) > 1
-    rows: list[dict[str, Any]] = [{"time_s": float(time_s)} for time_s in run.times_s[calm & several]]
-    yield _result("one_token", rows, "one token at most", "periods with several tokens")
-
-
-def reckons_without_fixes(run: Run) -> Iterator[Result]:
-    """Judge whether a vehicle that has just got a fix does not reckon."""
-    rows = _rows(run, run.reported("reckons") == 1)
-    yield _result("reckons_without_fixes", rows, "fixes end reckoning", "periods reckoned in spite of a fix")
-
-
-def each_fix_once(run: Run) -> Iterator[Result]:
-    """Judge whether no vehicle has rejected a second frame with the same fix."""
-    rows = _rows(run, run.reported("rejected.duplicate") >= 1)
-    yield _result("each_fix_once", rows, "each fix sent once", "reports of a fix sent twice")
-
-
-def few_at_once(run: Run) -> Iterator[Result]:
-    """Judge whether no vehicle sends a burst of frames at one instant."""
-    columns = [run.trace[name].to_pylist() for name in ("sender", "sent_ns", "seq")]
-    frames = set(zip(*columns, strict=True))
-    bursts = Counter((sender, sent_ns) for sender, sent_ns, _ in frames)
-    rows = [
-        {"sender": sender, "time_s": sent_ns / NS_PER_S, "frames": count}
-        for (sender, sent_ns), count in sorted(bursts.items())
-        if count > MOST_FRAMES
-    ]
-    yield _result(
-        "few_at_once", rows, f"at most {max(bursts.values(), default=0)} frames at once", "bursts of frames"
-    )
 
 
 def _rows(run: Run, bad: Mask) -> list[dict[str, Any]]:

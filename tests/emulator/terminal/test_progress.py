@@ -64,14 +64,6 @@ def test_a_terminal_without_the_signs_gets_lines(monkeypatch: pytest.MonkeyPatch
     os.close(master)
 
 
-def test_colours_by_force_are_no_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm")
-    assert terminal(io.StringIO()) is None
-
-
 def test_what_shows_depends_on_who_looks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     emulation = emulate(tmp_path / "run")
     assert type(show_progress(emulation, LogFormat.TEXT, quiet=False)) is PlainLines
