@@ -134,8 +134,9 @@ class Deliveries(Sequence[Delivery]):
         """Return the packets of these columns (4, n) of the table, as they stand."""
         if not table.shape[1]:
             return []
-        numbers, index = np.unique(table[_FRAME], return_inverse=True)
-        frames = [self._frames[number] for number in numbers.tolist()]
+        numbers = sorted(set(table[_FRAME].tolist()))
+        index = np.searchsorted(numbers, table[_FRAME])
+        frames = [self._frames[number] for number in numbers]
         of_frames = np.array([_OF_PACKET(sent) for sent in frames], object)
         names, sent_ns, payloads = of_frames[index].T.tolist()
         if any(sent.altered for sent in frames):
@@ -146,14 +147,14 @@ class Deliveries(Sequence[Delivery]):
 
     def _order(self) -> NDArray[np.intp]:
         order: NDArray[np.intp] = self._table[_ARRIVAL].argsort(kind="stable")
-        arrival_ns = self._table[_ARRIVAL, order]
+        arrival_ns, receiver, _, frame = self._table[:, order]
         is_same = arrival_ns[1:] == arrival_ns[:-1]
-        if is_same.any():
+        if (is_same & ((frame[1:] != frame[:-1]) | (receiver[1:] < receiver[:-1]))).any():
             tied = np.append(is_same, False) | np.append(False, is_same)
             some = order[tied]
             arrival, receiver, row, _ = self._table[:, some]
-            rows = self._trace.rows(row)
-            order[tied] = some[np.lexsort((row, rows["copy"], receiver, rows["seq"], rows["sender"], arrival))]
+            sender, seq, copy = self._trace.frames_of(row)
+            order[tied] = some[np.lexsort((row, copy, receiver, seq, sender, arrival))]
         return order
 
 
@@ -265,7 +266,7 @@ class InFlight:
     def _forget(self) -> None:
         """Forget the frames that no reception in flight needs; earlier `Deliveries` keep the old dictionary."""
         if len(self._frames) > self._frames_kept:
-            needed = np.unique(self._table[_FRAME, : self._length]).tolist()
+            needed = set(self._table[_FRAME, : self._length].tolist())
             self._frames = {number: self._frames[number] for number in needed}
             self._frames_kept = 2 * len(needed) + 64
 

@@ -127,10 +127,12 @@ class TransmitQueue(Mac):
 
     def enqueue(self, transmissions: Sequence[Transmission]) -> None:
         """Decide `queue_full`, or the time at which each frame's transmission ends."""
-        some = np.ones(len(transmissions), np.intp)
-        draws = self._draws.uniform_at(frame_keys(transmissions), some, some - 1)
-        for sent, draw in zip(transmissions, draws.tolist(), strict=True):
-            self._take(sent, int(self._access_jitter_ns * draw))
+        jitter_ns = np.zeros(len(transmissions))
+        if self._access_jitter_ns and len(transmissions):
+            some = np.ones(len(transmissions), np.intp)
+            jitter_ns = self._access_jitter_ns * self._draws.uniform_at(frame_keys(transmissions), some, some - 1)
+        for sent, each_ns in zip(transmissions, jitter_ns.tolist(), strict=True):
+            self._take(sent, int(each_ns))
 
     def _take(self, sent: Transmission, jitter_ns: int) -> None:
         frame = sent.frame

@@ -92,8 +92,8 @@ class LatencyStage:
 
     def __call__(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
         """Set the arrival time of each reception."""
-        draws = self._draws_of(transmissions, receptions)
-        latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
+        jitter_ns = self._jitter_ns * self._draws_of(transmissions, receptions) if self._jitter_ns else np.zeros(1)
+        latency_ns = (self._latency_ns + jitter_ns).astype(np.int64)
         arrival_ns = receptions.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
         if self._tick_ns:
             arrival_ns = -(-arrival_ns // self._tick_ns) * self._tick_ns

@@ -247,6 +247,11 @@ class Trace:
             rows["payload_digest"][i] = self._altered[int(number[i])]
         return rows
 
+    def frames_of(self, rows: IntArray) -> list[NDArray[Any]]:
+        """Return the senders' numbers, the numbers of the frames and of the copies of rows (n,), an array each."""
+        frames = self._frames.records[self._receptions.records["frame"][rows]]
+        return [frames[name] for name in ("sender", "seq", "copy")]
+
     def _column(self, name: str, index: NDArray[np.intp] | slice) -> NDArray[Any]:
         """Return a column of the rows at `index`; digests are those of the payloads that were sent."""
         if name in (_RECEPTION.fields or ()):
