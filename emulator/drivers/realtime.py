@@ -77,7 +77,7 @@ class RealTime:
         self._affected: set[str] = set()
         self._next_period = 0
         self._origin_ns = time.monotonic_ns()
-        self._collected_ns = 0
+        self._collected_ns = self._taken_ns = 0
         self.gaps = 0
 
     @property
@@ -85,9 +85,13 @@ class RealTime:
         """Emulated time: the time since the start, which is negative before."""
         return time.monotonic_ns() - self._origin_ns
 
-    def since_start_ns(self, monotonic_ns: int) -> int:
-        """Return the emulated time of an instant of the monotonic clock, at least 0."""
-        return max(monotonic_ns - self._origin_ns, 0)
+    def taken_ns(self, monotonic_ns: int) -> int:
+        """Return the emulated time at which to take what has come at an instant of the monotonic clock.
+
+        That is the instant, if nothing later has gone out or been taken.
+        """
+        self._taken_ns = max(monotonic_ns - self._origin_ns, self._collected_ns, self._taken_ns)
+        return self._taken_ns
 
     @property
     def wait_s(self) -> float:
@@ -354,7 +358,7 @@ async def take_what_comes(realtime: RealTime, processes: Processes, timeout_s: f
     """Wait for something to come, at most so long, and take all that has."""
     heard = await processes.receive(timeout_s)
     while heard is not None:
-        now_ns = realtime.since_start_ns(heard.arrived_ns)
+        now_ns = realtime.taken_ns(heard.arrived_ns)
         try:
             if isinstance(heard.message, SentMessage):
                 realtime.take_messages(now_ns, [heard.message])

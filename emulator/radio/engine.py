@@ -111,7 +111,9 @@ class Deliveries(Sequence[Delivery]):
         return iter(self._all())
 
     def _all(self) -> list[Delivery]:
-        if self._built is None:
+        if self._built is None and not len(self):
+            self._built = []
+        elif self._built is None:
             table = self._table[:, self._order()]
             receivers, rows = table[_RECEIVER].tolist(), table[_ROW].tolist()
             self._built = [*map(Delivery, receivers, self._packets(table), rows)]
@@ -134,9 +136,8 @@ class Deliveries(Sequence[Delivery]):
         """Return the packets of these columns (4, n) of the table, as they stand."""
         if not table.shape[1]:
             return []
-        numbers = sorted(set(table[_FRAME].tolist()))
-        index = np.searchsorted(numbers, table[_FRAME])
-        frames = [self._frames[number] for number in numbers]
+        numbers, index = np.unique(table[_FRAME], return_inverse=True)
+        frames = [self._frames[number] for number in numbers.tolist()]
         of_frames = np.array([_OF_PACKET(sent) for sent in frames], object)
         names, sent_ns, payloads = of_frames[index].T.tolist()
         if any(sent.altered for sent in frames):
@@ -147,15 +148,22 @@ class Deliveries(Sequence[Delivery]):
 
     def _order(self) -> NDArray[np.intp]:
         order: NDArray[np.intp] = self._table[_ARRIVAL].argsort(kind="stable")
-        arrival_ns, receiver, _, frame = self._table[:, order]
+        arrival_ns = self._table[_ARRIVAL, order]
         is_same = arrival_ns[1:] == arrival_ns[:-1]
-        if (is_same & ((frame[1:] != frame[:-1]) | (receiver[1:] < receiver[:-1]))).any():
-            tied = np.append(is_same, False) | np.append(False, is_same)
+        if is_same.any() and self._are_mixed(order, is_same):
+            tied = np.zeros(len(order), np.bool_)
+            tied[1:] = is_same
+            tied[:-1] |= is_same
             some = order[tied]
             arrival, receiver, row, _ = self._table[:, some]
             sender, seq, copy = self._trace.frames_of(row)
             order[tied] = some[np.lexsort((row, copy, receiver, seq, sender, arrival))]
         return order
+
+    def _are_mixed(self, order: NDArray[np.intp], is_same: NDArray[np.bool_]) -> bool:
+        """Return whether packets that arrive together are of several frames, or not ordered by receiver."""
+        receiver, frame = self._table[_RECEIVER, order], self._table[_FRAME, order]
+        return bool((is_same & ((frame[1:] != frame[:-1]) | (receiver[1:] < receiver[:-1]))).any())
 
 
 class InFlight:
@@ -524,7 +532,7 @@ class Engine:
         each = near.sum(axis=1)
         column = near.nonzero()[1]
         receiver = column if receptions.receiver is None else receptions.receiver[near]
-        near_ones = len(receiver) - int(each[addressed].sum())
+        near_ones = len(receiver) - (int(each[addressed].sum()) if addressed else 0)
         broadcasts = len(transmissions) - len(addressed)
         self._counts[Outcome.out_of_range] += broadcasts * (len(self._node_ids) - 1) - near_ones
         outcome, arrival_ns, cause = receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]

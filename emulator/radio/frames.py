@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -256,10 +256,9 @@ class Receptions:
         """Return the receptions of transmissions among `count` nodes, all pending."""
         receiver = None if transmissions[0].frame.topology.receiver is None else rows(transmissions, "receiver")
         shape = (len(transmissions), count) if receiver is None else receiver.shape
-        arrival_ns = np.zeros(shape, np.int64)
-        arrival_ns += _column(sent.end_ns for sent in transmissions)
-        cause = np.zeros(shape, np.int16)
-        cause += _column(sent.frame.cause for sent in transmissions).astype(np.int16)
+        arrival_ns, cause = np.empty(shape, np.int64), np.empty(shape, np.int16)
+        arrival_ns.T[:] = [sent.end_ns for sent in transmissions]
+        cause.T[:] = [sent.frame.cause for sent in transmissions]
         return cls(np.zeros(shape, np.uint8), arrival_ns, cause, receiver)
 
     def receivers(self) -> NDArray[np.intp]:
@@ -303,10 +302,6 @@ def frame_keys(transmissions: Sequence[Transmission]) -> NDArray[np.uint64]:
     """Return what names the draws of each frame (K, 3): its sender, its number, and which copy it is."""
     keys = [(frame.sender, frame.seq, frame.draw) for sent in transmissions for frame in (sent.frame,)]
     return np.array(keys, np.uint64).reshape(-1, 3)
-
-
-def _column(numbers: Iterable[int]) -> NDArray[np.int64]:
-    return np.array([*numbers], np.int64)[:, None]
 
 
 Stage = Callable[[Sequence[Transmission], Receptions], None]

@@ -173,9 +173,8 @@ class Trace:
             new["left_ns"] = new["sent_ns"]
         rows = self._receptions.add(len(outcome))
         rows["frame"] = np.repeat(np.arange(first_frame, first_frame + len(each)), each)
-        rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, cause
-        rows["cause"] -= NO_CAUSE
-        arrives = (outcome == PENDING) | (outcome == Outcome.receiver_down)
+        rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, np.subtract(cause, NO_CAUSE)
+        arrives = (outcome == PENDING) | (outcome == Outcome.receiver_down.value)
         rows["arrival_ns"] = np.where(arrives, arrival_ns, NOT_ARRIVING)
         if powers_db is not None:
             powers = self._powers.add(len(outcome))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import count
 from typing import Annotated, Any, Literal
 
@@ -128,6 +129,16 @@ def decode_message(content: bytes) -> Message:
     return message
 
 
+@lru_cache(maxsize=1024)
+def whole_message(payload: bytes) -> Message | None:
+    """Return the message of a frame that has all of it, the same at all receivers; None for a part.
+
+    Raises msgspec.MsgspecError for what is none.
+    """
+    fragment = decode_fragment(payload)
+    return decode_message(fragment.content) if fragment.parts == 1 else None
+
+
 class TooLargeError(Exception):
     """A message needs more than `MOST_FRAGMENTS` frames."""
 
@@ -165,9 +176,9 @@ class Reassembly:
 
         Raises msgspec.MsgspecError or LookupError for bytes that no sender has sent, as a fault makes them.
         """
+        if (message := whole_message(payload)) is not None:
+            return message
         fragment = decode_fragment(payload)
-        if fragment.parts == 1:
-            return decode_message(fragment.content)
         unfinished = self._parts.setdefault(sender, OrderedDict())
         parts = unfinished.setdefault(fragment.number, {})
         parts[fragment.index] = fragment.content

@@ -13,7 +13,7 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
@@ -358,8 +358,9 @@ def session_environment(
     return {**inherited, **session_variables(node, endpoint, client, path), "PYTHONPATH": python_path}
 
 
-def _options(sample: CrossingSample) -> dict[str, Any]:
-    """Return the arguments with which a sample is put, deleted or replied."""
+@lru_cache(maxsize=64)
+def _options(sample: CrossingSample) -> Mapping[str, Any]:
+    """Return the arguments with which a sample is put, deleted or replied, at each receiver."""
     options: dict[str, Any] = {
         "attachment": sample.attachment,
         "priority": getattr(zenoh.Priority, sample.priority),

@@ -80,6 +80,8 @@ class _Vehicle:
     lateness: list[int] = field(default_factory=lambda: [0] * wire.LATENESS_BINS)
     late: list[tuple[int, int]] = field(default_factory=list)
     is_due: bool = False
+    heard_ns: int | None = None
+    """Instant of the monotonic clock at which the first frame of the outbox has come, if a program has sent it."""
     has_warned: bool = False
     """True once it was told that a message has more frames than the radio's queue."""
 
@@ -377,7 +379,7 @@ class Gateways:
         """Begin to send what the programs put and have put, and their tokens, and to acknowledge once a second."""
         vehicle.on_air = True
         for what, told in vehicle.early.values():
-            self.take(what, (vehicle.gateway, told))
+            self.take(what, (vehicle.gateway, told), time.monotonic_ns())
         vehicle.early.clear()
         self._acknowledge(vehicle)
         self._renew_tokens(vehicle)
@@ -410,8 +412,8 @@ class Gateways:
         hello = wire.Hello(node, node, vehicle.nonce, pid, host, ready, failure, wire.VERSION)
         self._tell("local", node, hello)
 
-    def take(self, what: str, item: tuple[Gateway | None, Any]) -> None:
-        """Take what a gateway has told, on the loop."""
+    def take(self, what: str, item: tuple[Gateway | None, Any], arrived_ns: int) -> None:
+        """Take what a gateway has told, on the loop, and when (ns of the monotonic clock)."""
         gateway, told = item
         if what == "bug":
             raise told
@@ -429,6 +431,7 @@ class Gateways:
             vehicle.early.pop(key, None)
             vehicle.early[key] = what, told
         elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
+            vehicle.heard_ns = vehicle.heard_ns or arrived_ns
             self._transmit(vehicle, message)
         elif what == "session":
             self._look_at_sessions(vehicle)
@@ -490,9 +493,10 @@ class Gateways:
         frames = wire.Frames(
             vehicle.nonce, vehicle.seq, vehicle.received_seq, (), traffic, lateness, final, (), late
         )
+        arrived_ns, vehicle.heard_ns = vehicle.heard_ns or time.monotonic_ns(), None
         vehicle.late = []
         vehicle.seq += 1
-        self._tell("local", vehicle.gateway.node, frames)
+        self._tell("frames", vehicle.gateway.node, (frames, arrived_ns))
 
     # Sessions.
 

@@ -81,7 +81,9 @@ class LiveProcesses(Processes):
         self._emulation, self._options, self._launcher, self._on_query = emulation, options, launcher, on_query
         self._realtime = run.pacing == "realtime"
         self._loop = asyncio.get_running_loop()
-        self._incoming: deque[tuple[str, str, Any]] = deque()
+        self._incoming: deque[tuple[int, str, str, Any]] = deque()
+        self._arrived_ns = 0
+        """Instant of the monotonic clock at which the message that is being taken has come."""
         self._wake_pending = self._closed = False
         self._takes: dict[str, Callable[[str, Any], None]] = {
             "message": self._take_message,
@@ -94,7 +96,8 @@ class LiveProcesses(Processes):
             "lost": lambda how, process_ids: self.supervisor.host_lost(process_ids, how),
             "memory": self._take_memory,
             "local": self._take_decoded,
-            "gateway": lambda what, item: None if self.gateways is None else self.gateways.take(what, item),
+            "frames": lambda node, heard: self._take_frames(node, *heard),
+            "gateway": self._take_from_gateway,
         }
         self.time_ns: Callable[[], int] = lambda: 0
         """Emulated time, for events."""
@@ -171,7 +174,7 @@ class LiveProcesses(Processes):
 
     def hear(self, what: str, name: str, item: Any) -> None:
         """Enqueue what has come (a key of `_takes`), with a name and a payload or a state; on any thread."""
-        self._incoming.append((what, name, item))
+        self._incoming.append((time.monotonic_ns(), what, name, item))
         if not self._wake_pending and not self._closed:
             self._wake_pending = True
             self._loop.call_soon_threadsafe(self._drain)
@@ -193,7 +196,8 @@ class LiveProcesses(Processes):
     def _drain(self) -> None:
         self._wake_pending = False
         while self._incoming and not self._closed:
-            self.take(*self._incoming.popleft())
+            self._arrived_ns, *told = self._incoming.popleft()
+            self.take(*told)
 
     def take(self, what: str, name: str, item: Any) -> None:
         """Take what has come, on the loop."""
@@ -216,7 +220,7 @@ class LiveProcesses(Processes):
                 self._take_yield(node, message)
                 self._reasons.pop(node, None)
             case wire.Frames() if self._expected is wire.Frames:
-                self._take_frames(node, message)
+                self._take_frames(node, message, self._arrived_ns)
             case wire.Hello():
                 self._take_hello(node, message)
             case wire.Final():
@@ -225,6 +229,10 @@ class LiveProcesses(Processes):
                 self._stacks[node] = message
             case _:
                 raise ProtocolError(f"an unexpected {type(message).__name__}")
+
+    def _take_from_gateway(self, what: str, item: Any) -> None:
+        if self.gateways is not None:
+            self.gateways.take(what, item, self._arrived_ns)
 
     def _take_backbone(self, unit: str, payload: bytes) -> None:
         try:
@@ -442,7 +450,7 @@ class LiveProcesses(Processes):
         if not self._granted:
             self.changes.set()
 
-    def _take_frames(self, process_id: str, message: wire.Frames) -> None:
+    def _take_frames(self, process_id: str, message: wire.Frames, arrived_ns: int) -> None:
         """Take frames and acknowledgements, with those messages of the backbone that are here."""
         if refs := message.traffic.messages:
             self._check_refs(process_id, refs)
@@ -452,7 +460,7 @@ class LiveProcesses(Processes):
             message = replace(message, traffic=replace(message.traffic, messages=here))
         if message.final:
             self._so_far.pop(process_id, None)
-        self._heard.append(Heard(process_id, message, time.monotonic_ns()))
+        self._heard.append(Heard(process_id, message, arrived_ns))
         self.changes.set()
 
     def _take_sent(self, message: SentMessage) -> None:

@@ -7,6 +7,7 @@ meet in one state a process (`ProcessState`), and only `_TRANSITIONS` lead from 
 from __future__ import annotations
 
 import asyncio
+import math
 import signal
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -39,21 +40,23 @@ class ChangeSignal:
     """Wakes the task that waits for a change. For use on the run's event loop, by one waiting task."""
 
     def __init__(self) -> None:
-        self._changed = asyncio.Event()
+        self._waiter: asyncio.Future[bool] | None = None
 
-    def set(self) -> None:
+    def set(self, has_changed: bool = True) -> None:
         """Say that something has changed."""
-        self._changed.set()
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(has_changed)
 
     async def wait(self, timeout_s: float) -> bool:
         """Wait for the next change; False if none came in time."""
-        self._changed.clear()
+        loop = asyncio.get_running_loop()
+        self._waiter = loop.create_future()
+        timer = None if math.isinf(timeout_s) else loop.call_later(timeout_s, self.set, False)
         try:
-            async with asyncio.timeout(max(timeout_s, 0)):
-                await self._changed.wait()
-        except TimeoutError:
-            return False
-        return True
+            return await self._waiter
+        finally:
+            if timer is not None:
+                timer.cancel()
 
 
 class ProcessState(StrEnum):

@@ -232,3 +232,10 @@ def test_the_true_latency_of_a_late_delivery_is_in_the_trace() -> None:
 def test_a_trace_without_late_deliveries_has_no_column_for_them() -> None:
     _, emulation = started()
     assert "late_ns" not in emulation.engine.trace.to_table().column_names
+
+
+def test_messages_are_taken_at_the_instants_at_which_they_came_and_never_before_what_has_gone_out() -> None:
+    realtime, _ = started()
+    assert [realtime.taken_ns(came_ms * MS) // MS for came_ms in (3, 5, 4)] == [3, 5, 5]
+    realtime.due(20 * MS)
+    assert [realtime.taken_ns(came_ms * MS) // MS for came_ms in (12, 21)] == [20, 21]

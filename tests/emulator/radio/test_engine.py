@@ -1,6 +1,7 @@
 """The engine and its channel: one outcome for every reception, and draws that depend only on what they decide."""
 
 import mmap
+import sys
 import tracemalloc
 from collections import Counter
 from pathlib import Path
@@ -266,3 +267,15 @@ def test_the_room_of_a_trace_takes_memory_only_as_it_is_written() -> None:
     before = resident()
     held += traces(10)
     assert resident() - before < 10 * 2**20
+
+
+def test_frames_on_their_way_load_no_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`np.unique` alone would load numpy.ma at its first call, for a tenth of a second in the middle of a run."""
+    monkeypatch.delitem(sys.modules, "numpy.ma", raising=False)
+    monkeypatch.delattr(np, "ma", raising=False)
+    subject = engine(place(4, 1, 100.0), jitter_ms=0)
+    before = set(sys.modules)
+    for number in range(200):
+        subject.transmit(number * PERIOD_NS, number % 4, [b"x"])
+        assert len(list(subject.advance(number * PERIOD_NS + PERIOD_NS // 2))) == 3
+    assert set(sys.modules) == before

@@ -42,8 +42,7 @@ from vnet.gateway.frames import (
     Message,
     Reassembly,
     TooLargeError,
-    decode_fragment,
-    decode_message,
+    whole_message,
 )
 from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
 from vnet.gateway.ros2 import Ros2
@@ -412,8 +411,6 @@ class Vehicle:
 @lru_cache(maxsize=1024)
 def _whole(payload: bytes) -> tuple[Message, Sample | None] | None:
     """Return the message of a frame that has all of it, and its sample if it is one: the same at all receivers."""
-    fragment = decode_fragment(payload)
-    if fragment.parts != 1:
+    if (message := whole_message(payload)) is None:
         return None
-    message = decode_message(fragment.content)
     return message, sample_of(message) if isinstance(message, CrossingSample) else None
