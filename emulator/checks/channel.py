@@ -280,11 +280,13 @@ def check_isolation(recorded: RecordedRun) -> Finding:
     reporting = int(np.isfinite(recorded.value("heard")).any(axis=0).sum())
     text = f"{counted(arrived, 'arrival')} as they were sent"
     text += f"; {reporting} programs report no more received packets than that" if reporting else ""
-    unsent, overstated = counted(int(foreign.sum()), "arrival"), counted(len(claims), "report")
-    broken_text = f"{unsent} of what was never sent, {overstated} of more than arrived"
-    broken_text += f", sessions beside the radio at {first_names(strangers_at)}" if strangers_at else ""
-    if found_at:
-        broken_text += f', peers of {first_names(found_at)} are found by multicast (mode "client" is not)'
+    wrong = {
+        f"{counted(int(foreign.sum()), 'arrival')} of what was never sent": foreign.any(),
+        f"{counted(len(claims), 'report')} of more than arrived": claims,
+        f"more sessions than program.zenoh.sessions at {first_names(strangers_at)}": strangers_at,
+        f'peers of {first_names(found_at)} are found by multicast (mode "client" is not)': found_at,
+    }
+    broken_text = ", ".join(text for text, is_so in wrong.items() if is_so)
     figures = {"arrivals": arrived, "foreign": int(foreign.sum()), "claims": len(claims), "refused": refused}
     return result(broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
 

@@ -372,7 +372,10 @@ def test_sessions_are_counted_by_who_they_are() -> None:
     two(test)
 
 
-@pytest.mark.parametrize(("keys", "named"), [(("a//b",), "a//b"), (("a/**", "a/b"), "overlap")])
+@pytest.mark.parametrize(
+    ("keys", "named"),
+    [(("a//b",), "a//b"), (("a/**", "a/b"), "overlap"), (("vnet/fix",), "'vnet/fix' never crosses")],
+)
 def test_keys_that_cannot_be_are_named(keys: tuple[str, ...], named: str) -> None:
     with pytest.raises(ProgramError, match=named):
         check_keys(keys)
