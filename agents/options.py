@@ -13,17 +13,17 @@ from vnet.errors import ProgramError, did_you_mean, shown
 S = TypeVar("S", bound=msgspec.Struct)
 
 
-def parse(options: Mapping[str, Any], kind: type[S]) -> S:
+def parse(options: Mapping[str, Any], kind: type[S], renamed: Mapping[str, str] | None = None) -> S:
     """Convert options to a structure of the class `kind`; its field types and their bounds say what is allowed.
 
-    Raises ProgramError, in one line, with the key, its value and what is allowed.
+    `renamed` has the new names of keys that had another. Raises ProgramError, in one line, with the key, its value
+    and what is allowed.
     """
     fields = {field.name: field for field in msgspec.structs.fields(kind)}
     values = {}
     for key, value in options.items():
         if key not in fields:
-            allowed = f"unknown{did_you_mean(key, fields)}; allowed: {', '.join(sorted(fields))}"
-            raise ProgramError(f"program.options.{key}: {allowed}")
+            raise ProgramError(f"program.options.{key}: {_unknown(key, fields, renamed or {})}")
         values[key] = _convert(key, value, fields[key].type)
     return kind(**values)
 
@@ -31,6 +31,12 @@ def parse(options: Mapping[str, Any], kind: type[S]) -> S:
 def refuse(key: str, value: object, expected: str) -> ProgramError:
     """Return the error for a value that is not allowed."""
     return ProgramError(f"program.options.{key} = {shown(value)}: {expected}")
+
+
+def _unknown(key: str, known: Mapping[str, object], renamed: Mapping[str, str]) -> str:
+    if key in renamed:
+        return f"renamed; use {renamed[key]}"
+    return f"unknown{did_you_mean(key, known)}; allowed: {', '.join(sorted(known))}"
 
 
 def _convert(key: str, value: object, kind: Any) -> object:

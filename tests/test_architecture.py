@@ -208,8 +208,8 @@ def test_vnet_imports_neither_agents_nor_emulator() -> None:
 EXAMPLES = re.compile(
     r"agents\.(averaging|baselines|centralized|cooperative)|hears.all|cooperative (positioning )?program"
 )
-NAMING_EXAMPLES = {"vnet/cmm.py"}
-"""The former place of the mathematics."""
+NAMING_EXAMPLES = {"vnet/cmm.py", "vnet/runtime/programs.py"}
+"""The former place of the mathematics, and the former name of a program."""
 MEAN_OF_FIXES = "emulator/checks/senders.py"
 """A check whose figure, the mean of the fixes' errors, has the name of the program's mean."""
 

@@ -21,6 +21,9 @@ Deviation = Annotated[float, Meta(ge=0, le=COMMON_LIMIT_M)]
 Offset = Annotated[float, Meta(ge=-COMMON_LIMIT_M, le=COMMON_LIMIT_M)]
 Positive = Annotated[float, Meta(gt=0)]
 
+RENAMED = {"roads_apart": "separate_map_update"}
+"""New names of options, by the old."""
+
 OWN_PARTICLES, SHARED_PARTICLES = 1000, 200
 """Numbers of particles of a filter of a vehicle's own fixes, and of one of the fixes of all."""
 
@@ -117,7 +120,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:
         """Convert the options of a scenario. Raises ProgramError with the key, the value and what is allowed."""
-        chosen = parsing.parse(options, cls)
+        chosen = parsing.parse(options, cls, RENAMED)
         parsed = parsing.parse({**PROFILES[chosen.profile], **options}, cls)
         if parsed.hears and parsed.consensus != "exact":
             raise parsing.refuse("hears", parsed.hears, 'allowed with consensus = "exact" only')

@@ -19,7 +19,7 @@ FROM_THE_FOLDER = (
             f"`{check.name}`",
             check.claims,
             check.invalid,
-            "",
+            "the folder is of an earlier format",
             check.not_applicable,
             Subject.RUN.value,
         ]

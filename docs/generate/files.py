@@ -23,7 +23,7 @@ A run writes one folder: `runs/NAME-SEED` (with a number if that exists), or tha
 to the newest. Times are emulated nanoseconds from the start of the run; positions are metres east and north.
 [How to read the tables](../how-to/results.md#read-the-tables) has examples.
 
-The folder of a finished run is complete: `vnet check`, `report`, `render`, `play`, `compare`, `export` and `radio`
+The folder of a finished run is complete: `vnet check`, `report`, `render`, `compare`, `export` and `radio`
 give the same results on another machine, without input files, program, or SUMO. Repeating the run
 (`vnet run FOLDER/scenario.toml`) needs these.
 """
@@ -70,8 +70,16 @@ FEW = 4
 WORLD_COLUMNS = ["array", "type", "shape", "unit", "what"]
 KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
-`format` in `verdict.json` is the version of the whole folder: 4. A folder of another format is refused, with the
-version of vnet that wrote it. Its `scenario.toml` makes the run again.
+`format` in `verdict.json` is the version of the whole folder.
+
+- 4: `states.parquet` and `metrics.parquet` have the columns that the run's program declares, and no other's.
+- 3: the folder has a `manifest.json`. Without one, checks that compare files with each other are *unknown*
+  instead of *invalid*.
+- 2: the folder has a `world.npz`, and `scenario.toml` a section `[code]`.
+- 1 (vnet 0.1.0): it has neither. `render` and, with `radio.links` in a file, checks and radio figures need
+  the run's input files. Names of checks that began with `bit:` are read as `effect:`.
+
+A folder of a later format is refused, with the version of vnet that wrote it.
 """
 WORLD = {
     "node_ids": "ids of the vehicles, in the order of the scenario's network and of the tables' rows",

@@ -1,4 +1,8 @@
-"""Checks of a finished run's folder, which `vnet check` makes beside those of the run: its files fit together."""
+"""Checks of a finished run's folder, which `vnet check` makes beside those of the run: its files fit together.
+
+A folder of an earlier format has no manifest, and was written without these checks: where one of them finds
+something there, the run is *unknown* and not *invalid*.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +32,11 @@ from emulator.records.run_folder import MANIFEST_FILE, SCENARIO_FILE, VERDICT_FI
 from emulator.records.tables import BACKBONE, DRIVEN, PAYLOADS, backbone_figures
 from emulator.records.verdicts import (
     MOST_ROWS,
+    CheckResult,
     Finding,
     Judgement,
     NotExercised,
+    Verdict,
     invalid,
     named,
     not_exercised,
@@ -42,6 +48,8 @@ from emulator.scenario.loading import parse_toml
 from emulator.scenario.own_functions import are_here, declared_checks
 from vnet.counted import counted
 
+FIRST_WITH_MANIFEST = 3
+"""Format of the first folders that have a manifest."""
 FILES = "files"
 NO_PERIOD = "no period was completed"
 NOT_OF_THE_RUN = (FILES, "replay", "trace_sha256")
@@ -72,6 +80,8 @@ def check_files(recorded: OpenedRun) -> Finding:
     """Check that each file is the one whose digest the manifest has."""
     digests = read_manifest(recorded.folder)
     if digests is None:
+        if recorded.record.format < FIRST_WITH_MANIFEST:
+            return not_exercised(f"a folder of format {recorded.record.format} has no manifest")
         return invalid(f"there is no {MANIFEST_FILE}")
     differing = differing_files(recorded.folder, digests)
     for check in recorded.record.checks if not differing else ():
@@ -121,14 +131,19 @@ def check_payloads(recorded: OpenedRun) -> Finding:
 def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
     """Check that verdict.json has the figures that the other files give, and the verdict that its checks give."""
     record = recorded.record
+    if record.format == 1:
+        return not_exercised("figures of a folder of format 1 meant something else")
     kept_figures = _plain(record)
     computed = verdict_figures(recorded, rows_of(recorded.metrics)) | dict(_of_the_course(recorded))
+    if record.format < 4:  # which left out some
+        computed["figures"] = {name: value for name, value in computed["figures"].items() if name in record.figures}
     wrong = [
         {"figure": path, "kept": ours, "computed": theirs}
         for each, value in computed.items()
         for path, ours, theirs in differences(kept_figures[each], _plain(value), each)
     ]
-    wrong += _wrong_commands(recorded)
+    if record.format >= 3:
+        wrong += _wrong_commands(recorded)
     wrong += _wrong_counts(recorded)
     wrong += _wrong_checks(recorded, judgement)
     if record.verdict is not (summed := record.judgement.verdict):
@@ -284,6 +299,7 @@ FOLDER_CHECKS = (
         f"Each file is the one whose SHA-256 `{MANIFEST_FILE}` has. A run itself is unknown "
         "if the disk refused one.",
         "a file has other contents, is missing, or is not in the manifest",
+        "a folder of format 1 or 2, which has no manifest",
     ),
     FolderCheck(
         "truth",
@@ -325,6 +341,7 @@ VERDICT_FILE_CHECK = FolderCheck(
     f"`{VERDICT_FILE}` has the figures, the numbers of frames and vehicles, and the checks that the other files "
     "give.",
     "another figure, or a check that the files do not give",
+    "a folder of format 1",
 )
 
 
@@ -337,4 +354,13 @@ def judge_folder(recorded: OpenedRun, judgement: Judgement) -> None:
     else:
         findings += [NotExercised(check.name, NO_PERIOD) for check in (*FOLDER_CHECKS[1:], VERDICT_FILE_CHECK)]
     for finding in findings:
-        judgement.put(finding)
+        judgement.put(_of_earlier_format(finding) if recorded.record.format < FIRST_WITH_MANIFEST else finding)
+
+
+def _of_earlier_format(finding: Finding) -> Finding:
+    """Return a finding on a folder of an earlier vnet, which did not make this check: it makes no run invalid."""
+    if isinstance(finding, NotExercised) or finding.verdict is not Verdict.INVALID:
+        return finding
+    return CheckResult(
+        finding.name, Verdict.UNKNOWN, f"{finding.text}; the folder is of an earlier format", finding.figures
+    )

@@ -36,7 +36,7 @@ from emulator.records.run_folder import (
     SCENARIO_FILE,
     VERDICT_FILE,
     WORLD_FILE,
-    FormatError,
+    LaterFormatError,
     check_is_run,
     is_run_folder,
     not_finished,
@@ -58,12 +58,13 @@ from emulator.records.tables import (
 )
 from emulator.records.verdicts import MOST_ROWS, Record, read_record
 from emulator.scenario.faults import ProcessFault, Range, SenderFault, Swizzle
-from emulator.scenario.loading import LARGEST_BYTES, parse_recorded_scenario
+from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import LinkTable, RadioInputs, load_links
+from emulator.world.world import build_world
 from vnet.bounded import read_regular
-from vnet.errors import VnetError, printable
+from vnet.errors import ScenarioError, VnetError, printable
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 
@@ -717,21 +718,21 @@ class OpenedRun(RecordedRun):
 
     @cached_property
     def record(self) -> Record:
-        """Contents of verdict.json. A format that another vnet writes is refused."""
+        """Contents of verdict.json. A format that this vnet does not know is refused."""
         path = self.folder / VERDICT_FILE
         record = self._read(path, lambda: read_record(path))
-        if record.format != FORMAT:
-            raise FormatError(
+        if not 1 <= record.format <= FORMAT:
+            raise LaterFormatError(
                 f"{path}: format {record.format}, of vnet {printable(record.versions.get('vnet', '?'))}; this vnet "
-                f"reads {FORMAT}: make the run again with its {SCENARIO_FILE}"
+                f"reads 1 to {FORMAT}"
             )
         return replace(record, reproduce=_from_here(record.reproduce, self.folder))
 
-    def refuse_other_format(self) -> None:
-        """Raise VnetError if the folder is of another format; its verdict may be missing or broken."""
+    def refuse_later_format(self) -> None:
+        """Raise VnetError if the folder is of a later format; its verdict may be missing or broken."""
         try:
             _ = self.record
-        except FormatError:
+        except LaterFormatError:
             raise
         except VnetError:
             return
@@ -744,10 +745,18 @@ class OpenedRun(RecordedRun):
 
     @cached_property
     def world(self) -> RecordedWorld:
-        """Contents of world.npz."""
+        """Contents of world.npz. Folders of format 1 have none: their input files are needed."""
         path = self.folder / WORLD_FILE
-        self.refuse_other_format()
-        return self._read(path, lambda: RecordedWorld.read(path))
+        self.refuse_later_format()
+        if path.exists():
+            return self._read(path, lambda: RecordedWorld.read(path))
+        if self.record.format > 1:
+            raise not_finished(self.folder, WORLD_FILE)
+        try:
+            return RecordedWorld.of(build_world(load_scenario(self.folder / SCENARIO_FILE)))
+        except ScenarioError as error:
+            text = f"{self.folder}: of format 1 (vnet 0.1.0), which needs the run's input files: {error}"
+            raise VnetError(text) from None
 
     @property
     def trace(self) -> pa.Table:
@@ -813,7 +822,7 @@ class OpenedRun(RecordedRun):
     def _read_table(self, kind: Table) -> pa.Table:
         """Return a table with the types that it must have."""
         path = self.folder / kind.file
-        self.refuse_other_format()
+        self.refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
             if path.exists():

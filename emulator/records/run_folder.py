@@ -244,8 +244,8 @@ def _point_latest_to(path: Path) -> None:
 # What a folder is.
 
 
-class FormatError(VnetError):
-    """A folder is of a format that another vnet writes."""
+class LaterFormatError(VnetError):
+    """A folder is of a format that a later vnet writes."""
 
 
 def is_run_folder(folder: Path) -> bool:

@@ -11,11 +11,12 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from emulator.records.costs import RunCost
-from emulator.records.period_figures import KeyFigure, shown_figures
+from emulator.records.period_figures import POSITION_FIGURES, KeyFigure, shown_figures
 from emulator.records.reported import ReportedFigure
 from emulator.scenario.sections import first_problem
 from vnet.bounded import read_regular
 from vnet.errors import VnetError
+from vnet.units import title_of
 
 MOST_ROWS = 10
 """Offending rows that a failed check shows."""
@@ -133,6 +134,8 @@ def result(
 
 
 LARGEST_BYTES = 64 * 2**20
+RENAMED_CHECKS = {"bit:": "effect:"}
+"""Prefixes of the names of checks: that of format 1, and today's."""
 
 
 @dataclass(frozen=True)
@@ -191,8 +194,30 @@ _RECORD = TypeAdapter(Record)
 def read_record(path: Path) -> Record:
     """Read a verdict.json. Raises OSError, and VnetError where it is not what vnet writes."""
     try:
-        return _RECORD.validate_python(json.loads(read_regular(path, LARGEST_BYTES)))
+        data = json.loads(read_regular(path, LARGEST_BYTES))
+        record = _RECORD.validate_python(data)
     except ValidationError as error:
         raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
     except (ValueError, RecursionError) as error:
         raise VnetError(f"{path}: not JSON: {error}") from None
+    if "key_figures" not in data:  # of an earlier vnet, whose figures have no titles
+        own = [each.name for each in POSITION_FIGURES]
+        others = [
+            KeyFigure(name, title_of(name)) for name in record.figures if name[-2:] == "_m" and name not in own
+        ]
+        record = replace(record, key_figures=[*others, *POSITION_FIGURES])
+    if "packet_delivery_ratio" not in data:  # of an earlier vnet, which counted all receptions
+        record = replace(record, packet_delivery_ratio=record.share_of("delivered"))
+    return replace(
+        record,
+        checks=[replace(check, name=_new_name(check.name)) for check in record.checks],
+        not_exercised=[replace(check, name=_new_name(check.name)) for check in record.not_exercised],
+    )
+
+
+def _new_name(check: str) -> str:
+    """The name that a check has now."""
+    for old, new in RENAMED_CHECKS.items():
+        if check.startswith(old):
+            return new + check.removeprefix(old)
+    return check

@@ -50,7 +50,7 @@ def write_report(folder: Path) -> Path:
     Raises VnetError if `folder` is not a run's, is of a later format, or cannot be written.
     """
     source = Source(folder)
-    source.refuse_other_format()
+    source.refuse_later_format()
     known = [maybe(read) is not None for read in (lambda: source.scenario_text, lambda: source.record)]
     if not any(known):
         raise VnetError(f"{folder}: not a run's folder: neither scenario.toml nor verdict.json can be read")

@@ -45,6 +45,8 @@ from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
 T = TypeVar("T")
+RENAMED_SELECTORS = {"random": "count"}
+"""Keys of selectors: the old name, and today's."""
 Probability = Annotated[float, Field(ge=0, le=1)]
 Point = tuple[float, float]
 LONGEST_S = 86_400.0
@@ -138,6 +140,10 @@ class Selector(Section):
             return {"ids": given}
         if not isinstance(given, (dict, Selector)):
             raise ValueError('a selector is a list of ids, as ["v01", "v02"], or a table, as { count = 3 }')
+        if isinstance(given, dict):
+            for old, new in RENAMED_SELECTORS.items():
+                if old in given:
+                    raise ValueError(f"{old} is called {new}: write {{ {new} = {shown(given[old])} }}")
         return given
 
     @model_validator(mode="after")

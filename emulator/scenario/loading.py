@@ -26,7 +26,7 @@ from typing import Any, ParamSpec, TypeVar
 import tomli_w
 from pydantic import ValidationError
 
-from emulator.scenario.faults import DEFAULT_RULE, Fault, OwnRule
+from emulator.scenario.faults import DEFAULT_RULE, RENAMED_SELECTORS, Fault, OwnRule
 from emulator.scenario.network import LIBSUMO, input_files, libsumo_build
 from emulator.scenario.program import Program, from_here, split_file, with_programs
 from emulator.scenario.scenario import Scenario
@@ -343,6 +343,8 @@ def load_scenario(path: Path, overrides: Sequence[str] = (), checks: Sequence[st
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
+    if "inputs" in data:  # a run has recorded it
+        data = with_new_names(data)
     recorded_digests, _ = data.pop("inputs", {}), data.pop("code", None)
     if not isinstance(recorded_digests, dict):
         raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
@@ -510,7 +512,7 @@ def parse_recorded_scenario(text: str, path: Path) -> Scenario:
         data = parse_toml(text)
         for digests in ("inputs", "code"):
             data.pop(digests, None)
-        return Scenario.model_validate(data)
+        return Scenario.model_validate(with_new_names(data))
     except ValidationError as error:
         raise ScenarioError(f"{path}: {first_problem(error, Scenario)}") from None
     except ValueError as error:
@@ -521,6 +523,25 @@ def recorded_code(path: Path) -> dict[str, Any]:
     """Return the section `[code]` of a file, in which a run has recorded its code; empty if there is none."""
     code = read_toml(find_scenario(path)).get("code")
     return code if isinstance(code, dict) else {}
+
+
+def with_new_names(data: dict[str, Any]) -> dict[str, Any]:
+    """Return the data of a scenario that a run has recorded, with today's names."""
+    faults = data.get("fault")
+    if not isinstance(faults, list):
+        return data
+    return {**data, "fault": [_with_new_selectors(fault) for fault in faults]}
+
+
+def _with_new_selectors(fault: Any) -> Any:
+    if not isinstance(fault, dict):
+        return fault
+    return {
+        name: {RENAMED_SELECTORS.get(key, key): each for key, each in value.items()}
+        if isinstance(value, dict)
+        else value
+        for name, value in fault.items()
+    }
 
 
 def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str] = ()) -> Scenario:

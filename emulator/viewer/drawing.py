@@ -137,12 +137,12 @@ class PeriodArrays:
         return {n: unpack(cloud, 2) - truth[at[n]] for n, cloud in found.items() if len(cloud) % 8 == 0}
 
     def values(self) -> dict[str, Floats]:
-        """Numbers that programs report by names of their own, (n,) by name."""
-        return {name: unpack(value)[:, 0] for name, value in self.message["values"].items()}
+        """Numbers that programs report by names of their own, (n,) by name; none from an older vnet."""
+        return {name: unpack(value)[:, 0] for name, value in self.message.get("values", {}).items()}
 
     def texts(self) -> dict[str, list[str]]:
         """Texts that programs report by names of their own, one a vehicle by name."""
-        return {name: list(texts) for name, texts in self.message["texts"].items()}
+        return {name: list(texts) for name, texts in self.message.get("texts", {}).items()}
 
     def peers(self) -> dict[str, dict[str, Floats]]:
         """By name and node, the values (n,) that it reported for each other one and itself."""

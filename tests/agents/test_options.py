@@ -55,11 +55,12 @@ def test_options_that_are_not_set_have_their_defaults() -> None:
         ({"spans": [1]}, "spans = [1]: a table (each a list of 2 (each a number)) expected"),
         ({"spans": {"v1": [0, 1], "v2": 7}}, "spans.v2 = 7: a list of 2 (each a number) expected"),
         ({"cuont": 3}, "cuont: unknown (did you mean count?); allowed: corner_m, count, loud, peers, period_s"),
+        ({"old": 3}, "old: renamed; use count"),
     ],
 )
 def test_what_is_not_allowed_is_refused_in_one_line(options: dict[str, object], message: str) -> None:
     with pytest.raises(ProgramError) as caught:
-        parse(options, Example)
+        parse(options, Example, {"old": "count"})
     assert str(caught.value).startswith(f"program.options.{message}")
     assert "\n" not in str(caught.value)
 

@@ -28,6 +28,9 @@ Program = Callable[["Node"], Awaitable[None]]
 Programs = Mapping[str, Program]
 """Program of each node, by id."""
 
+RENAMED_MODULES = {"agents.liar": "agents.cooperative.attacker"}
+"""New names of modules with a program, by the old."""
+
 
 _given: ContextVar[Mapping[str, Program]] = ContextVar("vnet_given_programs", default=MappingProxyType({}))
 
@@ -50,6 +53,8 @@ def load_program(entry: str) -> Program:
         stand_ins.use_stand_ins(given[entry])
         return given[entry]
     module_name, _, name = entry.partition(":")
+    if module_name in RENAMED_MODULES:
+        raise ProgramError(f"program.entry = {entry!r}: renamed; use {RENAMED_MODULES[module_name]}:{name}")
     stand_ins.attach()
     try:
         module = importlib.import_module(module_name)

@@ -133,6 +133,7 @@ def test_old_foreign_and_future_frames_are_counted_and_left_out() -> None:
             {"fusoin": "none"},
             "program.options.fusoin: unknown (did you mean fusion?); allowed: alpha, common_sigma_m",
         ),
+        ({"roads_apart": True}, "program.options.roads_apart: renamed; use separate_map_update"),
         (
             {"fusion": "magic"},
             "program.options.fusion = 'magic': one of optimized, random, metropolis, max-degree, ",

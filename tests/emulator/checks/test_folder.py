@@ -122,10 +122,32 @@ def without_manifest(folder: Path) -> None:
     (folder / "manifest.json").unlink()
 
 
+def of_format(number: int) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        path = folder / "verdict.json"
+        path.write_text(path.read_text().replace('"format": 4', f'"format": {number}', 1))
+
+    return apply
+
+
 @pytest.mark.slow
-def test_a_folder_whose_manifest_is_gone_is_invalid(copy: Path) -> None:
+def test_a_folder_whose_manifest_is_gone_is_invalid_and_an_earlier_one_needs_none(copy: Path) -> None:
     without_manifest(copy)
     assert broken(check_run(copy)) == {"files"}
+    of_format(2)(copy)
+    judgement = check_run(copy)
+    assert judgement.verdict is Verdict.VALID
+    assert "files" in {left.name for left in judgement.not_exercised}
+
+
+@pytest.mark.slow
+def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_is_wrong(copy: Path) -> None:
+    next(edit for edit in EDITS if edit.found_by == "truth").apply(copy)
+    forge(copy)
+    without_manifest(copy)
+    of_format(2)(copy)
+    judgement = check_run(copy)
+    assert (broken(judgement), judgement.verdict) == (set(), Verdict.UNKNOWN)
 
 
 @pytest.mark.slow

@@ -175,14 +175,13 @@ def test_a_world_that_cannot_be_read_is_told_in_one_line(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("other", [3, 5])
-def test_a_folder_of_another_format_is_refused(inputs: Path, tmp_path: Path, other: int) -> None:
+def test_a_folder_of_a_later_format_is_refused(inputs: Path, tmp_path: Path) -> None:
     run_scenario(tmp_path / "run", with_files(inputs))
     path = tmp_path / "run" / "verdict.json"
-    path.write_text(path.read_text().replace('"format": 4', f'"format": {other}', 1))
+    path.write_text(path.read_text().replace('"format": 4', '"format": 5', 1))
     run = RecordedRun.open(tmp_path / "run")
     for read in (lambda: check_run(run.folder), lambda: list(messages(run.folder)), lambda: run.states):
-        with pytest.raises(VnetError, match=rf"format {other}, of vnet [\w.]+; this vnet reads 4"):
+        with pytest.raises(VnetError, match=r"format 5, of vnet [\w.]+; this vnet reads 1 to 4"):
             read()
 
 

@@ -1,6 +1,7 @@
 """Faults as data: what may be written down, what is said where it may not, and that it survives being written."""
 
 import json
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -12,7 +13,7 @@ from pydantic import ValidationError
 from emulator.faults.plan import FaultPlan, Nodes
 from emulator.scenario import faults
 from emulator.scenario.faults import KINDS, Fault, parse_fault
-from emulator.scenario.loading import dump_scenario, load_scenario
+from emulator.scenario.loading import dump_scenario, load_scenario, parse_recorded_scenario
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
 
@@ -105,6 +106,18 @@ def test_a_list_of_ids_is_a_selector() -> None:
     assert Scenario.model_validate({"program": {"exceptions": [exception]}}).program.of("v1").entry == "a:b"
     with pytest.raises(ValidationError, match=r"write the ids of the vehicles, as"):
         Scenario.model_validate({"program": {"exceptions": [{**exception, "nodes": {"count": 2}}]}})
+
+
+def test_what_a_run_has_recorded_is_read_under_its_new_name_and_all_else_refused(tmp_path: Path) -> None:
+    text = '[[fault]]\nkind = "kill"\nduration_s = 1.0\n[fault.nodes]\nrandom = 2\n'
+    (tmp_path / "own.toml").write_text(text)
+    with pytest.raises(ScenarioError, match=r"fault.0.kill.nodes: random is called count: write { count = 2 }"):
+        load_scenario(tmp_path / "own.toml")
+    recorded = tmp_path / "scenario.toml"
+    recorded.write_text(text + "[inputs]\n[code]\n")
+    for scenario in (load_scenario(recorded), parse_recorded_scenario(recorded.read_text(), recorded)):
+        (fault,) = scenario.fault
+        assert fault == parse_fault({"kind": "kill", "duration_s": 1.0, "nodes": {"count": 2}})
 
 
 points = st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))

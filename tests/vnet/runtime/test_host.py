@@ -386,6 +386,7 @@ def test_nodes_draw_from_seeds_of_their_own() -> None:
         ("no.such.module:main", "cannot import: ModuleNotFoundError"),
         ("agents.beacon:nothing", "has no 'nothing'"),
         ("agents.beacon:encode", "is not an async function"),
+        ("agents.liar:main", "'agents.liar:main': renamed; use agents.cooperative.attacker:main"),
     ],
 )
 def test_a_program_that_cannot_be_loaded_says_why(entry: str, message: str) -> None:
