@@ -259,6 +259,27 @@ def roads(
         _show(study.report(results, duration, rate), folder / "roads.md")
 
 
+@app.command()
+def decomposition(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 5,
+    duration: DurationOption = 100.0,
+    out: OutOption = None,
+) -> None:
+    """Decomposition: what loss, hops, caps and shares each cost, by oracles that give them back one at a time."""
+    from studies import decomposition as study
+
+    with one_line_errors():
+        folder = _folder(out, "decomposition")
+        results = [
+            {"network": name, **row}
+            for name, section in paper.network_sections(networks).items()
+            for row in study.decompose(section, range(1, seeds + 1), duration)
+        ]
+        write_results(results, folder, "decomposition")
+        _show(study.report(results, duration), folder / "decomposition.md")
+
+
 @app.command("figures")
 def draw_figures(
     networks: NetworksOption = None,
