@@ -139,3 +139,14 @@ def gained(before: Information, after: Information) -> Information:
     kept = direction[:, value > 0]
     onto = kept @ kept.T
     return Information.from_arrays(onto @ matrix @ onto, onto @ vector)
+
+
+def new_at_mean(before: Information, after: Information) -> Information:
+    """Return how much more `after` says than `before`, about its own mean; less than nothing counts as nothing."""
+    a, b, d, _, _ = after.minus(before).numbers
+    middle, root = (a + d) / 2, math.hypot((a - d) / 2, b)
+    if middle < root:  # of the eigenvalues one or both are negative
+        share = max(middle + root, 0.0) / (2 * root)
+        a, b, d = share * (a - middle + root), share * b, share * (d - middle + root)
+    x, y, *_ = plain_moments(*after.numbers)
+    return Information((a, b, d, a * x + b * y, b * x + d * y))

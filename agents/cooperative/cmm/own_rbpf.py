@@ -18,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.cmm.common_error import systematic
-from agents.cooperative.cmm.information import Five, Information, inverse, square_root
+from agents.cooperative.cmm.information import (
+    Five,
+    Information,
+    inverse,
+    inverted,
+    new_at_mean,
+    plain_moments,
+    square_root,
+)
 from agents.cooperative.cmm.kalman_bound import LaneModel, lane_axes
 from agents.cooperative.cmm.own_kalman import LEAST_VARIANCE_M2, OwnKalman
 from vnet.types import Array
@@ -32,6 +40,9 @@ LEAST_NOISE_M2 = 0.25
 a map are metres apart."""
 SIZE_STEP = 1.5
 """Ratio by which the number of particles that is wanted must differ before it changes: each change resamples."""
+LARGEST_PULL = 1.0
+"""Largest distance, in deviations of the cloud, by which what others know moves its mean in a period: further out
+there are too few particles."""
 _IDENTITY = np.eye(2)
 
 
@@ -202,12 +213,26 @@ class OwnRbpf:
         A cloud of several humps, one a lane, would be squeezed together if it were moved. With a precise receiver
         humps are narrow, and the moments say much more after a fix than its increment does: then what is new is
         what `pooled` says beyond the belief before the fix and the increment. So it is where increments of others
-        are those of lanes (`is_of_lanes`): at the beginning there are none, and less than nothing would be new.
+        are those of lanes (`is_of_lanes`). Less than nothing is never new: it would drive the cloud outward. Beside
+        what is new, which is at the mean of `pooled`, the cloud moves to that mean.
         """
-        a, b, d, x, y = pooled.minus(self._said if self._is_precise or is_of_lanes else self.belief).numbers
+        before = self._said if self._is_precise or is_of_lanes else self.belief
+        a, b, d, x, y = new_at_mean(before, pooled).numbers
+        pull_x, pull_y = self._pull(pooled)
+        x, y = x + pull_x, y + pull_y
         c_x, c_y = self.common_m
         self._log_weight = self._log_weight + c_x * (x - 0.5 * (a * c_x) - b * c_y) + c_y * (y - 0.5 * (d * c_y))
         self._settle()
+
+    def _pull(self, pooled: Information) -> tuple[float, float]:
+        """Return the vector that moves the mean of the cloud to that of `pooled`, by `LARGEST_PULL` at most."""
+        x, y, *_ = plain_moments(*pooled.numbers)
+        m_x, m_y, p, q, r = self.plain_moments
+        a, b, d = inverted(p, q, r)
+        off_x, off_y = x - m_x, y - m_y
+        x, y = a * off_x + b * off_y, b * off_x + d * off_y
+        share = min(1.0, LARGEST_PULL / math.sqrt(max(off_x * x + off_y * y, 1e-300)))
+        return share * x, share * y
 
     def _settle(self) -> None:
         """After the weights have changed: drop lanes, and resample if it is due."""

@@ -13,6 +13,7 @@ from agents.cooperative.cmm.information import (
     Information,
     gained,
     inverse,
+    new_at_mean,
     plain_moments,
     square_root,
     transport,
@@ -263,3 +264,15 @@ def test_of_three_no_majority_can_be_told() -> None:
 )
 def test_where_most_disagree_the_belief_is_wrong(shares: list[float], expected: list[float]) -> None:
     assert unless_most_disagree(shares) == expected
+
+
+@given(covariances(), covariances(), st.floats(-5, 5), st.floats(-5, 5))
+def test_what_is_new_is_never_less_than_nothing_and_at_the_mean(
+    before: Array, after: Array, x: float, y: float
+) -> None:
+    mean_m = np.array([x, y])
+    new = new_at_mean(Information.of(np.zeros(2), before), Information.of(mean_m, after))
+    scale = np.trace(inverse(before)) + np.trace(inverse(after))
+    assert np.linalg.eigvalsh(new.matrix)[0] >= -1e-9 * scale
+    assert np.linalg.eigvalsh(new.matrix - inverse(after) + inverse(before))[0] >= -1e-9 * scale
+    assert_allclose(new.vector, new.matrix @ mean_m, atol=1e-6 * scale)

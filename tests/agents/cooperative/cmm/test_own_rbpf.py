@@ -221,3 +221,23 @@ def test_the_sample_is_of_what_is_known() -> None:
     points = alone.sample(20_000, rng)
     assert_allclose(points.mean(axis=0), alone.estimate_m, atol=0.1)
     assert_allclose(np.cov(points.T), alone.estimate_covariance_m2, atol=0.3)
+
+
+@pytest.mark.parametrize("noise_m2", [NOISE_M2, 0.01 * NOISE_M2])
+def test_others_who_know_less_take_nothing_away_while_lanes_compete(noise_m2: Array) -> None:
+    """They would drive particles outward: to deviations of 8 m, where 3 m were known before the first fix."""
+    lanes = np.array([[0.0, 0.0], [6.0, 6.0]]), np.array([0.0, 1.2])
+
+    def known(factor: float) -> OwnRbpf:
+        own, rng = OwnRbpf(lanes, LaneModel(), 500, np.random.default_rng(3)), np.random.default_rng(3)
+        for _ in range(8):
+            own.predict(0.1)
+            said = own.belief
+            increment = own.take(np.ones(2) + 0.1 * rng.standard_normal(2), noise_m2)
+            assert increment is not None
+            mean_m, covariance_m2 = said.plus(increment).moments()
+            own.absorb(Information.of(mean_m + 0.5, factor * covariance_m2), is_of_lanes=True)
+        return own
+
+    assert_allclose(known(2.0).estimate_covariance_m2, known(1.01).estimate_covariance_m2)
+    assert np.linalg.eigvalsh(known(2.0).estimate_covariance_m2)[1] < 30
