@@ -28,7 +28,9 @@ LATERAL_SHARE = 0.45
 GATE_SIGMAS = 5.0
 """Fixes further from their prediction are outliers."""
 LOST_S = 2.0
-"""Time (s) of nothing but outliers after which the vehicle is somewhere else."""
+"""Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest two agree."""
+LOST_FIXES = 5
+"""Least number of outliers on end, where fixes are rare."""
 OFF_ROAD_WALK_M = 10.0
 """Random walk (m/√s) of a vehicle that is on no road, across its direction: a fix tells nearly all of its place."""
 SAME_LANE_M = 0.3
@@ -84,6 +86,7 @@ class OwnVehicle:
         self._filter: OwnKalman | OwnRbpf = OwnKalman.start(np.zeros(2), 0.0, unknown, start)
         self._is_placed = False
         self._outliers_s = 0.0
+        self._latest: Observation | None = None
         self.prior = self._filter.belief
         self.took_fix = False
 
@@ -130,15 +133,18 @@ class OwnVehicle:
         self.took_fix = False
         if fix is None:
             return NOTHING
+        before, self._latest = self._latest, fix
         was_placed = self._is_placed
         if not was_placed:
+            if not self._agree(before, fix, dt_s):
+                return NOTHING
             self._place(fix)
         noise_m2 = fix.white_covariance_m2
         increment = self._filter.take(fix.position_m, noise_m2, GATE_SIGMAS**2)
         if increment is None:
             self._is_placed = was_placed  # along a lane nothing is known before a fix has been taken
             self._outliers_s += dt_s
-            if self._outliers_s < LOST_S:
+            if self._outliers_s < max(LOST_S, LOST_FIXES * dt_s) or not self._agree(before, fix, dt_s):
                 return NOTHING
             self._place(fix)
             increment = self._filter.take(fix.position_m, noise_m2)
@@ -147,6 +153,15 @@ class OwnVehicle:
         self.took_fix = True
         self._go_on()
         return increment
+
+    def _agree(self, before: Observation | None, fix: Observation, dt_s: float) -> bool:
+        """Tell whether two fixes on end are of one place: one alone, which may be an outlier, places no vehicle."""
+        if before is None:
+            return False
+        x_m, y_m = (fix.position_m - before.position_m).tolist()
+        moved_m2 = self.model.speed_sigma_m_s**2 * dt_s**2 + float(self.model.process_noise(dt_s)[1, 1])
+        noise_m2 = float(np.trace(fix.white_covariance_m2 + before.white_covariance_m2)) / 2
+        return bool(x_m**2 + y_m**2 <= GATE_SIGMAS**2 * (moved_m2 + noise_m2))
 
     def _suit(self, multipath: tuple[float, float]) -> None:
         """Take the model of a receiver with this multipath, deviation (m) and correlation time (s)."""
