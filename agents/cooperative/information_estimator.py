@@ -377,7 +377,7 @@ class InformationEstimator:
             increments[1:] = [scaled_by(increment, share) for increment, share in each]
         own, largest = traces_of([self._increment, self._prior])
         traces = sorted(traces_of(increments))
-        usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
+        usual = INCREMENT_FACTOR * max(own, traces[max(len(traces) - 1 - max(1, len(traces) // 4), 0)])
         self._largest_increment = max(usual, self.own.largest_increment)
         if traces[-1] > self._largest_increment:
             increments = scaled_down(increments, self._largest_increment)
@@ -418,6 +418,8 @@ class InformationEstimator:
         for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):
             if share < 1:
                 of_lane = is_of_lane(increment)
+                if self._lanes and of_lane:
+                    self._lanes.learn_age(increment[4])
                 if has_joined and not of_lane:
                     continue  # c has moved since, which precise receivers see
                 origins.append(code)

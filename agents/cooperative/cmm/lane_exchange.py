@@ -53,6 +53,7 @@ class LaneExchange:
         self._lane_of: OwnKalman | None = None
         self._beyond = 0.0
         self._begins = False
+        self._oldest_passed = -2
 
     # The own fix.
 
@@ -123,16 +124,21 @@ class LaneExchange:
         self._lane = self._lane_of = None
 
     def join(self, increments: Sequence[Five]) -> None:
-        """Learn from the first that is heard how old memories are."""
-        if self.has_joined:
-            return
-        self._waited += self._waits
-        heard = [round(increment[4]) for increment in increments if is_of_lane(increment)]
-        ages = sorted(age for age in heard if age >= 0)
-        if ages:
-            self._begin(ages[len(ages) // 2])
-        self.has_joined = bool(heard) or self._waited >= JOINING_PERIODS
-        self._begins = self.has_joined and not ages
+        """Learn from those that are heard how old memories are: the oldest count, so that all come to the same."""
+        if not self.has_joined:
+            self._waited += self._waits
+        ages = [round(increment[4]) for increment in increments if is_of_lane(increment)]
+        oldest, self._oldest_passed = max([*ages, self._oldest_passed + 1]), -2
+        if oldest > (self._memory.age if self.has_joined else -1):
+            self.has_joined = True
+            self._begins = False
+            self._begin(min(oldest, MAX_AGE))
+        elif not self.has_joined and (ages or self._waited >= JOINING_PERIODS):
+            self.has_joined = self._begins = True
+
+    def learn_age(self, age: float) -> None:
+        """Learn how old memories were in the period before from an increment that is passed on."""
+        self._oldest_passed = max(self._oldest_passed, round(age) + 1)
 
     def restart(self) -> None:
         """Begin again after the vehicle's filter has."""
@@ -161,11 +167,17 @@ class LaneExchange:
         beyond = min(1.0, len(before) / heard) if heard else 0.0
         self._beyond += SMOOTHING * (beyond - self._beyond)
         factor = 1 + UNDERSTATED * self._beyond * min(1.0, weight)
-        belief = self._memory.fuse(pooled, self._sums(before, factor), self._sums(now, factor))
+        belief = self._memory.fuse(pooled, self._sums(before, factor, 1), self._sums(now, factor, 0))
         self._own.absorb(belief, is_of_lanes=True)
 
-    def _sums(self, increments: Iterable[Five], factor: float) -> dict[int, Five]:
-        known = [(kind_of_increment(each), information_of(each)) for each in increments if any(each[:2])]
+    def _sums(self, increments: Iterable[Five], factor: float, since: int) -> dict[int, Five]:
+        """Return the sums by kind of increments of `since` periods ago, of memories of the same age alone."""
+        ages = {self._memory.age - since, self._memory.age if self._memory.age == MAX_AGE else -1}
+        known = [
+            (kind_of_increment(each), information_of(each))
+            for each in increments
+            if any(each[:2]) and round(each[4]) in ages
+        ]
         sums = summed((kind, information) for kind, information in known if self._memory.follow(kind))
         return {
             kind: (factor * a, factor * b, factor * d, factor * x, factor * y)

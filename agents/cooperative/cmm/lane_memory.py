@@ -28,20 +28,20 @@ from agents.cooperative.cmm.information import Five, Information, Three, inverte
 from agents.cooperative.cmm.kalman_bound import LaneModel
 from vnet.types import Array
 
-FIRST_LOG_ODDS, LOG_ODDS_STEP = -14.0, 0.625
+FIRST_LOG_ODDS, LOG_ODDS_STEP = -14.0, 1.25
 """Base-2 logarithm of K / (1 − K) of the first kind, and its step from kind to kind: receivers of 0.01 to 100 m."""
 SAME_NOISE = 0.7
 """Change of the logarithm of a fix's variance up to which the filter keeps its gain."""
-KINDS = 31
-"""Number of gains: those of neighbouring kinds differ by a factor of 1.5, and either is nearly the best."""
+KINDS = 16
+"""Number of gains: those of neighbouring kinds differ by a factor of 2.4, and the nearest is nearly the best."""
 SPREAD_STEP, SPREAD_STEPS = 2.0, 8
 """Factor of the variance of the offset from family to family, and their number: multipath of up to 4 m."""
 TIME_STEP, TIME_STEPS = math.sqrt(2.0), 8
 """Factor of the correlation time of the offset, and the number of times: up to 11 times that without multipath."""
 ALL_KINDS = KINDS * SPREAD_STEPS * TIME_STEPS
 """Number of kinds of all families; half precision has integers up to 2048."""
-MAX_KINDS = 6
-"""Number of kinds that are followed at a time."""
+MAX_KINDS = 10
+"""Number of kinds that are followed at a time: a dozen of 0.03 to 30 m have about nine."""
 UNHEARD_PERIODS = 100
 """Periods after which a kind that nobody uses is forgotten."""
 MAX_AGE = 255

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from agents.cooperative.cmm.kalman_bound import LaneModel, OffsetAndMultipath
 from agents.cooperative.cmm.own_vehicle import OwnConfig, OwnVehicle
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
+from agents.cooperative.options import Options
 from tests.agents.cooperative.test_information import PERIOD_NS, MovingNetwork
 from vnet import Fix
 from vnet.roads.lanes import LaneMap
@@ -112,6 +113,58 @@ def test_in_any_network_errors_are_as_stated(drawn: list[Receiver], seed: int, r
     for estimator in network.estimators:
         assert np.isfinite(estimator.common_error[0]).all()
         assert (np.linalg.eigvalsh(estimator.common_error[1]) > 0).all()
+
+
+class BadStart(MixedNetwork):
+    """The first fix of a vehicle is an outlier, at a time when nobody can tell."""
+
+    def fix(self, k: int) -> Fix:
+        """Return a fix of vehicle k."""
+        fix = super().fix(k)
+        return replace(fix, position_m=fix.position_m + np.array([6.0, 9.0])) if k == self.period == 0 else fix
+
+
+def test_a_first_fix_that_is_an_outlier_moves_nobody() -> None:
+    found = []
+    for seed in range(3):
+        network = BadStart([Receiver()] * 6, seed)
+        for _ in range(10):
+            network.advance()
+            found.append(network.normalized())
+    assert np.mean(found) < 2
+
+
+@pytest.mark.parametrize("sigma_m", [0.03, 0.3])
+def test_who_hears_of_older_memories_at_second_hand_alone_is_consistent(sigma_m: float) -> None:
+    """Of a ring of six three begin late at once: the middle one hears only the other two."""
+    found = []
+    for seed in range(3):
+        network = MixedNetwork([Receiver(sigma_m)] * 6, seed, 1)
+        for _ in range(20):
+            network.advance()
+        for k in (0, 1, 5):
+            network.estimators[k] = network.new(k)
+        for period in range(30):
+            network.advance()
+            found.append(network.normalized() if period > 5 else 0.0)
+    assert np.mean(found) < 1.3
+
+
+def test_coarse_receivers_do_not_keep_a_network_from_what_precise_ones_know() -> None:
+    """What three of eight say is not cut to what most can say."""
+
+    def error_m(**options: object) -> float:
+        squares = []
+        for seed in range(3):
+            network = MixedNetwork([Receiver(0.1)] * 3 + [Receiver(10.0)] * 5, seed)
+            network.options = Options.parse({"exchange": "information", "particles": 300, **options})
+            network.estimators = [network.new(k) for k in range(8)]
+            for _ in range(30):
+                network.advance()
+            squares += [float(np.sum((e.common_error[0] - network.common_m) ** 2)) for e in network.estimators]
+        return math.sqrt(np.mean(squares))
+
+    assert error_m() < 1.5 * error_m(defence=False)
 
 
 def test_offset_and_multipath_make_one_process() -> None:
