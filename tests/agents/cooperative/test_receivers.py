@@ -136,7 +136,7 @@ def test_a_first_fix_that_is_an_outlier_moves_nobody() -> None:
 
 @pytest.mark.parametrize("sigma_m", [0.03, 0.3])
 def test_who_hears_of_older_memories_at_second_hand_alone_is_consistent(sigma_m: float) -> None:
-    """Of a ring of six three begin late at once: the middle one hears only the other two."""
+    """Three of a ring of six begin late at once: the middle one hears only the other two."""
     found = []
     for seed in range(3):
         network = MixedNetwork([Receiver(sigma_m)] * 6, seed, 1)
@@ -151,7 +151,7 @@ def test_who_hears_of_older_memories_at_second_hand_alone_is_consistent(sigma_m:
 
 
 def test_coarse_receivers_do_not_keep_a_network_from_what_precise_ones_know() -> None:
-    """What three of eight say is not cut to what most can say."""
+    """Three of eight are precise, and are not cut to what the others can say."""
 
     def error_m(**options: object) -> float:
         squares = []
