@@ -9,13 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
 from emulator.radio.frames import NO_CAUSE
@@ -251,12 +249,6 @@ class Trace:
         frames = self._frames.records[self._receptions.records["frame"][rows]]
         return [frames[name] for name in ("sender", "seq", "copy")]
 
-    def _column(self, name: str, index: NDArray[np.intp] | slice) -> NDArray[Any]:
-        """Return a column of the rows at `index`; digests are those of the payloads that were sent."""
-        if name in (_RECEPTION.fields or ()):
-            return np.asarray(self._receptions.records[name][index])
-        return np.asarray(self._frames.records[name][self._receptions.records["frame"][index]])
-
     def to_table(self) -> pa.Table:
         """Return the trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
 
@@ -270,19 +262,24 @@ class Trace:
         """
         receptions, frames, powers = self._receptions.records, self._frames.records, self._powers.records
         order = self._canonical_order()
-        digest = self._column("payload_digest", order)
+        of_row = receptions["frame"][order]
+
+        def values_of(column: str) -> NDArray[Any]:
+            return receptions[column][order] if column in (_RECEPTION.fields or ()) else frames[column][of_row]
+
+        digest = values_of("payload_digest")
         for i in np.flatnonzero(receptions["altered"][order]).tolist():
             digest[i] = self._altered[int(order[i])]
 
         def named(column: str, names: Sequence[str]) -> pa.DictionaryArray:
-            codes = pa.array(self._column(column, order).astype(np.int32))
+            codes = pa.array(values_of(column).astype(np.int32))
             return pa.DictionaryArray.from_arrays(codes, pa.array(list(names), pa.string()))
 
         def plain(column: str) -> pa.Array:
-            return pa.array(self._column(column, order))
+            return pa.array(values_of(column))
 
         def optional(column: str) -> pa.Array:
-            values = self._column(column, order)
+            values = values_of(column)
             return pa.array(values, mask=values == NOT_ARRIVING)
 
         return pa.table(
@@ -299,7 +296,7 @@ class Trace:
                 "copy": plain("copy"),
                 **({"on_air_ns": optional("on_air_ns"), "left_ns": plain("left_ns")} if self._knows_air else {}),
                 **({name: plain(name) for name in CHOSEN} if self.chooses else {}),
-                **(_exchanges(frames[receptions["frame"][order]]) if self.acknowledges else {}),
+                **(_exchanges(frames[of_row]) if self.acknowledges else {}),
                 **({LATE: pa.array(self._late(order))} if self._late_ns else {}),
                 **({name: _in_db(powers[name][order]) for name in UNHASHED} if self.knows_power else {}),
             }
@@ -326,10 +323,6 @@ class Trace:
     def sha256(self) -> str:
         """Return the hash of the content; see `sha256_of_table`."""
         return sha256_of_table(self.to_table())
-
-    def write(self, path: Path) -> None:
-        """Write the trace as Parquet. Raise OSError if the file cannot be written."""
-        pq.write_table(self.to_table(), path, compression="zstd")
 
 
 def _exchanges(frames: NDArray[np.void]) -> dict[str, pa.Array]:

@@ -153,7 +153,9 @@ class RunFolder:
         """Keep a table as Parquet, as `keep` does."""
         import pyarrow.parquet as pq  # slow to import, and a command's first line comes before any table
 
-        self.keep(name, lambda path: pq.write_table(table, path, compression="zstd"))
+        # Readers that look for a span of time skip the rest of a file; the least and most of others only take time.
+        how: dict[str, Any] = {"compression": "zstd", "write_statistics": ["sent_ns", "time_ns"]}
+        self.keep(name, lambda path: pq.write_table(table, path, **how))
 
     def event(self, time_ns: int, kind: EventKind, node: str | None = None, **details: Any) -> None:
         """Write down what happened at an emulated instant, after all that was foreseen for an earlier one."""
