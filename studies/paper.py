@@ -15,7 +15,7 @@ import numpy as np
 
 from emulator.cells.cells import Cell
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world, components
+from emulator.world.world import build_world
 from studies.measure import REFERENCE, study_cell
 from studies.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
 from vnet.errors import VnetError
@@ -141,29 +141,6 @@ def default_scenario(
             "network": network,
             "radio": {"range_m": PAPER_RANGE_M, "loss": 0.1},
             "program": {"entry": "agents.cooperative:main", "options": options},
-        }
-    )
-
-
-def bound_scenario(
-    network: dict[str, Any],
-    seed: int,
-    by_component: bool,
-    options: dict[str, Any] | None = None,
-    duration_s: float = DEFAULT_S,
-) -> Scenario:
-    """One filter that hears every fix without loss; or one a connected component. `options` are the filter's."""
-    world = build_world(default_scenario(network, seed, {}))
-    label = components(world.at(0).position_m, PAPER_RANGE_M) if by_component else np.zeros(len(world.node_ids))
-    return Scenario.model_validate(
-        {
-            "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
-            "network": network,
-            "radio": everybody(label[:, None] == label[None, :]),
-            "program": {
-                "entry": "agents.centralized:main",
-                "options": {"particles": CENTRALIZED_PARTICLES} | (options or {}),
-            },
         }
     )
 

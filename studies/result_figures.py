@@ -1,4 +1,4 @@
-"""Figures of networks and of results: graphs, errors against time, the paper's Table I, ratios to the bound.
+"""Figures of results: errors against time, and the paper's Table I.
 
 Each function writes a PNG and an SVG next to each other and returns the PNG's path; its `draw_…` only makes the
 figure.

@@ -1,12 +1,11 @@
 """The style of the experiments' figures: colours, one look a mechanism, and saving as PNG and SVG.
 
-Colours are those of Okabe and Ito, and nothing is told by colour alone. A mechanism has one colour, line and hatch
+Colours are those of Okabe and Ito, and nothing is told by colour alone. A mechanism has one colour and line
 in all figures; its variants ("random, one hop") keep the colour. No pyplot: no window, no state that lasts.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +38,6 @@ styled = matplotlib.rc_context(
         "axes.grid": True,
         "grid.color": "0.867",
         "grid.linewidth": 0.6,
-        "hatch.linewidth": 0.6,
         "svg.hashsalt": "vnet",
     }
 )
@@ -123,8 +121,3 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
             looks[name] = OTHER_LOOKS[others % len(OTHER_LOOKS)]
             others += 1
     return looks
-
-
-def shown(name: str) -> str:
-    """ "n1" is the paper's N1; other names are left as they are."""
-    return name.upper() if re.fullmatch(r"n\d+", name) else name

@@ -188,8 +188,8 @@ AgentOption = Annotated[
     str | None,
     typer.Option(
         metavar="COMMAND",
-        help="Have each vehicle be this command in place of vnet-agent, with {endpoint}, {run}, {node} and "
-        "{credentials} where it needs them.",
+        help="Have each vehicle be this command in place of vnet-agent. It must have {endpoint}, {run}, {node} and "
+        "{credentials}.",
     ),
 ]
 ProcessesOption = Annotated[

@@ -240,6 +240,7 @@ class RealTime:
 
     def returned(self, now_ns: int, process_id: str) -> wire.Batch:
         """Take a process that was started again and is ready; returns the batch that starts it."""
+        self._taken_ns = max(self._taken_ns, now_ns)
         self._emulation.come_back(self._nodes[process_id], now_ns)
         self._batch_seq[process_id] = self._frames_seq[process_id] = 0
         self._lost[process_id] = []
@@ -285,6 +286,7 @@ class RealTime:
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""
+        self._taken_ns = max(self._taken_ns, now_ns)
         for node in self._nodes[process_id]:
             self._emulation.died(now_ns, node, **details)
         self._unacknowledged[process_id].clear()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shlex
 import subprocess
 import sys
 import threading
@@ -172,7 +173,8 @@ class Session:
 
         `replay` says why no replay is warranted, if none is.
         """
-        return conclude(self.emulation, self.wall_s, self.command, replay)
+        agent = [] if self.live is None or not self.live.agent else ["--agent", shlex.join(self.live.agent)]
+        return conclude(self.emulation, self.wall_s, shlex.join([self.command, *agent]), replay)
 
     # Step by step, in lockstep, on a thread of its own. While the run is held, faults may be planned.
 

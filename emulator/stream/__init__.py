@@ -1,1 +1,1 @@
-"""The stream to observers: its messages, live and from a finished run, and playback in wall-clock time."""
+"""The stream to observers: its messages, live and from a finished run."""

@@ -49,7 +49,7 @@ MODULES = {"vnet": "emulator.cli", "vnet-agent": "agents.cli"}
 ONLY_PARSED = {
     r"--debug ": "asks its user; tests/system/test_debugging.py has one",
     r"--rerun spawn": "opens a window",
-    r"^vnet (view|play) ": "opens a window, or serves until somebody has looked",
+    r"^vnet view ": "opens a window, or serves until somebody has looked",
     r"^vnet(-agent| emulator| host).*tls/": "needs another host, or its address",
     r"dask://HOST": "needs other hosts",
     r"^vnet sweep .*(three_radios/[24]00|traffic|positioning)": "takes half an hour",

@@ -28,14 +28,6 @@ def test_the_paper_profile_starts_at_the_truth_and_hears_whom_it_should() -> Non
         assert abs(len(near) - len(heard)) <= 1 and len(near ^ set(heard)) <= 1  # offsets of centimetres
 
 
-def test_the_limit_has_one_filter_a_component_and_the_bound_one_over_all() -> None:
-    network = {"kind": "generated", "vehicles": 24}
-    by_component = np.array(paper.bound_scenario(network, 1, True).radio.links)
-    assert np.array_equal(by_component, by_component.T)
-    assert 0 < by_component.mean() < 1
-    assert np.array(paper.bound_scenario(network, 1, False).radio.links).all()
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

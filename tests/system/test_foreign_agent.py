@@ -190,6 +190,7 @@ def test_a_run_starts_foreign_agents_and_does_to_them_what_faults_do(vnet: Vnet,
     (tmp_path / "faults.toml").write_text(FAULTS)
     done = vnet("run", str(tmp_path / "faults.toml"), *EACH_FOREIGN)
     assert done.verdict["verdict"] == "valid", done.stdout
+    assert "foreign_agent.py" in shlex.split(done.verdict["reproduce"])[3]  # after vnet run --agent
     assert [event["node"] for event in done.events_of("restarted")] == ["v01"]
     assert done.events_of("refused") == done.events_of("died") == []
     assert {row["sender"] for row in done.trace()} == {"v01", "v02", "v03"}

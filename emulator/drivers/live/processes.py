@@ -472,7 +472,7 @@ class LiveProcesses(Processes):
         elif ref in self.late:
             self.late.discard(ref)
             (sent,), _ = self._sent.split([ref])
-            self._heard.append(Heard(process_id, sent, time.monotonic_ns()))
+            self._heard.append(Heard(process_id, sent, self._arrived_ns))
             self.changes.set()
 
     def _check_refs(self, process_id: str, refs: Sequence[MessageRef]) -> None:

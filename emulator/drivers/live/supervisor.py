@@ -42,8 +42,11 @@ class ChangeSignal:
     def __init__(self) -> None:
         self._waiter: asyncio.Future[bool] | None = None
 
-    def set(self, has_changed: bool = True) -> None:
+    def set(self) -> None:
         """Say that something has changed."""
+        self._wake(True)
+
+    def _wake(self, has_changed: bool) -> None:
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(has_changed)
 
@@ -51,7 +54,7 @@ class ChangeSignal:
         """Wait for the next change; False if none came in time."""
         loop = asyncio.get_running_loop()
         self._waiter = loop.create_future()
-        timer = None if math.isinf(timeout_s) else loop.call_later(timeout_s, self.set, False)
+        timer = None if math.isinf(timeout_s) else loop.call_later(timeout_s, self._wake, False)
         try:
             return await self._waiter
         finally:
