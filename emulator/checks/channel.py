@@ -283,7 +283,7 @@ def check_isolation(recorded: RecordedRun) -> Finding:
     wrong = {
         f"{counted(int(foreign.sum()), 'arrival')} of what was never sent": foreign.any(),
         f"{counted(len(claims), 'report')} of more than arrived": claims,
-        f"more sessions than program.zenoh.sessions at {first_names(strangers_at)}": strangers_at,
+        f"more sessions than commands (program.zenoh.sessions) at {first_names(strangers_at)}": strangers_at,
         f'peers of {first_names(found_at)} are found by multicast (mode "client" is not)': found_at,
     }
     broken_text = ", ".join(text for text, is_so in wrong.items() if is_so)

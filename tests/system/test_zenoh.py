@@ -152,7 +152,7 @@ def test_a_session_at_another_vehicles_endpoint_is_no_isolation(vnet: Vnet, tmp_
     assert done.status == 1
     assert {event["node"] for event in done.events_of("extra_session")} == {"v02"}
     assert done.check("isolation")["verdict"] == "invalid"
-    assert done.check("isolation")["text"] == "more sessions than program.zenoh.sessions at v02"
+    assert done.check("isolation")["text"] == "more sessions than commands (program.zenoh.sessions) at v02"
 
 
 def test_a_peer_that_others_find_by_multicast_is_no_isolation(vnet: Vnet, tmp_path: Path) -> None:

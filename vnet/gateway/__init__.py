@@ -34,7 +34,8 @@ def client_config(endpoint: str) -> dict[str, Any]:
 def session_variables(node: str, endpoint: str, config: Mapping[str, Any], path: Path) -> dict[str, str]:
     """Return the variables by which a program finds its endpoint; `path` is a file that has `config`.
 
-    `ZENOH_CONFIG` is read by `Config.from_env`, and `ZENOH_CONFIG_OVERRIDE` by rmw_zenoh and its clients.
+    `ZENOH_CONFIG` is read by `Config.from_env`, and `ZENOH_CONFIG_OVERRIDE` by rmw_zenoh and, with `STARTUP` on
+    `PYTHONPATH`, by `zenoh.open`.
     """
     return {
         "ZENOH_CONFIG": str(path),

@@ -80,8 +80,6 @@ class _Vehicle:
     lateness: list[int] = field(default_factory=lambda: [0] * wire.LATENESS_BINS)
     late: list[tuple[int, int]] = field(default_factory=list)
     is_due: bool = False
-    heard_ns: int | None = None
-    """Instant of the monotonic clock at which the first frame of the outbox has come, if a program has sent it."""
     has_warned: bool = False
     """True once it was told that a message has more frames than the radio's queue."""
 
@@ -399,7 +397,7 @@ class Gateways:
         if self._is_there(vehicle):
             vehicle.gateway.forget_tokens(self._now_ns())
             if (tokens := vehicle.gateway.tokens()) is not None and not vehicle.is_paused:
-                self._transmit(vehicle, tokens)
+                self._transmit(vehicle, tokens, time.monotonic_ns())
             self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)
 
     def _is_there(self, vehicle: _Vehicle) -> bool:
@@ -413,7 +411,7 @@ class Gateways:
         self._tell("local", node, hello)
 
     def take(self, what: str, item: tuple[Gateway | None, Any], arrived_ns: int) -> None:
-        """Take what a gateway has told, on the loop, and when (ns of the monotonic clock)."""
+        """Take a message of a gateway, and the instant (ns of the monotonic clock) at which it arrived."""
         gateway, told = item
         if what == "bug":
             raise told
@@ -431,15 +429,17 @@ class Gateways:
             vehicle.early.pop(key, None)
             vehicle.early[key] = what, told
         elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
-            vehicle.heard_ns = vehicle.heard_ns or arrived_ns
-            self._transmit(vehicle, message)
+            self._transmit(vehicle, message, arrived_ns)
         elif what == "session":
             self._look_at_sessions(vehicle)
             if any(is_peer(who) for who in gateway.sessions - self._found):
                 self._seek_peers()
 
-    def _transmit(self, vehicle: _Vehicle, message: Message) -> None:
-        """Send a message by the vehicle's radio: a reply to one vehicle, if the MAC repeats what is lost."""
+    def _transmit(self, vehicle: _Vehicle, message: Message, arrived_ns: int) -> None:
+        """Send a message by the vehicle's radio as of the instant (ns of the monotonic clock) at which it arrived.
+
+        A reply is sent to one vehicle, if the MAC repeats what is lost.
+        """
         assert vehicle.fragments is not None
         node, to = vehicle.gateway.node, None
         if isinstance(message, CrossingTokens) and self._ros2 is not None and self._ros2.graph == "always":
@@ -460,7 +460,7 @@ class Gateways:
             vehicle.has_warned = True
             text = f"a message of {frames} frames, which cannot arrive: radio.queue_frames = {most}"
             self._note(vehicle, "warning", text)
-        self._flush_soon(vehicle)
+        self._flush(vehicle, arrived_ns)
 
     def _take_report(self, vehicle: _Vehicle, content: bytes) -> None:
         try:
@@ -482,8 +482,8 @@ class Gateways:
             vehicle.is_due = True
             self._loop.call_soon(self._flush, vehicle)
 
-    def _flush(self, vehicle: _Vehicle, final: bool = False) -> None:
-        """Say what the vehicle sends, and acknowledge what it has been told."""
+    def _flush(self, vehicle: _Vehicle, arrived_ns: int | None = None, final: bool = False) -> None:
+        """Say what the vehicle sends, and acknowledge what it has been told: now, or as of an instant."""
         vehicle.is_due = False
         if not self._is_there(vehicle) or (vehicle.is_paused and not final):
             return
@@ -493,10 +493,9 @@ class Gateways:
         frames = wire.Frames(
             vehicle.nonce, vehicle.seq, vehicle.received_seq, (), traffic, lateness, final, (), late
         )
-        arrived_ns, vehicle.heard_ns = vehicle.heard_ns or time.monotonic_ns(), None
         vehicle.late = []
         vehicle.seq += 1
-        self._tell("frames", vehicle.gateway.node, (frames, arrived_ns))
+        self._tell("frames", vehicle.gateway.node, (frames, arrived_ns or time.monotonic_ns()))
 
     # Sessions.
 

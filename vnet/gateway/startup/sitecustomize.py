@@ -4,11 +4,13 @@ Python finds it by `PYTHONPATH`, also where vnet is not installed. So programs w
 of their own, are clients of their vehicle's router, and no peers of other vehicles past the radio.
 """
 
+from __future__ import annotations
+
 import os
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.machinery import ModuleSpec
-from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
@@ -16,12 +18,14 @@ from typing import Any
 class ZenohFinder:
     """Finds `zenoh` as Python does, and has its `open` changed once it is loaded."""
 
-    def find_spec(self, name: str, _path: object = None, _target: object = None) -> ModuleSpec | None:
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         """Return how to load `zenoh`; None for any other module."""
         if name != "zenoh":
             return None
-        sys.meta_path.remove(self)
-        spec = find_spec(name)
+        found = (each.find_spec(name, path, target) for each in sys.meta_path if each is not self)
+        spec = next(filter(None, found), None)
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
@@ -34,14 +38,13 @@ class ZenohFinder:
 
 
 def open_with_override(zenoh: Any) -> None:
-    """Have `zenoh.open` change a copy of each configuration as the environment says."""
+    """Have `zenoh.open` change each configuration as the environment says: a copy would lose keys of TLS."""
     opened = zenoh.open
 
-    def open(config: Any) -> Any:
-        config = zenoh.Config.from_json5(str(config))
+    def open(config: Any, **options: Any) -> Any:
         for setting in filter(None, os.environ.get("ZENOH_CONFIG_OVERRIDE", "").split(";")):
             config.insert_json5(*setting.split("=", 1))
-        return opened(config)
+        return opened(config, **options)
 
     zenoh.open = open
 
@@ -52,5 +55,7 @@ sys.path.remove(__file__.rpartition("/")[0])
 own = sys.modules.pop("sitecustomize")
 try:
     import_module("sitecustomize")
-except ImportError:
+except ImportError as error:
+    if error.name != "sitecustomize":
+        raise
     sys.modules["sitecustomize"] = own

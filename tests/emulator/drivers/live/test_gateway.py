@@ -381,6 +381,10 @@ def test_keys_that_cannot_be_are_named(keys: tuple[str, ...], named: str) -> Non
         check_keys(keys)
 
 
+def test_a_key_that_is_not_under_vnets_may_cross() -> None:
+    check_keys(["vnet", "vnets/**"])
+
+
 def test_an_exception_on_a_thread_of_zenohs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     async def first_bug() -> Exception:
         told: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()

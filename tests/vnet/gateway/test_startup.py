@@ -1,0 +1,73 @@
+"""Start of Python in the commands of vehicles: `zenoh.open` heeds the environment, and loses nothing."""
+
+import base64
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vnet.gateway import STARTUP
+from vnet.transport.authority import issue_certificates
+
+pytestmark = pytest.mark.slow
+
+OPENS = """
+session = zenoh.open(config)
+print([str(reply.ok.key_expr).rpartition("/")[2] for reply in session.get(f"@/{session.zid()}/*")])
+session.close()
+"""
+"""A session that says its mode if its administration space is enabled, as it is by the environment alone."""
+OVERRIDE = 'mode="peer";adminspace/enabled=true;scouting/multicast/enabled=false'
+SAYS = "['peer']\n"
+
+
+def start(*paths: Path, code: str) -> subprocess.CompletedProcess[str]:
+    """Run a program as a command of a vehicle is run, with `paths` of the user's own."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (STARTUP, *paths)))}
+    environment |= {"ZENOH_CONFIG_OVERRIDE": OVERRIDE}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import zenoh",
+        "import importlib.util; assert importlib.util.find_spec('zenoh'); import zenoh",
+        "import importlib, zenoh; importlib.reload(zenoh)",
+    ],
+)
+def test_zenoh_heeds_the_environment_however_it_is_found(imports: str) -> None:
+    done = start(code=f"{imports}\nconfig = zenoh.Config(){OPENS}")
+    assert done.stdout == SAYS, done.stderr
+
+
+def test_open_takes_all_that_zenohs_takes() -> None:
+    code = OPENS.replace("open(config)", "open(config=config, timestamp_callback=None)")
+    done = start(code=f"import zenoh\nconfig = zenoh.Config(){code}")
+    assert done.stdout == SAYS, done.stderr
+
+
+def test_a_configuration_keeps_the_keys_of_tls_that_zenoh_does_not_write() -> None:
+    """Without its private key a session cannot listen."""
+    router = issue_certificates([], ["127.0.0.1"]).router
+    settings: dict[str, object] = {"listen/endpoints": ["tls/127.0.0.1:0"]}
+    for name, pem in (("certificate", router.certificate), ("private_key", router.private_key)):
+        settings[f"transport/link/tls/listen_{name}_base64"] = base64.b64encode(pem.encode()).decode()
+    fill = f"for setting in {settings!r}.items(): config.insert_json5(setting[0], json.dumps(setting[1]))"
+    done = start(code=f"import json, zenoh\nconfig = zenoh.Config()\n{fill}{OPENS}")
+    assert done.stdout == SAYS, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("code", "says"), [("print('own')", "own\nstarted\n"), (None, "started\n"), ("import nosuch", "started\n")]
+)
+def test_a_sitecustomize_of_the_users_own_runs_and_its_errors_are_told(
+    tmp_path: Path, code: str | None, says: str
+) -> None:
+    if code is not None:
+        (tmp_path / "sitecustomize.py").write_text(code)
+    done = start(tmp_path, code="print('started')")
+    assert done.stdout == says
+    assert ("nosuch" in done.stderr) == (code == "import nosuch")
