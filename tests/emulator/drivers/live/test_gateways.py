@@ -1,4 +1,4 @@
-"""What gateways say to a run in the place of agents, without Zenoh."""
+"""Messages of gateways to a run, in the place of agents, without Zenoh."""
 
 import asyncio
 from typing import Any
