@@ -129,7 +129,7 @@ def decode_message(content: bytes) -> Message:
     return message
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=64)
 def whole_message(payload: bytes) -> Message | None:
     """Return the message of a frame that has all of it, the same at all receivers; None for a part.
 
