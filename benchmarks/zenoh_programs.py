@@ -17,11 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import zenoh
+from numpy.typing import NDArray
 
 from benchmarks.__main__ import ROOT, Figures, event, vnet
 from emulator.drivers.live.gateway import Gateway
 from emulator.scenario.program import ZenohSessions
 from vnet.gateway.keys import RADIO_KEYS
+from vnet.transport.session import open_local_router, router_endpoint
 
 RATE_HZ = 10
 PAYLOAD_BYTES = 100
@@ -61,33 +63,64 @@ def measure() -> Figures:
 
 
 def gateways(vehicles: int, peers: int) -> Figures:
-    """Return the latency that gateways add, from one client's put to another's callback, and late deliveries."""
+    """Return the latency from one client's put to another's callback, less the radio's, and late deliveries.
+
+    *Added* is what it is more than that of the same clients at one router of Zenoh's, without vnet.
+    """
+    plain_ms = plain(vehicles)
     with tempfile.TemporaryDirectory(prefix="vnet-bench-") as name:
         folder = Path(name)
         clients: list[subprocess.Popen[bytes]] = []
 
-        def start_clients(pid: int) -> None:
+        def start(pid: int) -> None:
             while not (found := list(Path(tempfile.gettempdir()).glob("vnet-bench-*/run/endpoints.json"))):
                 time.sleep(0.01)
-            endpoints = list(json.loads(found[0].read_text()).items())
-            for first in range(0, vehicles, CLIENTS_A_PROCESS):
-                share = json.dumps(endpoints[first : first + CLIENTS_A_PROCESS])
-                command = [sys.executable, "-m", "benchmarks.zenoh_programs", share, str(folder / f"{first}.json")]
-                clients.append(subprocess.Popen(command, cwd=ROOT))
+            clients.extend(start_clients(list(json.loads(found[0].read_text()).items()), folder))
 
-        result = vnet("run", scenario(folder, vehicles, peers), watch=start_clients)
-        for client in clients:
-            client.wait(60)
-        added_ms = np.concatenate([json.loads((path).read_text()) for path in folder.glob("*.json")]) - LATENCY_MS
-        late = event(result, "late_deliveries")
-        verdicts = {"valid": 0.0, "unknown": 1.0, "invalid": 2.0}
-        return {
-            "samples": float(len(added_ms)),
-            "added_p50_ms": float(np.percentile(added_ms, 50)),
-            "added_p99_ms": float(np.percentile(added_ms, 99)),
-            "late_share": late["count"] / max(late["total"], 1),
-            "verdict (0 valid, 1 unknown)": verdicts[result["verdict"]],
-        }
+        result = vnet("run", scenario(folder, vehicles, peers), watch=start)
+        gateway_ms = latencies_ms(clients, folder) - LATENCY_MS
+    late = event(result, "late_deliveries")
+    verdicts = {"valid": 0.0, "unknown": 1.0, "invalid": 2.0}
+    p50_ms, p99_ms = np.percentile(gateway_ms, (50, 99)).tolist()
+    plain_p50_ms, plain_p99_ms = np.percentile(plain_ms, (50, 99)).tolist()
+    return {
+        "samples": float(len(gateway_ms)),
+        "p50_ms": p50_ms,
+        "p99_ms": p99_ms,
+        "added_p50_ms": p50_ms - plain_p50_ms,
+        "added_p99_ms": p99_ms - plain_p99_ms,
+        "late_share": late["count"] / max(late["total"], 1),
+        "verdict (0 valid, 1 unknown)": verdicts[result["verdict"]],
+    }
+
+
+def plain(vehicles: int) -> NDArray[np.float64]:
+    """Return the latencies (ms) between so many clients of one router, which all hear each other."""
+    with tempfile.TemporaryDirectory(prefix="vnet-bench-") as name:
+        router = open_local_router("tcp/127.0.0.1:0", {})
+        try:
+            endpoint = router_endpoint(router)
+            clients = start_clients([(f"v{number}", endpoint) for number in range(vehicles)], Path(name))
+            return latencies_ms(clients, Path(name))
+        finally:
+            router.close()  # type: ignore[no-untyped-call]
+
+
+def start_clients(endpoints: Sequence[tuple[str, str]], folder: Path) -> list[subprocess.Popen[bytes]]:
+    """Start the processes of the clients of these vehicles (name and endpoint)."""
+    clients = []
+    for first in range(0, len(endpoints), CLIENTS_A_PROCESS):
+        share = json.dumps(endpoints[first : first + CLIENTS_A_PROCESS])
+        command = [sys.executable, "-m", "benchmarks.zenoh_programs", share, str(folder / f"{first}.json")]
+        clients.append(subprocess.Popen(command, cwd=ROOT))
+    return clients
+
+
+def latencies_ms(clients: Sequence[subprocess.Popen[bytes]], folder: Path) -> NDArray[np.float64]:
+    """Return what all clients have measured, once they have ended."""
+    for client in clients:
+        client.wait(60)
+    return np.concatenate([json.loads(path.read_text()) for path in folder.glob("*.json")])
 
 
 def endpoints_listen() -> Figures:
