@@ -65,7 +65,7 @@ from vnet.types import Array
 from vnet.units import NS_PER_S
 
 LOST_PERIODS = 10
-"""Periods on end in which most neighbours contradict the vehicle, after which it is the vehicle that is wrong."""
+"""Consecutive periods in which most neighbours contradict the vehicle, after which the vehicle itself is wrong."""
 LOST_NEIGHBOURS = 3
 """Least number of neighbours that can say so."""
 PASSED_SHARE = 0.8
@@ -148,7 +148,7 @@ class InformationEstimator:
         self._used_shares: list[float] = []  # of their increments
         self._prior = as_sent(self.own.prior.numbers)
         self._increment: Five = _NOTHING
-        self._largest_increment = 0.0
+        self._largest_about_c = self._largest_of_lane = 0.0
         self._code = int(self.name, 16)
         self._passing = Passing(passed_record(self._code, self._increment))
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
@@ -266,7 +266,7 @@ class InformationEstimator:
         used = [0.0 if any(each) else 1.0 for each in said]
         by_kind: dict[int, list[int]] = {}
         for row, increment in enumerate(increments):
-            if self._lanes.follow(increment):
+            if self._lanes.can_use(increment, is_before):
                 by_kind.setdefault(kind_of_increment(increment), []).append(row)
         for kind, rows in by_kind.items():
             about = self._lanes.news(kind, is_before) if kind else belief
@@ -377,11 +377,21 @@ class InformationEstimator:
             increments[1:] = [scaled_by(increment, share) for increment, share in each]
         own, largest = traces_of([self._increment, self._prior])
         traces = sorted(traces_of(increments))
-        usual = INCREMENT_FACTOR * max(own, traces[max(len(traces) - 1 - max(1, len(traces) // 4), 0)])
-        self._largest_increment = max(usual, self.own.largest_increment)
-        if traces[-1] > self._largest_increment:
-            increments = scaled_down(increments, self._largest_increment)
-        return scaled_down(priors, PRIOR_FACTOR * largest), increments
+        # A few precise receivers say more than most others, in increments of lanes alone.
+        of_lane = traces[max(len(traces) - 1 - max(1, len(traces) // 4), 0)]
+        self._largest_about_c, self._largest_of_lane = (
+            max(INCREMENT_FACTOR * max(own, usual), self.own.largest_increment)
+            for usual in (traces[len(traces) // 2], of_lane)
+        )
+        return scaled_down(priors, PRIOR_FACTOR * largest), self._cut(increments, traces[-1])
+
+    def _cut(self, increments: Sequence[Five], largest: float = math.inf) -> Sequence[Five]:
+        """Return increments scaled down to what is usual; `largest` is the largest of their traces, if known."""
+        about_c, of_lane = self._largest_about_c, self._largest_of_lane
+        if largest <= min(about_c, of_lane):
+            return increments
+        limits = [of_lane if is_of_lane(each) else about_c for each in increments]
+        return [each for one, limit in zip(increments, limits, strict=True) for each in scaled_down([one], limit)]
 
     def _weigh(
         self,
@@ -418,8 +428,6 @@ class InformationEstimator:
         for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):
             if share < 1:
                 of_lane = is_of_lane(increment)
-                if self._lanes and of_lane:
-                    self._lanes.learn_age(increment[4])
                 if has_joined and not of_lane:
                     continue  # c has moved since, which precise receivers see
                 origins.append(code)
@@ -431,7 +439,7 @@ class InformationEstimator:
         if min(used) < 1:
             self._reject("passed", sum(share < COUNTED_SHARE for share in used))
             increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]
-        return scaled_down(increments, self._largest_increment)
+        return list(self._cut(increments))
 
     # What goes out.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 from agents.cooperative.cmm.information import NOTHING, Five, Information
@@ -17,6 +18,7 @@ from agents.cooperative.cmm.lane_memory import (
 )
 from agents.cooperative.cmm.own_kalman import OwnKalman
 from agents.cooperative.cmm.own_vehicle import OwnVehicle
+from agents.cooperative.cmm.plausibility import MEMORY_S
 from agents.cooperative.cmm.rbpf import Observation
 
 JOINING_PERIODS = 3
@@ -53,12 +55,13 @@ class LaneExchange:
         self._lane_of: OwnKalman | None = None
         self._beyond = 0.0
         self._begins = False
-        self._oldest_passed = -2
+        self._since_older_s = math.inf
 
     # The own fix.
 
     def step(self, dt_s: float, fix: Observation | None) -> Five:
         """Advance by `dt_s` and take the own fix; returns its increment."""
+        self._since_older_s += dt_s
         if self.has_joined:
             self._advance(max(1, round(dt_s / self._period_s)))
         increment = self._own.step(dt_s, fix)
@@ -124,30 +127,42 @@ class LaneExchange:
         self._lane = self._lane_of = None
 
     def join(self, increments: Sequence[Five]) -> None:
-        """Learn from those that are heard how old memories are: the oldest count, so that all come to the same."""
-        if not self.has_joined:
-            self._waited += self._waits
-        ages = [round(increment[4]) for increment in increments if is_of_lane(increment)]
-        oldest, self._oldest_passed = max([*ages, self._oldest_passed + 1]), -2
-        if oldest > (self._memory.age if self.has_joined else -1):
-            self.has_joined = True
-            self._begins = False
-            self._begin(min(oldest, MAX_AGE))
-        elif not self.has_joined and (ages or self._waited >= JOINING_PERIODS):
-            self.has_joined = self._begins = True
+        """Begin again with the age of the oldest memories that are heard.
 
-    def learn_age(self, age: float) -> None:
-        """Learn how old memories were in the period before from an increment that is passed on."""
-        self._oldest_passed = max(self._oldest_passed, round(age) + 1)
+        A vehicle that has joined does so at most once in `MEMORY_S`: whoever claims an older memory in each period
+        would stop the exchange.
+        """
+        ages = [round(increment[4]) for increment in increments if is_of_lane(increment)]
+        oldest = max(ages, default=-1)
+        if self.has_joined:
+            if oldest > self._memory.age and self._since_older_s >= MEMORY_S:
+                self._since_older_s = 0.0
+                self._begins = False
+                self._begin(min(oldest, MAX_AGE))
+            return
+        self._waited += self._waits
+        if oldest >= 0:
+            self.has_joined = True
+            self._begin(min(oldest, MAX_AGE))
+        elif ages or self._waited >= JOINING_PERIODS:
+            self.has_joined = self._begins = True
 
     def restart(self) -> None:
         """Begin again after the vehicle's filter has."""
         self._begin(self._memory.age)
 
-    def follow(self, increment: Five) -> bool:
-        """Tell whether an increment can be used: it is about c, or says something and its kind is followed."""
+    def can_use(self, increment: Five, is_before: bool) -> bool:
+        """Tell whether an increment, of the period before if so, can be used.
+
+        It is about c, or says something, is of a memory of the same age, and its kind is followed.
+        """
         kind = kind_of_increment(increment)
-        return kind == 0 or (any(increment[:2]) and self._memory.follow(kind))
+        return kind == 0 or (self._is_of_age(increment, is_before) and self._memory.follow(kind))
+
+    def _is_of_age(self, increment: Five, is_before: bool) -> bool:
+        """Tell whether an increment of a lane says something, of a memory of the same age."""
+        age, own = round(increment[4]), self._memory.age
+        return any(increment[:2]) and (age == own - is_before or age == own == MAX_AGE)
 
     def news(self, kind: int, is_before: bool) -> Moments:
         """Return the mean and the covariance of what increments of a kind are about."""
@@ -164,21 +179,17 @@ class LaneExchange:
 
         Those of this period came from `heard` vehicles; `weight` is the weight of other vehicles' priors.
         """
+        before = [each for each in before if self._is_of_age(each, True)]
         beyond = min(1.0, len(before) / heard) if heard else 0.0
         self._beyond += SMOOTHING * (beyond - self._beyond)
         factor = 1 + UNDERSTATED * self._beyond * min(1.0, weight)
-        belief = self._memory.fuse(pooled, self._sums(before, factor, 1), self._sums(now, factor, 0))
+        belief = self._memory.fuse(pooled, self._sums(before, factor, True), self._sums(now, factor, False))
         self._own.absorb(belief, is_of_lanes=True)
 
-    def _sums(self, increments: Iterable[Five], factor: float, since: int) -> dict[int, Five]:
-        """Return the sums by kind of increments of `since` periods ago, of memories of the same age alone."""
-        ages = {self._memory.age - since, self._memory.age if self._memory.age == MAX_AGE else -1}
-        known = [
-            (kind_of_increment(each), information_of(each))
-            for each in increments
-            if any(each[:2]) and round(each[4]) in ages
-        ]
-        sums = summed((kind, information) for kind, information in known if self._memory.follow(kind))
+    def _sums(self, increments: Iterable[Five], factor: float, is_before: bool) -> dict[int, Five]:
+        """Return the sums by kind of those increments that can be used."""
+        usable = [each for each in increments if self.can_use(each, is_before)]
+        sums = summed((kind_of_increment(each), information_of(each)) for each in usable)
         return {
             kind: (factor * a, factor * b, factor * d, factor * x, factor * y)
             for kind, (a, b, d, x, y) in sums.items()

@@ -30,7 +30,7 @@ GATE_SIGMAS = 5.0
 LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest two agree."""
 LOST_FIXES = 5
-"""Least number of outliers on end, where fixes are rare."""
+"""Least number of consecutive outliers, where fixes are rare."""
 OFF_ROAD_WALK_M = 10.0
 """Random walk (m/√s) of a vehicle that is on no road, across its direction: a fix tells nearly all of its place."""
 SAME_LANE_M = 0.3
@@ -87,6 +87,7 @@ class OwnVehicle:
         self._is_placed = False
         self._outliers_s = 0.0
         self._latest: Observation | None = None
+        self._since_s = 0.0
         self.prior = self._filter.belief
         self.took_fix = False
 
@@ -131,20 +132,22 @@ class OwnVehicle:
         self._filter.predict(dt_s)
         self.prior = self._filter.belief
         self.took_fix = False
+        self._since_s += dt_s
         if fix is None:
             return NOTHING
         before, self._latest = self._latest, fix
+        since_s, self._since_s = self._since_s, 0.0
         was_placed = self._is_placed
         if not was_placed:
-            if not self._agree(before, fix, dt_s):
+            if not self._agree(before, fix, since_s):
                 return NOTHING
             self._place(fix)
         noise_m2 = fix.white_covariance_m2
         increment = self._filter.take(fix.position_m, noise_m2, GATE_SIGMAS**2)
         if increment is None:
             self._is_placed = was_placed  # along a lane nothing is known before a fix has been taken
-            self._outliers_s += dt_s
-            if self._outliers_s < max(LOST_S, LOST_FIXES * dt_s) or not self._agree(before, fix, dt_s):
+            self._outliers_s += since_s
+            if self._outliers_s < max(LOST_S, LOST_FIXES * since_s) or not self._agree(before, fix, since_s):
                 return NOTHING
             self._place(fix)
             increment = self._filter.take(fix.position_m, noise_m2)
@@ -154,12 +157,15 @@ class OwnVehicle:
         self._go_on()
         return increment
 
-    def _agree(self, before: Observation | None, fix: Observation, dt_s: float) -> bool:
-        """Tell whether two fixes on end are of one place: one alone, which may be an outlier, places no vehicle."""
+    def _agree(self, before: Observation | None, fix: Observation, since_s: float) -> bool:
+        """Tell whether two consecutive fixes, `since_s` apart, are of one place.
+
+        One alone places no vehicle: it may be an outlier.
+        """
         if before is None:
             return False
         x_m, y_m = (fix.position_m - before.position_m).tolist()
-        moved_m2 = self.model.speed_sigma_m_s**2 * dt_s**2 + float(self.model.process_noise(dt_s)[1, 1])
+        moved_m2 = self.model.speed_sigma_m_s**2 * since_s**2 + float(self.model.process_noise(since_s)[1, 1])
         noise_m2 = float(np.trace(fix.white_covariance_m2 + before.white_covariance_m2)) / 2
         return bool(x_m**2 + y_m**2 <= GATE_SIGMAS**2 * (moved_m2 + noise_m2))
 
@@ -190,6 +196,7 @@ class OwnVehicle:
         """Begin again with this belief about c, and seek the lane again."""
         self._filter = OwnKalman.start(np.zeros(2), 0.0, self._unknown, belief.moments())
         self._is_placed = False
+        self._latest, self._outliers_s = None, 0.0
         self.prior = belief
 
     def _place(self, fix: Observation) -> None:

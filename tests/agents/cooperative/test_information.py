@@ -100,6 +100,7 @@ class MovingNetwork(Network):
     def __init__(self, sigma_m: list[float], seed: int, reach: int | None = None) -> None:
         super().__init__(len(sigma_m), reach)
         self._sigma_m = sigma_m
+        self.change: Change = _honest
         self._rng = np.random.default_rng(seed)
         self.common_m, self._offset_m = (
             3 * self._rng.standard_normal(2),
@@ -108,7 +109,7 @@ class MovingNetwork(Network):
 
     def advance(self) -> None:
         """Run a period, and move on."""
-        self.run(1)
+        self.run(1, self.change)
         for state, sigma_m, tau_s in ((self.common_m, 3.0, 600.0), (self._offset_m, 0.38, 20.0)):
             keep = np.exp(-0.1 / tau_s)
             state *= keep

@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.cooperative.cmm.kalman_bound import LaneModel, OffsetAndMultipath
+from agents.cooperative.cmm.lane_exchange import LaneExchange
 from agents.cooperative.cmm.own_vehicle import OwnConfig, OwnVehicle
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
+from agents.cooperative.information_frame import InformationFrame
 from agents.cooperative.options import Options
-from tests.agents.cooperative.test_information import PERIOD_NS, MovingNetwork
+from tests.agents.cooperative.test_information import PERIOD_NS, Change, MovingNetwork
 from vnet import Fix
 from vnet.roads.lanes import LaneMap
 
@@ -165,6 +167,56 @@ def test_coarse_receivers_do_not_keep_a_network_from_what_precise_ones_know() ->
         return math.sqrt(np.mean(squares))
 
     assert error_m() < 1.5 * error_m(defence=False)
+
+
+def root_mean_square_m(network: MixedNetwork, periods: int, liars: set[str], lie: Change) -> float:
+    """Return the error of c of the others over some periods."""
+    squares = []
+    for _ in range(periods):
+        network.change = lie
+        network.advance()
+        honest = [e for name, e in zip(network.ids, network.estimators, strict=True) if name not in liars]
+        squares += [float(np.sum((e.common_error[0] - network.common_m) ** 2)) for e in honest]
+    return math.sqrt(np.mean(squares))
+
+
+@pytest.mark.parametrize("count", [6, 8])
+def test_increments_of_a_minority_that_colludes_do_not_take_over(count: int) -> None:
+    """Two of a vehicle's five neighbours, or three of seven, claim a thousand times as much, 0.3 m off."""
+    liars = {f"v{k}" for k in range((count - 1) // 2)}
+    network = MixedNetwork([Receiver()] * count, 0)
+
+    def bold(name: str, frame: InformationFrame) -> InformationFrame:
+        if name not in liars:
+            return frame
+        x, y = network.estimators[int(name[1:])].common_error[0] + np.array([0.3, 0.0])
+        return replace(frame, increment=(1e3, 0.0, 1e3, 1e3 * float(x), 1e3 * float(y)))
+
+    for _ in range(30):
+        network.advance()
+    assert root_mean_square_m(network, 30, liars, bold) < 0.8
+
+
+@pytest.mark.parametrize("reach", [1, 8])
+def test_who_claims_ever_older_memories_does_not_stop_the_exchange(reach: int) -> None:
+    network = MixedNetwork([Receiver(0.1)] * 8, 0, reach)
+
+    def older(name: str, frame: InformationFrame) -> InformationFrame:
+        if name != "v0":
+            return frame
+        return replace(frame, increment=(0.0, 0.0, -1.0, 0.0, float(2 * network.period)))
+
+    for _ in range(30):
+        network.advance()
+    assert root_mean_square_m(network, 60, {"v0"}, older) < 0.45
+
+
+def test_an_increment_of_another_age_is_not_judged_and_not_used() -> None:
+    lanes = LaneMap(np.zeros((1, 2)), np.zeros(1), 0.85)
+    exchange = LaneExchange(OwnVehicle(OwnConfig(RbpfConfig()), lanes, np.random.default_rng(1)), PERIOD_S)
+    exchange.join([(0.0, 1.0, -3.0, 0.5, 20.0)])
+    for age, is_before, is_used in ((20, False, True), (20, True, False), (19, True, True), (5, False, False)):
+        assert exchange.can_use((0.0, 1.0, -3.0, 0.5, float(age)), is_before) == is_used
 
 
 def test_offset_and_multipath_make_one_process() -> None:

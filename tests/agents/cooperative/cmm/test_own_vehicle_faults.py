@@ -53,9 +53,26 @@ def test_a_vehicle_that_begins_again_knows_no_position_before_two_fixes_agree() 
     assert position is not None and np.abs(position[1]).max() < LARGEST_M2
 
 
-def test_two_outliers_on_end_of_rare_fixes_are_not_believed() -> None:
+def test_two_consecutive_outliers_of_rare_fixes_are_not_believed() -> None:
     own, rng = vehicle(), np.random.default_rng(4)
     own.restart(Information.of(COMMON_M, 0.05 * np.eye(2)))
     for period in range(30):
         own.step(1.0, fix(rng, FAULT_M if period in (20, 21) else np.zeros(2)))
         assert own.took_fix == (period not in (0, 20, 21))
+
+
+def test_a_vehicle_that_drives_is_placed_by_fixes_that_come_rarely() -> None:
+    """It has moved by 8 m from fix to fix; most steps are without one."""
+    own, rng = vehicle(), np.random.default_rng(5)
+    for period in range(41):
+        own.step(0.1, fix(rng, np.array([0.4 * period, 0.0])) if period % 20 == 0 else None)
+    assert own.position_m() is not None
+
+
+def test_a_vehicle_that_begins_again_forgets_the_fixes_of_before() -> None:
+    own, rng = vehicle(), np.random.default_rng(6)
+    for _ in range(3):
+        own.step(0.1, fix(rng, np.zeros(2)))
+    own.restart(Information.of(COMMON_M, 0.01 * np.eye(2)))
+    own.step(0.1, fix(rng, np.zeros(2)))
+    assert own.position_m() is None
