@@ -148,7 +148,7 @@ class InformationEstimator:
         self._used_shares: list[float] = []  # of their increments
         self._prior = as_sent(self.own.prior.numbers)
         self._increment: Five = _NOTHING
-        self._largest_about_c = self._largest_of_lane = 0.0
+        self._largest_increment = 0.0
         self._code = int(self.name, 16)
         self._passing = Passing(passed_record(self._code, self._increment))
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
@@ -377,21 +377,11 @@ class InformationEstimator:
             increments[1:] = [scaled_by(increment, share) for increment, share in each]
         own, largest = traces_of([self._increment, self._prior])
         traces = sorted(traces_of(increments))
-        # A few precise receivers say more than most others, in increments of lanes alone.
-        of_lane = traces[max(len(traces) - 1 - max(1, len(traces) // 4), 0)]
-        self._largest_about_c, self._largest_of_lane = (
-            max(INCREMENT_FACTOR * max(own, usual), self.own.largest_increment)
-            for usual in (traces[len(traces) // 2], of_lane)
-        )
-        return scaled_down(priors, PRIOR_FACTOR * largest), self._cut(increments, traces[-1])
-
-    def _cut(self, increments: Sequence[Five], largest: float = math.inf) -> Sequence[Five]:
-        """Return increments scaled down to what is usual; `largest` is the largest of their traces, if known."""
-        about_c, of_lane = self._largest_about_c, self._largest_of_lane
-        if largest <= min(about_c, of_lane):
-            return increments
-        limits = [of_lane if is_of_lane(each) else about_c for each in increments]
-        return [each for one, limit in zip(increments, limits, strict=True) for each in scaled_down([one], limit)]
+        usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
+        self._largest_increment = max(usual, self.own.largest_increment)
+        if traces[-1] > self._largest_increment:
+            increments = scaled_down(increments, self._largest_increment)
+        return scaled_down(priors, PRIOR_FACTOR * largest), increments
 
     def _weigh(
         self,
@@ -439,7 +429,7 @@ class InformationEstimator:
         if min(used) < 1:
             self._reject("passed", sum(share < COUNTED_SHARE for share in used))
             increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]
-        return list(self._cut(increments))
+        return scaled_down(increments, self._largest_increment)
 
     # What goes out.
 

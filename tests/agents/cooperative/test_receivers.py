@@ -15,7 +15,6 @@ from agents.cooperative.cmm.lane_exchange import LaneExchange
 from agents.cooperative.cmm.own_vehicle import OwnConfig, OwnVehicle
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
 from agents.cooperative.information_frame import InformationFrame
-from agents.cooperative.options import Options
 from tests.agents.cooperative.test_information import PERIOD_NS, Change, MovingNetwork
 from vnet import Fix
 from vnet.roads.lanes import LaneMap
@@ -150,23 +149,6 @@ def test_who_hears_of_older_memories_at_second_hand_alone_is_consistent(sigma_m:
             network.advance()
             found.append(network.normalized() if period > 5 else 0.0)
     assert np.mean(found) < 1.3
-
-
-def test_coarse_receivers_do_not_keep_a_network_from_what_precise_ones_know() -> None:
-    """Three of eight are precise, and are not cut to what the others can say."""
-
-    def error_m(**options: object) -> float:
-        squares = []
-        for seed in range(3):
-            network = MixedNetwork([Receiver(0.1)] * 3 + [Receiver(10.0)] * 5, seed)
-            network.options = Options.parse({"exchange": "information", "particles": 300, **options})
-            network.estimators = [network.new(k) for k in range(8)]
-            for _ in range(30):
-                network.advance()
-            squares += [float(np.sum((e.common_error[0] - network.common_m) ** 2)) for e in network.estimators]
-        return math.sqrt(np.mean(squares))
-
-    assert error_m() < 1.5 * error_m(defence=False)
 
 
 def root_mean_square_m(network: MixedNetwork, periods: int, liars: set[str], lie: Change) -> float:
