@@ -270,7 +270,7 @@ def test_the_room_of_a_trace_takes_memory_only_as_it_is_written() -> None:
 
 
 def test_frames_on_their_way_load_no_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`np.unique` alone would load numpy.ma at its first call, for a tenth of a second in the middle of a run."""
+    """`np.unique` alone would load numpy.ma at its first call, in the middle of a run."""
     monkeypatch.delitem(sys.modules, "numpy.ma", raising=False)
     monkeypatch.delattr(np, "ma", raising=False)
     subject = engine(place(4, 1, 100.0), jitter_ms=0)
