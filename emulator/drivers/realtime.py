@@ -6,6 +6,7 @@ Traffic is taken when it comes, and what is due goes out in batches; `run_in_rea
 from __future__ import annotations
 
 import asyncio
+import importlib
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -51,6 +52,7 @@ class RealTime:
     """
 
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
+        importlib.import_module("numpy.ma")  # pyarrow would, at its first array of numpy's, within the run
         self._emulation = emulation
         self._nodes = {nodes[0]: tuple(nodes) for nodes in processes}
         self._process_of = {node: nodes[0] for nodes in processes for node in nodes}

@@ -49,6 +49,8 @@ ENDPOINTS = "endpoints.json"
 HIGHEST_PORT = 65_535
 HOW = "ZENOH_CONFIG, VNET_ENDPOINT and {endpoint} have the endpoint; in Python zenoh.open() finds it by itself"
 """Hint for those whose program does not connect."""
+TURNS_S = 0.1
+"""Seconds over which vehicles begin, one after another, what all of them do: at one instant it would be late."""
 
 
 @dataclass
@@ -69,7 +71,7 @@ class _Vehicle:
     on_air: bool = False
     """True from time 0, or from its return, on."""
     early: dict[object, tuple[str, Any]] = field(default_factory=dict)
-    """Queries of its programs and the latest sample of each key, which wait until then."""
+    """Queries of its programs and the latest sample of each key, which wait until its turn then."""
     outbox: list[SentFrame] = field(default_factory=list)
     reports: list[Report] = field(default_factory=list)
     notes: list[wire.Note] = field(default_factory=list)
@@ -374,14 +376,23 @@ class Gateways:
                 self._note(vehicle, "debug", f"a frame of {packet.sender} is no sample: {error}")
 
     def _go_on_air(self, vehicle: _Vehicle) -> None:
-        """Begin to send what the programs put and have put, and their tokens, and to acknowledge once a second."""
+        """Begin to send what the programs put; in its turn also what they have put, and what is told regularly."""
         vehicle.on_air = True
-        for what, told in vehicle.early.values():
-            self.take(what, (vehicle.gateway, told), time.monotonic_ns())
-        vehicle.early.clear()
-        self._acknowledge(vehicle)
-        self._renew_tokens(vehicle)
-        self._tell_clock(vehicle)
+        turn = self._emulation.number[vehicle.gateway.node] / len(self._emulation.number)
+        self._loop.call_later(TURNS_S * turn, self._take_turn, vehicle)
+
+    def _take_turn(self, vehicle: _Vehicle) -> None:
+        if self._is_there(vehicle):
+            self._send_early(vehicle, time.monotonic_ns())
+            self._acknowledge(vehicle)
+            self._renew_tokens(vehicle)
+            self._tell_clock(vehicle)
+
+    def _send_early(self, vehicle: _Vehicle, arrived_ns: int) -> None:
+        early, vehicle.early = vehicle.early, {}
+        for what, told in early.values():
+            if (message := vehicle.gateway.take(what, told)) is not None:
+                self._transmit(vehicle, message, arrived_ns)
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:
         if self._ros2 is not None and self._is_there(vehicle):
@@ -424,10 +435,12 @@ class Gateways:
             return
         if what == "report":
             self._take_report(vehicle, told)
-        elif what in ("query", "message") and not vehicle.on_air:
+        elif what in ("query", "message"):
             key = getattr(told, "key", told)  # each query is kept
             vehicle.early.pop(key, None)
             vehicle.early[key] = what, told
+            if vehicle.on_air:
+                self._send_early(vehicle, arrived_ns)
         elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
             self._transmit(vehicle, message, arrived_ns)
         elif what == "session":

@@ -4,6 +4,7 @@ import asyncio
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from emulator.drivers.live.gateway import Gateway
 from emulator.drivers.live.gateways import Gateways
@@ -11,7 +12,7 @@ from emulator.drivers.live.supervisor import ChangeSignal
 from emulator.scenario.scenario import Scenario
 from tests.emulator.drivers.live.fakes import FakeLauncher, on_a_loop
 from tests.support.multi_loop_driver import emulation_of
-from vnet.gateway.frames import CrossingSample
+from vnet.gateway.frames import CrossingSample, Reassembly
 from vnet.transport import wire
 from vnet.transport.access import Access
 
@@ -19,40 +20,85 @@ SAMPLE = CrossingSample("pose", b"here", "zenoh/bytes", False, None, "DATA", "DR
 WELCOME = wire.Welcome("v01", b"1", 0, "realtime", "", {}, [], 1, 1, 1000, 1.0, 0, "")
 
 
+class Rig:
+    """Gateways without routers, and what they tell the run."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, vehicles: int, radio: dict[str, Any]) -> None:
+        self.routers: dict[str, Gateway] = {}
+        self.told: asyncio.Queue[tuple[str, str, Any]] = asyncio.Queue()
+        monkeypatch.setattr(Gateway, "open", lambda gateway, listen: self._open_none(gateway, listen))
+        scenario = Scenario.model_validate(
+            {
+                "run": {"pacing": "realtime"},
+                "network": {"vehicles": vehicles},
+                "radio": radio,
+                "program": {"kind": "zenoh"},
+            }
+        )
+        launcher: Any = FakeLauncher()
+        emulation = emulation_of(scenario)
+        self.gateways = Gateways(emulation, launcher, False, lambda *_: None, self._tell, lambda: 0, ChangeSignal())
+        self.gateways.start_agents("", Access.create("fake", []), [[node] for node in emulation.world.node_ids])
+
+    def _open_none(self, gateway: Gateway, listen: str) -> str:
+        self.routers[gateway.node] = gateway
+        return listen
+
+    def _tell(self, *item: Any) -> None:
+        self.told.put_nowait(item)
+
+    async def welcome(self, *nodes: str) -> None:
+        """Have the run welcome these vehicles, once all have said hello."""
+        while len(self.routers) < len(self.gateways.pids) or self.told.qsize() < len(self.routers):
+            await asyncio.sleep(0)
+        while not self.told.empty():
+            assert isinstance(self.told.get_nowait()[2], wire.Hello)
+        for node in nodes:
+            self.gateways.send(node, WELCOME)
+
+    def put(self, node: str, sample: CrossingSample, arrived_ns: int) -> None:
+        """Have a program of a vehicle put a sample."""
+        self.gateways.take("message", (self.routers[node], sample), arrived_ns)
+
+    async def sent(self, count: int) -> list[tuple[list[CrossingSample], int]]:
+        """Return the samples of the next messages with frames, and the instants of which they are."""
+        found = []
+        while len(found) < count:
+            what, _, item = await self.told.get()
+            if what == "frames" and item[0].traffic.frames:
+                reassembly = Reassembly()
+                found.append(([reassembly.take("x", each.payload) for each in item[0].traffic.frames], item[1]))
+        return found
+
+
 @on_a_loop
 async def test_frames_are_sent_as_of_the_instants_of_their_own_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither tokens, which are told past the radio here, nor an earlier sample of the vehicle makes one older."""
-    routers: dict[str, Gateway] = {}
-    told: asyncio.Queue[tuple[str, str, Any]] = asyncio.Queue()
-
-    def open_none(gateway: Gateway, listen: str) -> str:
-        routers[gateway.node] = gateway
-        return listen
-
-    def tell(*item: Any) -> None:
-        told.put_nowait(item)
-
-    monkeypatch.setattr(Gateway, "open", open_none)
-    scenario = Scenario.model_validate(
-        {
-            "run": {"pacing": "realtime"},
-            "network": {"vehicles": 2},
-            "radio": {"profile": "ros2", "ros2": {"graph": "always"}},
-            "program": {"kind": "zenoh"},
-        }
-    )
-    launcher: Any = FakeLauncher()
-    gateways = Gateways(emulation_of(scenario), launcher, False, lambda *_: None, tell, lambda: 0, ChangeSignal())
-    gateways.start_agents("", Access.create("fake", []), [["v01"], ["v02"]])
-    for _ in range(2):
-        assert isinstance((await told.get())[2], wire.Hello)
-    gateways.send("v01", WELCOME)
-    gateways.send("v01", wire.Batch([], 0, origin_ns=0))
-    assert (await told.get())[0] == "frames", "it is on the air, and acknowledges"
-    router = routers["v01"]
-    gateways.take("token", (router, ("alive/v01", True)), 5)
+    rig = Rig(monkeypatch, 2, {"profile": "ros2", "ros2": {"graph": "always"}})
+    await rig.welcome("v01")
+    rig.gateways.send("v01", wire.Batch([], 0, origin_ns=0))
+    assert (await rig.told.get())[0] == "frames", "it is on the air, and acknowledges"
+    rig.gateways.take("token", (rig.routers["v01"], ("alive/v01", True)), 5)
     for arrived_ns in (8, 9):
-        gateways.take("message", (router, SAMPLE), arrived_ns)
-    sent = [(await told.get())[2] for _ in range(2)]
-    assert [(len(frames.traffic.frames), arrived_ns) for frames, arrived_ns in sent] == [(1, 8), (1, 9)]
-    await gateways.close()
+        rig.put("v01", SAMPLE, arrived_ns)
+    assert await rig.sent(2) == [([SAMPLE], 8), ([SAMPLE], 9)]
+    await rig.gateways.close()
+
+
+@on_a_loop
+async def test_what_programs_put_before_the_start_goes_out_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that puts more before its turn sends both, in their order, and the latest sample of each key alone."""
+    monkeypatch.setattr("emulator.drivers.live.gateways.TURNS_S", 1e6)
+    rig = Rig(monkeypatch, 3, {})
+    await rig.welcome("v01", "v02", "v03")
+    lane, newer = replace(SAMPLE, key="lane"), replace(SAMPLE, payload=b"there")
+    for node in ("v01", "v02", "v03"):
+        rig.put(node, SAMPLE, 1)
+        rig.put(node, lane, 2)
+        rig.gateways.send(node, wire.Batch([], 0, origin_ns=0))
+    first = await rig.sent(2)
+    assert [samples for samples, _ in first] == [[SAMPLE], [lane]], "v01 has the first turn"
+    rig.put("v02", newer, 7)
+    assert await rig.sent(2) == [([lane], 7), ([newer], 7)]
+    assert rig.told.empty(), "the turn of v03 is far away"
+    await rig.gateways.close()
