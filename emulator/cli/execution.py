@@ -249,7 +249,7 @@ def _finish(session: Session, progress: Progress, asked: OutputOptions, output: 
         elif asked.quiet:
             output.print(f"verdict: {judgement.verdict}  {folder}")
         else:
-            print_summary(judgement, verdict, folder, SafeConsole(), asked.report, asked.verbose)
+            print_summary(judgement, verdict, session.folder, SafeConsole(), asked.report, asked.verbose)
         if asked.report:
             report_at_end(folder)
     raise typer.Exit(status)

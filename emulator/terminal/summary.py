@@ -20,12 +20,14 @@ from emulator.checks.judge import Judgement, Verdict
 from emulator.checks.own import PREFIX
 from emulator.pages.text import as_text, cell
 from emulator.records.costs import HEADS, RunCost, read_cost
+from emulator.records.events import EventKind
 from emulator.records.period_figures import KeyFigure, shown_figures
 from emulator.records.reported import ReportedFigure
-from emulator.records.run_folder import RECORDING, REPORT
+from emulator.records.run_folder import RECORDING, REPORT, RunFolder
 from emulator.records.tables import on_backbone
 from emulator.records.verdicts import CheckResult
 from emulator.viewer.sinks import is_closed, repair_command
+from vnet.units import NS_PER_S
 
 SLOWEST = 10
 """Vehicles in the table of what a run cost."""
@@ -37,7 +39,7 @@ STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "
 def print_summary(
     judgement: Judgement,
     verdict: dict[str, Any],
-    folder: Path,
+    folder: RunFolder,
     console: Console,
     report: bool = False,
     verbose: bool = False,
@@ -56,14 +58,19 @@ def print_summary(
         counts = verdict["frames_by_outcome"]
         _print_table("receptions: one for each frame and receiver in range", _frames(counts), console)
     _print_cost(read_cost(verdict["cost"]), console, verbose)
+    if bad := [event for event in folder.events if event.kind == EventKind.log and event.is_bad]:
+        which = "" if len(bad) == 1 else f"{len(bad)} warnings and errors, the first "
+        text = f"log          {which}at {bad[0].time_ns / NS_PER_S:.3f} s: {bad[0].text}"
+        console.print(Text(as_text(text)), soft_wrap=True)
     if (order := verdict["order"]) is not None:
         console.print(f"order        {_order(order)}", highlight=False, soft_wrap=True)
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
-    console.print(f"files        {folder}", highlight=False, soft_wrap=True)
-    quoted = shlex.quote(str(folder))
+    path = folder.path
+    console.print(f"files        {path}", highlight=False, soft_wrap=True)
+    quoted = shlex.quote(str(path))
     following = {verdict["reproduce"]: "the same run again", f"vnet check {quoted}": "judge it again"}
-    following[f"vnet report {quoted} --open"] = f"read {folder / REPORT}" if report else "have a report of it"
-    if (recording := folder / RECORDING).exists():
+    following[f"vnet report {quoted} --open"] = f"read {path / REPORT}" if report else "have a report of it"
+    if (recording := path / RECORDING).exists():
         following[f"vnet view {quoted}"] = "look at it"
         if not is_closed(recording):
             following[repair_command(recording)] = "repair the recording, whose observer was killed"

@@ -47,7 +47,7 @@ from vnet.units import NS_PER_S
 ENDPOINTS = "endpoints.json"
 """File of a run's folder with the endpoint of each vehicle."""
 HIGHEST_PORT = 65_535
-HOW = "ZENOH_CONFIG, VNET_ENDPOINT and {endpoint} have the endpoint; in Python zenoh.open() finds it by itself"
+HOW = "ZENOH_CONFIG, VNET_ENDPOINT and {endpoint} have it, for Zenoh 1; in Python zenoh.open() finds it by itself"
 """Hint for those whose program does not connect."""
 TURNS_S = 0.1
 """Seconds over which vehicles begin, one after another, what all of them do: at one instant it would be late."""

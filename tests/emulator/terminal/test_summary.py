@@ -1,11 +1,13 @@
-"""Commands of a summary can be typed where they are shown: quoted, and relative to the current folder inside it."""
+"""Summaries: what programs warned of; commands can be typed as shown: quoted, and relative to the folder."""
 
 import shlex
 import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from emulator.cli.commands import app
 from emulator.terminal.summary import as_typed
 
 
@@ -37,3 +39,13 @@ def test_a_program_that_is_not_on_the_path_is_named_with_its_folder(
     assert as_typed("vnet check run") == ".venv/bin/vnet check run"
     monkeypatch.setattr(sys, "executable", "/opt/my env/bin/python")
     assert as_typed("vnet check run") == f"{shlex.quote('/opt/my env/bin/vnet')} check run"
+
+
+def test_the_first_line_that_is_no_mere_note_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    says = ["log('quiet')", "log('first', 'warning')", "log('second', 'error')"]
+    Path("loud.py").write_text("async def main(node):\n" + "".join(f"    node.{each}\n" for each in says))
+    done = CliRunner().invoke(app, ["simulate", "twelve", "--program", "loud.py", "--out", "run"])
+    (line,) = [line for line in done.output.splitlines() if line.startswith("log ")]
+    assert "v01: first" in line
+    assert "24 warnings" in line

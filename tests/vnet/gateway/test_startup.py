@@ -71,3 +71,13 @@ def test_a_sitecustomize_of_the_users_own_runs_and_its_errors_are_told(
     done = start(tmp_path, code="print('started')")
     assert done.stdout == says
     assert ("nosuch" in done.stderr) == (code == "import nosuch")
+
+
+def test_a_zenoh_of_another_protocol_is_named(tmp_path: Path) -> None:
+    """Alone it would only say that nobody answers."""
+    (tmp_path / "zenoh.py").touch()
+    (about := tmp_path / "eclipse_zenoh-0.11.0.dist-info").mkdir()
+    (about / "METADATA").write_text("Name: eclipse-zenoh\nVersion: 0.11.0\n")
+    done = start(tmp_path, code="import zenoh")
+    assert done.returncode == 1
+    assert "eclipse-zenoh 0.11.0" in done.stderr.splitlines()[-1]

@@ -12,7 +12,7 @@ from emulator.drivers.live.supervisor import ChangeSignal
 from emulator.scenario.scenario import Scenario
 from tests.emulator.drivers.live.fakes import FakeLauncher, on_a_loop
 from tests.support.multi_loop_driver import emulation_of
-from vnet.gateway.frames import CrossingSample, Reassembly
+from vnet.gateway.frames import CrossingSample, Message, Reassembly
 from vnet.transport import wire
 from vnet.transport.access import Access
 
@@ -60,9 +60,9 @@ class Rig:
         """Have a program of a vehicle put a sample."""
         self.gateways.take("message", (self.routers[node], sample), arrived_ns)
 
-    async def sent(self, count: int) -> list[tuple[list[CrossingSample], int]]:
+    async def sent(self, count: int) -> list[tuple[list[Message | None], int]]:
         """Return the samples of the next messages with frames, and the instants of which they are."""
-        found = []
+        found: list[tuple[list[Message | None], int]] = []
         while len(found) < count:
             what, _, item = await self.told.get()
             if what == "frames" and item[0].traffic.frames:
