@@ -92,13 +92,15 @@ def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Ar
     power_db *= 10
     survives = np.zeros(len(rows))
     heard = power_mw > 0
-    airtime_ns, rate_mbps = recorded.airtime_ns[rows], recorded.bitrate_mbps[rows]
+    first, of_row, _ = recorded.emissions  # far fewer than rows, which take long to sort
+    airtime_ns, rate_mbps = recorded.airtime_ns[first], recorded.bitrate_mbps[first]
     if radio.sidelink is not None:  # where not the time on air counts, but the share of the channel
-        airtime_ns = -(-recorded.column("size_bytes")[rows] // radio.sidelink.subchannel_bytes)
+        airtime_ns = -(-recorded.column("size_bytes")[first] // radio.sidelink.subchannel_bytes)
     kinds, kind = np.unique(np.column_stack([airtime_ns, rate_mbps]), axis=0, return_inverse=True)
+    kind = kind.ravel()[of_row[rows]]
     for number, m in enumerate(shapes):
         for index, (length_ns, mbps) in enumerate(kinds.tolist()):
-            some = heard & (shape == number) & (kind.ravel() == index)
+            some = heard & (shape == number) & (kind == index)
             if some.any():
                 survives[some] = _arrives(radio, m, int(length_ns), mbps, power_db[some])
     return survives

@@ -44,6 +44,8 @@ AGAIN = "again"
 """The folder, in a run's own, of the second run of `--check-determinism`."""
 VERDICT_ROOM_BYTES = 1 << 16
 """Size of most verdicts, with their manifests."""
+PLAIN = ("size_bytes", "payload_digest", "copy")
+"""Columns of tables, beside times, that are written without a dictionary."""
 FORMAT = 4
 """Version of the folder's files; `verdict.json` holds it. docs/reference/files.md says what changed with each."""
 
@@ -151,10 +153,15 @@ class RunFolder:
 
     def keep_table(self, name: str, table: pa.Table) -> None:
         """Keep a table as Parquet, as `keep` does."""
+        import pyarrow as pa
         import pyarrow.parquet as pq  # slow to import, and a command's first line comes before any table
 
         # Readers that look for a span of time skip the rest of a file; the least and most of others only take time.
         how: dict[str, Any] = {"compression": "zstd", "write_statistics": ["sent_ns", "time_ns"]}
+        # Dictionaries of times are long, and numbers of few values are as small without one.
+        if not any(pa.types.is_nested(each.type) for each in table.schema):
+            names = table.column_names
+            how["use_dictionary"] = [each for each in names if not each.endswith("_ns") and each not in PLAIN]
         self.keep(name, lambda path: pq.write_table(table, path, **how))
 
     def event(self, time_ns: int, kind: EventKind, node: str | None = None, **details: Any) -> None:

@@ -61,6 +61,8 @@ class Links:
 
     def contain(self, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Mask:
         """Return the mask (n,) of these senders and receivers that are among the pairs."""
+        if self.count**2 <= len(sender):
+            return np.asarray(self.matrix()[sender, receiver])
         known, asked = self.sender * self.count + self.receiver, sender * self.count + receiver
         if not len(known):
             return np.zeros(len(asked), dtype=bool)
