@@ -1,6 +1,5 @@
 """Orders of events: the same however vehicles are divided into processes, and again from their tape."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -150,17 +149,3 @@ def test_a_run_says_where_it_left_a_tape_that_does_not_fit() -> None:
     earlier = Deviation("v02", 0, 8, 1, "timer of f", "fix")
     assert first_left([*made, later, earlier], made) == earlier
     assert first_left(made, made) is None
-
-
-@pytest.mark.parametrize(
-    "run, text",
-    [
-        ('order = "shuffle"\npacing = "realtime"', 'order = "shuffle" goes with pacing = "lockstep"'),
-        ('order = "pct"\ntape = "x"', 'tape goes with order = "fifo"'),
-        ('order_slack_us = 1\npacing = "realtime"', 'order_slack_us goes with pacing = "lockstep"'),
-        ("order_slack_us = 300", "must divide the period of fixes, 100000 µs"),
-    ],
-)
-def test_orders_that_cannot_be_are_refused(run: str, text: str) -> None:
-    with pytest.raises(ValueError, match=text):
-        Scenario.model_validate(tomllib.loads(f"[run]\n{run}"))

@@ -18,7 +18,6 @@ from emulator.scenario.scenario import Radio, least_transit_ns
 from tests.emulator.radio.test_csma import crowds, planned, run, scattered
 from tests.support.faulty_engine import FaultyEngine
 from tests.support.radio import engine, line
-from vnet.errors import ScenarioError
 from vnet.radio import SentFrame
 
 MS, S = 1_000_000, 1_000_000_000
@@ -59,34 +58,6 @@ def beacons(
 
 
 # Reading.
-
-
-@pytest.mark.parametrize(
-    ("radio", "message"),
-    [
-        ({"mac": {"kind": "lte"}}, "lte-mode4"),
-        ({"mac": {"kind": "lte-mode4", "access_category": "BE"}}, "allowed here: .*subchannels"),
-        ({"mac": {"kind": "lte-mode4", "scs_khz": 30}}, "unknown key"),
-        ({"mac": {"subchannels": 4}}, "allowed here: access_category"),
-        ({"mac": {"kind": "lte-mode4", "reservation_ms": 30}}, "allowed are 20, 50, 100"),
-        ({"mac": {"kind": "nr-mode2", "reservation_ms": 150}}, "allowed are 1 to 99 and 100"),
-        ({"mac": {"kind": "lte-mode4", "subchannels": 1}, "max_payload_bytes": 200}, "carries at most 190"),
-        ({"mac": {"kind": "lte-mode4", "bler": [1.0, 0.5]}}, "as many"),
-        ({"mac": {"kind": "lte-mode4", "bler": [0.5, 1.0], "bler_sinr_db": [0, 1]}}, "must not grow"),
-        ({"mac": {"kind": "lte-mode4", "bler": [1.0, 0.5], "bler_sinr_db": [1, 1]}}, "must grow"),
-        ({"mac": {"kind": "lte-mode4", "t1_slots": 5}}, "less than or equal to 4"),
-        ({"mac": {"kind": "lte-mode4"}, "congestion": {"kind": "etsi"}}, "80211p"),
-        ({"mac": {}, "congestion": {"kind": "cr_limit", "busy": [0.3], "most": [0.1]}}, "lte-mode4"),
-        ({"mac": {"kind": "lte-mode4"}, "congestion": {"kind": "cr_limit", "busy": [0.3], "most": []}}, "as many"),
-        ({"mac": {"kind": "lte-mode4"}, "receiver": {"min_snr_db": 5}}, "sensing_dbm"),
-        ({"mac": {"kind": "lte-mode4"}, "bitrate_mbps": 12}, "subchannel_bytes"),
-        ({"path_loss": {"kind": "winner_b1", "environment_m": 2}}, "less than antenna_m"),
-    ],
-)
-def test_a_scenario_that_cannot_be_is_refused_in_one_line(radio: dict[str, Any], message: str) -> None:
-    with pytest.raises(ScenarioError, match=message) as raised:
-        scenario_of({"radio": radio}, {})
-    assert "\n" not in str(raised.value)
 
 
 def test_kind_is_80211p_where_none_is_given_and_a_slot_bounds_the_payload() -> None:

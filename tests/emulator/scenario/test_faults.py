@@ -81,24 +81,6 @@ def test_each_kind_has_its_defaults_and_says_what_it_lacks(kind: str) -> None:
             parse_fault(less)
 
 
-@pytest.mark.parametrize(
-    ("data", "part"),
-    [
-        ({"duration_s": 1}, "a kind is needed"),
-        ({"kind": "quake", "duration_s": 1}, "kind = 'quake': must be one of ConstPosOffset, DataReplay, "),
-        ({"kind": "Kill", "duration_s": 1}, "kind = 'Kill' (did you mean kill?): must be one of "),
-        ([], "a table is needed"),
-        (None, "a table is needed"),
-        ("kill", "a table is needed"),
-    ],
-)
-def test_what_is_no_fault_is_one_line(data: object, part: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        parse_fault(data)
-    assert part in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_list_of_ids_is_a_selector() -> None:
     listed, table = (parse_fault(minimal("block", receivers=ids)) for ids in (["v1", "v3"], {"ids": ["v1", "v3"]}))
     assert listed == table

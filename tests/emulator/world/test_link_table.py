@@ -32,32 +32,6 @@ def table(*rows: tuple[float, int, int, float | None]) -> LinkTable:
     return LinkTable((np.array(time_s) * S).astype(np.int64), np.array(sender), np.array(receiver), losses)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (HEAD, "no rows; a row for each link is needed"),
-        ("time_s,sender,receiver\n0,a,b\n", "no column 'loss'; needed are time_s, sender, receiver, loss"),
-        ("time,sender,receiver,loss\n0,a,b,0\n", "no column 'time_s'; needed are time_s, sender, receiver, loss"),
-        (HEAD + "1,a,b,0\n0.5,a,c,0\n", "line 3: time_s = 0.5: earlier than the row before; sort by time"),
-        (HEAD + "0,a,x,0\n", "line 2: receiver = 'x': no such vehicle; the network has a, b, c"),
-        (HEAD + "0,,b,0\n", "line 2: sender = '': no such vehicle"),
-        (HEAD + "-1,a,b,0\n", "line 2: time_s = -1: 0 or more is needed"),
-        (HEAD + "0,a,b,-0.1\n", "line 2: loss = '-0.1': 0 to 1, or nothing out of range, is needed"),
-        (HEAD + "0,a,b,1.1\n", "line 2: loss = '1.1': 0 to 1, or nothing out of range, is needed"),
-        (HEAD + "0,a,b,nan\n", "line 2: loss = 'nan': 0 to 1"),
-        (HEAD + "0,a,b,0\n0,b,a\n", "line 3: ends before its loss; 4 cells are needed"),
-        (HEAD + "0,a,a,0\n", "line 2: 'a' to itself: two vehicles are needed"),
-        (HEAD + "0,a,b,0\n0,b,a,0\n0,a,b,1\n", "line 4: a to b twice at one time; leave one out"),
-    ],
-)
-def test_a_wrong_table_is_one_line(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "links.csv"
-    path.write_text(text)
-    with pytest.raises(ScenarioError) as caught:
-        load_links(Radio(links=path), NAMES)
-    assert str(caught.value).startswith(f"{path}: {message}") and "\n" not in str(caught.value)
-
-
 def test_losses_of_the_table_and_of_the_scenario_exclude_each_other(tmp_path: Path) -> None:
     (tmp_path / "links.csv").write_text(HEAD + "0,a,b,0\n")
     with pytest.raises(ScenarioError, match=r"^radio\.loss = 0\.1: must be 0, because .*links\.csv has the losses"):

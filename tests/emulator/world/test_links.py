@@ -46,32 +46,6 @@ def test_a_matrix_in_the_scenario_is_that_matrix() -> None:
     assert links.tolist() == CHAIN
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "empty; a square matrix of 0 and 1"),
-        ("\n\n", "empty"),
-        ("0,1,0\n1,0,1\n", "not square: 2 rows, and 3 entries in row 1"),
-        ("0,1,0\n1,0\n0,0,0\n", "not square: 3 rows, and 2 entries in row 2"),
-        ("0,1\n1,0\n", "radio.links is 2×2, but the network has 3 vehicles"),
-        ("0,0,0\n0,0,2\n0,0,0\n", "line 2: entry 3 = '2': 0 or 1 is needed"),
-        ("0,0,0\n0,0,-1\n0,0,0\n", "line 2: entry 3 = '-1'"),
-        ("0,0,0\n0,0,0.5\n0,0,0\n", "line 2: entry 3 = '0.5'"),
-        ("0,0,0\n\n\n0,nan,0\n0,0,0\n", "line 4: entry 2 = 'nan'"),
-        ("a,b,c\n0,0,0\n0,0,0\n0,0,0\n", "line 1: entry 1 = 'a': 0 or 1 is needed"),
-        ("0,0,0,\n0,0,0,\n0,0,0,\n", "line 1: entry 4 = ''"),
-        ("0;0;0\n0;0;0\n0;0;0\n", "line 1: entry 1 = '0;0;0'"),
-    ],
-)
-def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "links.csv"
-    path.write_text(text)
-    with pytest.raises(ScenarioError) as caught:
-        links_of(path)
-    assert str(caught.value).startswith(f"{path}: {message}")
-    assert "\n" not in str(caught.value)
-
-
 def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match=r"no\.csv: cannot be read: No such file"):
         links_of(tmp_path / "no.csv")

@@ -131,42 +131,6 @@ def test_of_several_receivers_the_mean_is_common_and_the_rest_each_ones_own(tmp_
     assert np.array_equal(kept_m, np.asarray(world.receiver_m))
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "no column time_s"),
-        ("time_s,east_m\n0,1\n", "no column north_m"),
-        ("time_s,a_east_m,b_north_m\n0,1,1\n", "no column a_north_m"),
-        ("time_s,aeast,a_north_m,b_east_m,b_north_m\n0,1,1,1,1\n", "no column a_east_m"),
-        ("east_m,north_m\n1,1\n", "no column time_s"),
-        ("time_s,east_m,north_m,east_m\n0,1,1,1\n", "column east_m is there twice"),
-        ("time_s,east_m,north_m\n", "no rows"),
-        ("time_s,east_m,north_m\n0,1\n", "line 2: north_m"),
-        ("time_s,east_m,north_m\n0,1,nan\n", "north_m = 'nan': a finite number"),
-        ("time_s,east_m,north_m\n0,1,1\n0,1,1\n", "times must increase"),
-        ("time_s,east_m,north_m\n0,1,1\n99,1e9,1\n", "an error of 1e+09 m"),
-        ("time_s,east_m,north_m\n0,1,1\n5,1,1\n", "from 0 to 5 s; the run needs them from 0 to 20 s"),
-    ],
-)
-def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        world_of({}, 20.0, world=recorded(tmp_path, text))
-    assert "errors.csv" in str(caught.value)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("section", "words"),
-    [('kind = "file"', "path is required"), ("start_s = 3.0", 'go with kind = "file"')],
-)
-def test_keys_of_the_common_error_go_with_its_kind(tmp_path: Path, section: str, words: str) -> None:
-    path = tmp_path / "a.toml"
-    path.write_text(f"[world.common_error]\n{section}\n")
-    with pytest.raises(ScenarioError, match=words):
-        load_scenario(path)
-
-
 def test_the_file_is_found_beside_the_scenario_and_digested(tmp_path: Path) -> None:
     (tmp_path / "errors.csv").write_text(TWO_RECEIVERS)
     path = tmp_path / "a.toml"

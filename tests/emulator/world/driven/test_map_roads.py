@@ -335,19 +335,3 @@ def test_a_start_that_cannot_be_is_one_line(tmp_path: Path, count: int, keys: di
     with pytest.raises(ScenarioError, match=message) as error:
         world_on(write_map(tmp_path, *CROSS), count, keys)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("keys", "message"),
-    [
-        ({"lanes": 2}, "lanes goes with road"),
-        ({"length_m": 900.0}, "length_m goes with road"),
-        ({"start_m": [5.0]}, 'start_m and start_lanes need routes where road = "map"'),
-        ({"road": "ring", "routes": [EAST]}, 'routes goes with road = "map", not with "ring"'),
-        ({"routes": []}, "routes"),
-        ({"routes": [[]]}, "routes"),
-    ],
-)
-def test_keys_that_do_not_go_with_a_map_are_refused(keys: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Scenario.model_validate({"network": {"kind": "driven", "driven": {"road": "map"} | keys}})

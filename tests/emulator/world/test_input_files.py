@@ -1,0 +1,52 @@
+"""Whatever is wrong with a file that a scenario names is said in one line: the file, its line, the value."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from emulator.scenario.scenario import Radio, Scenario
+from emulator.world.maps.files import read_buildings
+from emulator.world.networks import load_network
+from emulator.world.radio_inputs import load_links
+from emulator.world.world import build_world
+from tests.support.maps import FRAME
+from tests.support.paths import ROOT
+from vnet.errors import ScenarioError
+
+BLOCK = re.compile(r"### (\w+) (\S+)\n(.*?)=> ([^\n]+)\n\n?", re.DOTALL)
+"""A kind of file, its name, its text, and what is said of it."""
+
+
+def with_world(section: dict[str, object]) -> object:
+    return build_world(Scenario.model_validate({"run": {"duration_s": 20.0}, **section}))
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "network": load_network,
+    "trips": lambda path: with_world({"network": {"kind": "trips", "path": str(path)}}),
+    "links": lambda path: load_links(Radio(links=path), ["a", "b", "c"]),
+    "errors": lambda path: with_world({"world": {"common_error": {"kind": "file", "path": str(path)}}}),
+    "buildings": lambda path: read_buildings(path, lambda: FRAME),
+}
+
+
+def said_of(kind: str, path: Path) -> str:
+    with pytest.raises(ScenarioError) as caught:
+        READERS[kind](path)
+    said = str(caught.value)
+    assert str(path) in said and "\n" not in said
+    return said.removeprefix(f"{path}: ").replace(str(path), path.name)
+
+
+@pytest.mark.slow
+def test_messages_are_those_that_were_read(tmp_path: Path) -> None:
+    golden = (ROOT / "tests" / "golden" / "input_files.txt").read_text(encoding="utf-8")
+    shown = []
+    for kind, name, text, _ in BLOCK.findall(golden):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        shown.append(f"### {kind} {name}\n{text}=> {said_of(kind, tmp_path / name)}\n")
+    assert len(shown) > 80
+    (tmp_path / "input_files.txt").write_text("\n".join(shown), encoding="utf-8")
+    assert "\n".join(shown) == golden, f"read {tmp_path}/input_files.txt; if it is right, keep it"
