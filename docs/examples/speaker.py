@@ -42,7 +42,7 @@ def listen(observation: Any, word: int) -> int:
     return 1 + 2 * axis + int(landmark[axis] > 0)  # 1, 2: west, east; 3, 4: south, north
 
 
-def mean_reward(radio: dict[str, Any], episodes: int = 50) -> float:
+def mean_reward(radio: dict[str, Any], episodes: int = 20) -> float:
     """Return the listener's mean reward a step."""
     env, rewards = with_radio(radio), []
     for seed in range(episodes):

@@ -14,6 +14,7 @@ pytestmark = pytest.mark.slow
 
 VNET = shlex.join([sys.executable, "-P", "-m", "emulator.cli"])
 OPTIONS = "--quiet --no-report"
+FEW = "--set program.options.particles=20"
 
 
 def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -39,7 +40,7 @@ def is_one_line_each(text: str) -> bool:
 
 
 def test_on_a_full_disk_what_fits_is_kept_and_the_run_is_unknown(tmp_path: Path) -> None:
-    done = on_disk("size=200k", f"{VNET} simulate twelve --duration 5 --out disk/run {OPTIONS}", tmp_path)
+    done = on_disk("size=200k", f"{VNET} simulate twelve --duration 5 --out disk/run {FEW} {OPTIONS}", tmp_path)
     assert done.returncode == 3, done.stderr
     assert is_one_line_each(done.stderr) and "No space left on device" in done.stderr
     names = {path.name for path in (tmp_path / "kept" / "run").iterdir()}
@@ -64,7 +65,7 @@ def test_a_read_only_disk_is_told_in_one_line(tmp_path: Path) -> None:
 
 
 def test_a_limit_of_the_size_of_files_loses_those_above_it_alone(tmp_path: Path) -> None:
-    done = shell(f"ulimit -f 20; {VNET} simulate twelve --duration 5 --out run {OPTIONS}", tmp_path)
+    done = shell(f"ulimit -f 20; {VNET} simulate twelve --duration 5 --out run {FEW} {OPTIONS}", tmp_path)
     assert done.returncode == 3, done.stderr
     assert is_one_line_each(done.stderr) and "File too large" in done.stderr
     names = {path.name for path in (tmp_path / "run").iterdir()}
@@ -100,11 +101,10 @@ def test_sixty_four_descriptors_are_few_for_a_live_run_and_enough_for_a_simulate
     done = shell(f"ulimit -n 64; {VNET} run quickstart --duration 1 --out live {OPTIONS}", tmp_path)
     assert done.returncode == 2
     assert is_one_line_each(done.stderr) and "Too many open files" in done.stderr
-    done = shell(f"ulimit -n 64; {VNET} simulate quickstart --duration 1 --out run {OPTIONS}", tmp_path)
+    done = shell(f"ulimit -n 64; {VNET} simulate quickstart --duration 1 --out run {FEW} {OPTIONS}", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("closed", ["0<&-", "1>&-", "2>&-", "0<&- 1>&- 2>&-"])
-def test_closed_descriptors_are_nobodys_files(tmp_path: Path, closed: str) -> None:
+def test_closed_descriptors_are_nobodys_files(tmp_path: Path) -> None:
     for command in ("simulate beacon --duration 1 --out run", "check run"):
-        assert shell(f"{VNET} {command} {closed}", tmp_path).returncode == 0
+        assert shell(f"{VNET} {command} 0<&- 1>&- 2>&-", tmp_path).returncode == 0

@@ -1,14 +1,12 @@
 """Shipped scenarios on a machine made small and slow: the same verdict or unknown, never invalid."""
 
 import os
-import shlex
 import subprocess
 from pathlib import Path
 
-from tests.golden.runs import load, machine, results_of
 from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
-from tests.system.conftest import PATIENT, TIMEOUT_S, Finished
+from tests.system.conftest import PATIENT, TIMEOUT_S, Finished, Vnet
 
 LITTLE_MB = 8
 """Private memory in MB in which a cooperative agent does not fit."""
@@ -28,14 +26,11 @@ def run_slowly(folder: Path, *words: str) -> Finished:
     return Finished(done.returncode, done.stdout, done.stderr, folder)
 
 
-def test_a_slow_machine_gives_the_same_verdict(tmp_path: Path) -> None:
-    made_with, rows = load()
-    expected = rows["faults"]  # which the golden test simulates
-    slow = run_slowly(tmp_path / "slow", *shlex.split(expected.command))
-    found = results_of(slow.folder)
-    assert slow.status == expected.results["status"] == 0, slow.stderr + slow.stdout
-    same = {"verdict", "trace", *(["metrics"] if machine() == made_with else [])}
-    assert {name: found[name] for name in same} == {name: expected.results[name] for name in same}
+def test_a_slow_machine_gives_the_same_verdict(vnet: Vnet, tmp_path: Path) -> None:
+    words = ["scenarios/faults.toml", "--duration", "15", "--program", "agents.beacon:main"]
+    slow, expected = run_slowly(tmp_path / "slow", *words), vnet("simulate", *words)
+    assert slow.status == expected.status == 0, slow.stderr + slow.stdout
+    assert slow.fingerprint == expected.fingerprint
 
 
 def test_a_small_machine_is_unknown(tmp_path: Path) -> None:

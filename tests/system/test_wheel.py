@@ -79,7 +79,7 @@ def test_it_is_the_wheel_that_runs(command: Command, environment: Path) -> None:
 
 
 def test_shipped_scenarios_run_by_their_names(command: Command, tmp_path: Path) -> None:
-    assert "verdict: valid" in command("vnet", "run", "twelve", "--duration", "1", "--quiet")
+    assert "verdict: valid" in command("vnet", "simulate", "beacon", "--duration", "1", "--quiet")
     command("vnet", "demo", "--duration", "0.1", "--out", "demo")
     assert (tmp_path / "demo" / "recording.rrd").stat().st_size > 0
 

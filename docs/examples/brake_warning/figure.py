@@ -1,6 +1,6 @@
 """Run the study of docs/how-to/brake-warning.md, print its table and draw its figure.
 
-python docs/examples/brake_warning/figure.py brake-warning.png --shares 0,1 --seeds 1
+python docs/examples/brake_warning/figure.py brake-warning.png --shares 1 --seeds 1
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ points = st.tuples(coordinates, coordinates)
 rings_of_points = st.lists(points, min_size=3, max_size=7, unique=True)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.lists(st.lists(rings_of_points, min_size=1, max_size=2), min_size=1, max_size=4), points, points)
 def test_losses_are_those_of_exact_arithmetic(buildings: list[list[Ring]], start: Point, end: Point) -> None:
     assume(start != end)
@@ -143,7 +143,7 @@ small = st.integers(-3, 3)
 lattice_points = st.tuples(small, small)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     st.lists(st.lists(lattice_points, min_size=3, max_size=6, unique=True), min_size=1, max_size=3),
     lattice_points,

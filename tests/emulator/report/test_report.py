@@ -124,7 +124,9 @@ def test_checks_that_failed_come_first(beacon: Path) -> None:
 
 
 def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
-    run = simulate(tmp_path / "run", "--duration", "1.5", "--no-report", scenario="80211p.toml")
+    run = simulate(
+        tmp_path / "run", "--duration", "1.5", "--no-report", "--set", "network.vehicles=20", scenario="80211p.toml"
+    )
     page = page_of(run)
     assert "channel busy ratio (%)" in page.text and "expected: " not in page.text
     figures = radio_metrics(RecordedRun.open(run))

@@ -259,10 +259,10 @@ PRIMITIVES = [
 def test_asyncio_s_primitives_hold_in_every_order(program: Callable[[Node], Awaitable[None]]) -> None:
     """Without an alarm. In CI there are 626 shuffles and 626 times PCT of each of eight programs: 10 016 orders."""
     different = set()
-    for seed in range(626 if os.environ.get("CI") else 60):
+    for seed in range(626 if os.environ.get("CI") else 25):
         for order in (Order("shuffle", seed), Order("pct", seed, 1 + seed % 5, 50)):
             different.add(tuple((each.time_ns, each.decision, each.label) for each in run(program, order)))
-    assert len(different) > 100, "orders were explored"
+    assert len(different) > 40, "orders were explored"
 
 
 @pytest.mark.slow
