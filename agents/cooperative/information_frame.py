@@ -27,8 +27,8 @@ from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, Fra
 from agents.cooperative.vehicle_cache import VehicleCache
 from vnet.types import Array
 
-VERSION = 4
-"""Version of the layout; `frame` has 3."""
+VERSION = 5
+"""Version of the layout and of what its numbers mean, such as kinds of gains; `frame` has 3."""
 INFORMATION_LIMIT = 1e6
 """Largest entry of a matrix (1/m²): a deviation of a millimetre."""
 INCREMENT_LIMIT = 6e4

@@ -39,7 +39,7 @@ class LaneModel:
     lateral_sigma_m: float = LATERAL_SIGMA_M
     lateral_tau_s: float = 20.0
     acceleration_m2_s4: float = 1.0
-    speed_sigma_m_s: float = 0.5
+    speed_sigma_m_s: float = 15.0
 
     @property
     def measured(self) -> list[list[int]]:

@@ -28,10 +28,10 @@ LATERAL_SHARE = 0.45
 GATE_SIGMAS = 5.0
 """Fixes further from their prediction are outliers."""
 LOST_S = 2.0
-"""Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest two agree."""
+"""Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest three agree."""
 LOST_FIXES = 5
 """Least number of consecutive outliers, where fixes are rare."""
-OFF_ROAD_WALK_M = 10.0
+OFF_ROAD_WALK_M = 20.0
 """Random walk (m/√s) of a vehicle that is on no road, across its direction: a fix tells nearly all of its place."""
 SAME_LANE_M = 0.3
 SAME_LANE_RAD = 0.02
@@ -80,13 +80,18 @@ class OwnVehicle:
         start = np.array(config.rbpf.start_m), sigma_m**2 * np.eye(2)
         # On no road a vehicle keeps its place: a renewed offset would be anywhere after seconds without a fix.
         tau_s = 2 * (UNKNOWN_ALONG_M / OFF_ROAD_WALK_M) ** 2
-        unknown = replace(self.model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=tau_s)
+        unknown = replace(
+            self.model,
+            lateral_sigma_m=UNKNOWN_ALONG_M,
+            lateral_tau_s=tau_s,
+            acceleration_m2_s4=config.rbpf.driving_m2_s4[0],
+        )
         self._unknown = unknown
         self._on_lane, self._multipath = self.model, (0.0, 0.0)
         self._filter: OwnKalman | OwnRbpf = OwnKalman.start(np.zeros(2), 0.0, unknown, start)
         self._is_placed = False
         self._outliers_s = 0.0
-        self._latest: Observation | None = None
+        self._latest: list[tuple[float, Observation]] = []  # two fixes, each with the time since the one before
         self._since_s = 0.0
         self.prior = self._filter.belief
         self.took_fix = False
@@ -135,8 +140,8 @@ class OwnVehicle:
         self._since_s += dt_s
         if fix is None:
             return NOTHING
-        before, self._latest = self._latest, fix
         since_s, self._since_s = self._since_s, 0.0
+        before, self._latest = self._latest, [*self._latest[-1:], (since_s, fix)]
         was_placed = self._is_placed
         if not was_placed:
             if not self._agree(before, fix, since_s):
@@ -157,17 +162,20 @@ class OwnVehicle:
         self._go_on()
         return increment
 
-    def _agree(self, before: Observation | None, fix: Observation, since_s: float) -> bool:
-        """Tell whether two consecutive fixes, `since_s` apart, are of one place.
+    def _agree(self, before: list[tuple[float, Observation]], fix: Observation, since_s: float) -> bool:
+        """Tell whether a fix, `since_s` after two others, is where these lead at any constant speed.
 
-        One alone places no vehicle: it may be an outlier.
+        Fewer place no vehicle: one may be an outlier, and at 1 Hz two are as far apart where a vehicle drives.
         """
-        if before is None:
+        if len(before) < 2:
             return False
-        x_m, y_m = (fix.position_m - before.position_m).tolist()
-        moved_m2 = self.model.speed_sigma_m_s**2 * since_s**2 + float(self.model.process_noise(since_s)[1, 1])
-        noise_m2 = float(np.trace(fix.white_covariance_m2 + before.white_covariance_m2)) / 2
-        return bool(x_m**2 + y_m**2 <= GATE_SIGMAS**2 * (moved_m2 + noise_m2))
+        (_, first), (gap_s, second) = before
+        more = since_s / gap_s
+        off_m = fix.position_m - second.position_m - more * (second.position_m - first.position_m)
+        weighed = ((1.0, fix), ((1 + more) ** 2, second), (more**2, first))
+        noise_m2 = sum(weight * float(np.trace(each.white_covariance_m2)) for weight, each in weighed) / 2
+        moved_m2 = self._unknown.acceleration_m2_s4 * (since_s * (since_s + gap_s) / 2) ** 2
+        return bool(off_m @ off_m <= GATE_SIGMAS**2 * (moved_m2 + noise_m2))
 
     def _suit(self, multipath: tuple[float, float]) -> None:
         """Take the model of a receiver with this multipath, deviation (m) and correlation time (s)."""
@@ -196,7 +204,7 @@ class OwnVehicle:
         """Begin again with this belief about c, and seek the lane again."""
         self._filter = OwnKalman.start(np.zeros(2), 0.0, self._unknown, belief.moments())
         self._is_placed = False
-        self._latest, self._outliers_s = None, 0.0
+        self._latest, self._outliers_s = [], 0.0
         self.prior = belief
 
     def _place(self, fix: Observation) -> None:

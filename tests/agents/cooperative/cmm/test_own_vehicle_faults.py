@@ -33,18 +33,18 @@ def test_a_wrong_receiver_leaves_bounded_positions(wrong_periods: int) -> None:
         wrong = 30 <= period < 30 + wrong_periods
         own.step(0.1, fix(rng, FAULT_M if wrong else np.zeros(2)))
         position = own.position_m()
-        if period == 0:
-            continue  # one fix does not tell a place
+        if period < 2:
+            continue  # two fixes do not tell a place
         assert position is not None
         assert np.abs(position[1]).max() < LARGEST_M2, period
         error_m = float(np.linalg.norm(position[0]))
     assert error_m < 3.0
 
 
-def test_a_vehicle_that_begins_again_knows_no_position_before_two_fixes_agree() -> None:
+def test_a_vehicle_that_begins_again_knows_no_position_before_three_fixes_agree() -> None:
     own, rng = vehicle(), np.random.default_rng(3)
     own.restart(Information.of(COMMON_M, 0.01 * np.eye(2)))
-    for fault_m in (np.zeros(2), FAULT_M, np.zeros(2)):
+    for fault_m in (np.zeros(2), FAULT_M, np.zeros(2), np.zeros(2)):
         assert own.position_m() is None
         own.step(0.1, fix(rng, fault_m))
         assert not own.took_fix
@@ -58,7 +58,7 @@ def test_two_consecutive_outliers_of_rare_fixes_are_not_believed() -> None:
     own.restart(Information.of(COMMON_M, 0.05 * np.eye(2)))
     for period in range(30):
         own.step(1.0, fix(rng, FAULT_M if period in (20, 21) else np.zeros(2)))
-        assert own.took_fix == (period not in (0, 20, 21))
+        assert own.took_fix == (period not in (0, 1, 20, 21))
 
 
 def test_a_vehicle_that_drives_is_placed_by_fixes_that_come_rarely() -> None:
@@ -67,6 +67,37 @@ def test_a_vehicle_that_drives_is_placed_by_fixes_that_come_rarely() -> None:
     for period in range(41):
         own.step(0.1, fix(rng, np.array([0.4 * period, 0.0])) if period % 20 == 0 else None)
     assert own.position_m() is not None
+
+
+@pytest.mark.parametrize("rate_hz", [1, 2, 5, 10])
+@pytest.mark.parametrize("speed_m_s", [0.0, 5.0, 15.0, 30.0])
+def test_a_vehicle_without_a_map_is_placed_as_well_as_its_fixes(rate_hz: int, speed_m_s: float) -> None:
+    """It drives around, in circles of at least 150 m, and brakes and accelerates by 3 m/s² in every 20 s."""
+    rng, step_s = np.random.default_rng(7), 0.02
+    time_s = np.arange(0, 60, step_s)
+    brakes_m_s = np.interp(time_s % 20, [8, 12, 16], [0, min(12.0, speed_m_s), 0])
+    turned_rad = np.cumsum((speed_m_s - brakes_m_s) / 150) * step_s
+    way_m = np.stack([np.cos(turned_rad), np.sin(turned_rad)], 1) * (speed_m_s - brakes_m_s)[:, None] * step_s
+    place_m = np.cumsum(way_m, axis=0)[:: round(1 / (rate_hz * step_s))]
+    for sigma_m in (0.1, 1.0, 3.0):
+        own = OwnVehicle(OwnConfig(RbpfConfig()), LaneMap(np.zeros((0, 2)), np.zeros(0), 0.85), rng)
+        noise_m = sigma_m * rng.standard_normal(place_m.shape)
+        off_m = []
+        for true_m, seen_m in zip(place_m, place_m + COMMON_M + noise_m, strict=True):
+            own.step(1 / rate_hz, Observation(seen_m, sigma_m**2 * np.eye(2), None))
+            position = own.position_m()
+            off_m.append((position[0] if position else seen_m) + own.estimate_m - COMMON_M - true_m)
+        assert position is not None
+        assert np.mean(np.square(off_m)) < 1.05 * np.mean(np.square(noise_m))
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 30.0])
+def test_a_vehicle_that_drives_along_its_lane_is_placed(speed_m_s: float) -> None:
+    rng, lanes = np.random.default_rng(8), LaneMap(np.zeros((1, 2)), np.zeros(1), 0.85)
+    own = OwnVehicle(OwnConfig(RbpfConfig()), lanes, rng)
+    for period in range(30):
+        own.step(1.0, fix(rng, np.array([speed_m_s * period, 0.0])))
+        assert own.took_fix == (period > 1)
 
 
 def test_a_vehicle_that_begins_again_forgets_the_fixes_of_before() -> None:
