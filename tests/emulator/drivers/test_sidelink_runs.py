@@ -36,7 +36,7 @@ def radio(mac: dict[str, Any], **more: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("mac", "latency_ms"), zip(MACS, [7.0, 0.5, 7.0], strict=True), ids=["mode 4", "mode 2", "dynamic"]
+    ("mac", "latency_ms"), [*zip(MACS, [7.0, 0.5, 7.0], strict=True)], ids=["mode 4", "mode 2", "dynamic"]
 )
 def test_live_processes_do_what_their_simulation_does(mac: dict[str, Any], latency_ms: float) -> None:
     sections = {"run": {"duration_s": 1.6, "settle_s": 0.1}, "radio": radio(mac, latency_ms=latency_ms)}
