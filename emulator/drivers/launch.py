@@ -155,7 +155,7 @@ class Launcher:
             for name in (nodes[0] for nodes in groups):
                 given = {"{endpoint}": endpoint, "{run}": access.run, "{node}": name}
                 words = [*TIED, *(_filled(word, given) for word in self.agent_command)]
-                self._start_with(name, words, access.credentials(node_user(name)), {})
+                self._start(name, words, {**SAME_ARITHMETIC, **os.environ}, access.credentials(node_user(name)))
                 self._lower_priority(name, nice)
             return
         agents = {nodes[0]: self._agent_arguments(endpoint, access.run, nodes) for nodes in groups}
@@ -234,26 +234,7 @@ class Launcher:
         In a session of its own it gets processor time even where the run could use all of it, if autogroups act.
         """
         command = [sys.executable, *arguments, *(["--credentials", CREDENTIALS] if credentials else [])]
-        self._start_with(name, command, credentials, environment, own_session)
-
-    def _start_with(
-        self,
-        name: str,
-        command: Sequence[str],
-        credentials: Credentials | None,
-        environment: Mapping[str, str],
-        own_session: bool = False,
-    ) -> None:
-        """Start a command, with the path of a pipe that holds the credentials in place of `CREDENTIALS`."""
-        read_end, write_end = os.pipe()
-        if credentials is not None:
-            os.write(write_end, credentials.dumps().encode())
-        os.close(write_end)
-        command = [_filled(word, {CREDENTIALS: f"/dev/fd/{read_end}"}) for word in command]
-        try:
-            self._start(name, command, {**SAME_ARITHMETIC, **os.environ, **environment}, own_session, [read_end])
-        finally:
-            os.close(read_end)
+        self._start(name, command, {**SAME_ARITHMETIC, **os.environ, **environment}, credentials, own_session)
 
     def start_command(self, name: str, words: Sequence[str], environment: Mapping[str, str], nice: int) -> None:
         """Start a command in a group of its own that ends with this process; it prints to `logs/{name}.log`."""
@@ -265,10 +246,18 @@ class Launcher:
         name: str,
         command: Sequence[str],
         environment: Mapping[str, str],
+        credentials: Credentials | None = None,
         own_session: bool = False,
-        descriptors: Sequence[int] = (),
     ) -> None:
+        """Start a command, with the path of a pipe that holds the credentials in place of `CREDENTIALS`."""
+        descriptors: list[int] = []
         try:
+            if credentials is not None:
+                read_end, write_end = os.pipe()
+                descriptors.append(read_end)
+                os.write(write_end, credentials.dumps().encode())
+                os.close(write_end)
+                command = [_filled(word, {CREDENTIALS: f"/dev/fd/{read_end}"}) for word in command]
             inherit = nullcontext() if name in self._services else default_time_slice()
             with (self.logs / f"{name}.log").open("ab") as log, inherit:
                 self._processes[name] = GroupProcess(
@@ -283,6 +272,9 @@ class Launcher:
                 )
         except OSError as error:
             raise _cannot_start(name, error.strerror) from None
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
 
     @property
     def pids(self) -> dict[str, int]:
