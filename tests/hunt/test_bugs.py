@@ -14,7 +14,7 @@ from emulator.testing.campaign_plan import Plan
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.trial import run_trial
 from tests.hunt.bugs import BUGS, FAULTS, Bug
-from tests.hunt.programs import convoy_lead, crossing_permits, warning_display
+from tests.hunt.programs import crossing_permits
 
 pytestmark = pytest.mark.slow
 
@@ -75,18 +75,6 @@ async def cancel_when_ready(task: "asyncio.Task[object]", make_ready: Callable[[
     await asyncio.wait({task})
 
 
-@pytest.mark.parametrize(("inbox", "left"), [(warning_display.Inbox, []), (warning_display.RepairedInbox, [7])])
-def test_an_item_given_to_a_cancelled_reader(inbox: type[warning_display.Inbox], left: list[int]) -> None:
-    async def main() -> list[int]:
-        items = inbox()
-        reader: asyncio.Task[object] = asyncio.ensure_future(items.get())
-        await cancel_when_ready(reader, lambda: items.put(7))
-        items.put(8)
-        return [await items.get() for _ in range(len(left) + 1)]
-
-    assert asyncio.run(main()) == [*left, 8]
-
-
 @pytest.mark.parametrize(
     ("permits", "free"), [(crossing_permits.Permits, 0), (crossing_permits.RepairedPermits, 1)]
 )
@@ -99,15 +87,3 @@ def test_a_permit_given_to_a_cancelled_task(permits: type[crossing_permits.Permi
         return pool.free
 
     assert asyncio.run(main()) == free
-
-
-@pytest.mark.parametrize(("member", "cancelled"), [(convoy_lead.Member, False), (convoy_lead.RepairedMember, True)])
-def test_a_cancellation_that_comes_with_a_report(member: type[convoy_lead.Member], cancelled: bool) -> None:
-    async def main() -> bool:
-        reports: asyncio.Queue[str] = asyncio.Queue()
-        task: asyncio.Task[object] = asyncio.ensure_future(member.within(reports.get(), 60.0))
-        await asyncio.sleep(0)
-        await cancel_when_ready(task, lambda: reports.put_nowait("v03"))
-        return task.cancelled()
-
-    assert asyncio.run(main()) is cancelled

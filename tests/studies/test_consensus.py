@@ -149,10 +149,10 @@ def test_a_study_leaves_a_table_its_numbers_and_a_picture(tmp_path: Path, monkey
     rows = [f"v{number},{x},{y},0" for number, (x, y) in enumerate(places)]
     (tmp_path / "five.csv").write_text("\n".join(["id,x_m,y_m,heading_rad", *rows]))
     network = {"kind": "file", "path": str(tmp_path / "five.csv")}
-    path = study_network(network, [1, 2], tmp_path, rounds=55)
+    path = study_network(network, [1], tmp_path, rounds=55)
     text = path.read_text()
     results = pq.read_table(tmp_path / "consensus.parquet").to_pylist()
-    assert len(results) == 3 * 2 * (2 + 1 + 2)
+    assert len(results) == 3 * (2 + 1 + 2)
     assert {"study", "rule", "loss", "latency_ms", "seed", "convergence_factor"} <= set(results[0])
     assert {"error_50", "error_55"} <= set(results[0])
     assert "| loss 30% | ratio | " in text and "| delay 150 ms | metropolis | " in text
@@ -163,7 +163,7 @@ def test_a_study_leaves_a_table_its_numbers_and_a_picture(tmp_path: Path, monkey
     assert "rounds, one every 0.1 s" in svg and "ratio, measured" in svg
     written = path.stat().st_mtime_ns
     store = {file: file.stat().st_mtime_ns for file in (tmp_path / "cells").iterdir()}
-    assert study_network(network, [1, 2], tmp_path, rounds=55).read_text() == text
+    assert study_network(network, [1], tmp_path, rounds=55).read_text() == text
     assert path.stat().st_mtime_ns > written
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "cells").iterdir()} == store, "no run twice"
 

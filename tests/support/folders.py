@@ -5,6 +5,7 @@ import shutil
 from dataclasses import asdict
 from pathlib import Path
 
+from rich.console import Console
 from typer.testing import CliRunner
 
 from emulator.checks.judge import check_run
@@ -13,7 +14,7 @@ from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.recorded_run import RecordedRun
-from emulator.report.comparison import Comparison, comparison_page
+from emulator.report.comparison import Comparison, print_comparison
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from emulator.stream.playback import messages
@@ -37,12 +38,19 @@ def readings(folder: Path, other: Path, scratch: Path) -> Readings:
         "check": repr(asdict(check_run(folder))) + command("check", str(folder)),
         "report": report_page(Source(folder)),
         "play": repr(list(messages(folder))),
-        "compare": comparison_page(Comparison.of(folder, other)),
+        "compare": compared(folder, other),
         "csv": repr(written),
         "radio": command("radio", str(folder)),
     }
     named = {name: text.replace(str(folder), "RUN") for name, text in read.items()}
     return {**named, "pcapng": pcapng.getvalue(), "mcap": mcap.getvalue()}
+
+
+def compared(folder: Path, other: Path) -> str:
+    """Return what `vnet compare` prints of two runs; the charts of its page are in tests/emulator/report."""
+    printed = io.StringIO()
+    print_comparison(Comparison.of(folder, other), Console(file=printed, width=200))
+    return printed.getvalue()
 
 
 def rendered(folder: Path) -> str:

@@ -65,8 +65,11 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize("command", ["simulate", "run"])
-@pytest.mark.parametrize(("options", "message"), WRONG, ids=lambda value: str(value)[:30])
+@pytest.mark.parametrize(
+    ("command", "options", "message"),
+    [("simulate", *each) for each in WRONG] + [("run", *each) for each in WRONG if each[0][0] == "--program"],
+    ids=lambda value: str(value)[:30],
+)
 def test_what_is_refused_leaves_nothing(command: str, options: list[str], message: str) -> None:
     status, stderr = vnet(command, BEACON, *SHORT, *options)
     assert (status, stderr.count("\n")) == (2, 1), stderr

@@ -40,7 +40,9 @@ def test_details_decide_the_level_of_some(kind: str, details: dict[str, object],
 
 @pytest.mark.slow
 def test_events_have_the_details_that_are_declared(tmp_path: Path) -> None:
-    scenario = load_scenario(ROOT / "scenarios" / "faults.toml", ["run.duration_s=15"])
+    scenario = load_scenario(
+        ROOT / "scenarios" / "faults.toml", ["run.duration_s=15", "program.entry=agents.beacon:main"]
+    )
     session = Session(scenario, tmp_path / "run").open()
     session.run()
     session.close()

@@ -94,9 +94,16 @@ def of_states(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("edits", [[of_events, of_verdict, of_states], [of_manifest]], ids=["records", "manifest"])
-@pytest.mark.parametrize("command", ["check", "report", "compare", "radio", "trace", "diff"])
-def test_no_command_sends_what_a_folder_holds(run: Path, tmp_path: Path, edits: list[Edit], command: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "edits"),
+    [
+        *((command, [of_events, of_verdict, of_states]) for command in ("check", "report", "compare")),
+        *((command, [of_events, of_verdict, of_states]) for command in ("radio", "trace", "diff")),
+        ("check", [of_manifest]),
+    ],
+    ids=["check", "report", "compare", "radio", "trace", "diff", "manifest"],
+)
+def test_no_command_sends_what_a_folder_holds(run: Path, tmp_path: Path, command: str, edits: list[Edit]) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     for edit in edits:
         edit(copy)
