@@ -124,25 +124,30 @@ class Deliveries(Sequence[Delivery]):
 
         Nothing is kept of them, which is what takes time where there are many.
         """
-        table = self._table[:, self._order()]
-        table = table[:, np.argsort(table[_RECEIVER], kind="stable")]
-        packets, receivers = self._packets(table), table[_RECEIVER]
-        first = np.flatnonzero(np.diff(receivers, prepend=-1))
-        ends = [*first.tolist(), len(packets)][1:]
-        for receiver, start, end in zip(receivers[first].tolist(), first.tolist(), ends, strict=True):
+        if not len(self):
+            return
+        order = self._order()
+        receivers = self._table[_RECEIVER].take(order)
+        small = receivers.astype(np.uint16) if receivers.max() < 1 << 16 else receivers  # sorted by radix
+        order = order.take(small.argsort(kind="stable"))
+        packets = self._packets(self._table.take(order, axis=1))
+        receivers = self._table[_RECEIVER].take(order)
+        starts = [0, *(np.flatnonzero(receivers[1:] != receivers[:-1]) + 1).tolist()]
+        ends = [*starts[1:], len(packets)]
+        for receiver, start, end in zip(receivers.take(starts).tolist(), starts, ends, strict=True):
             yield receiver, packets[start:end]
 
     def _packets(self, table: IntArray) -> list[Packet]:
         """Return the packets of these columns (4, n) of the table, as they stand."""
         if not table.shape[1]:
             return []
-        numbers, index = np.unique(table[_FRAME], return_inverse=True)
-        frames = [self._frames[number] for number in numbers.tolist()]
-        of_frames = np.array([_OF_PACKET(sent) for sent in frames], object)
-        names, sent_ns, payloads = of_frames[index].T.tolist()
-        if any(sent.altered for sent in frames):
-            receptions = zip(index.tolist(), table[_RECEIVER].tolist(), payloads, strict=True)
-            payloads = [frames[number].altered.get(receiver, payload) for number, receiver, payload in receptions]
+        numbers = table[_FRAME].tolist()
+        frames = {number: self._frames[number] for number in set(numbers)}
+        of_frames = {number: _OF_PACKET(sent) for number, sent in frames.items()}
+        names, sent_ns, payloads = zip(*map(of_frames.__getitem__, numbers), strict=True)
+        if any(sent.altered for sent in frames.values()):
+            receptions = zip(numbers, table[_RECEIVER].tolist(), payloads, strict=True)
+            payloads = tuple(frames[number].altered.get(node, payload) for number, node, payload in receptions)
         powers = self._trace.powers(table[_ROW]) if self._trace.knows_power else ()
         return [*map(Packet, names, sent_ns, table[_ARRIVAL].tolist(), payloads, *powers)]
 
@@ -529,13 +534,15 @@ class Engine:
         addressed = [number for number, sent in enumerate(transmissions) if sent.attempt]
         for number in addressed:  # its row stands also if nobody could receive it
             near[number, transmissions[number].frame.to] = True
-        each = near.sum(axis=1)
-        column = near.nonzero()[1]
-        receiver = column if receptions.receiver is None else receptions.receiver[near]
+        each = np.count_nonzero(near, axis=1)
+        place = np.flatnonzero(near)  # look-ups with one index are much faster than with a mask of two dimensions
+        column = place - np.repeat(np.arange(len(each)) * near.shape[1], each)
+        receiver = column if receptions.receiver is None else receptions.receiver.ravel().take(place)
         near_ones = len(receiver) - (int(each[addressed].sum()) if addressed else 0)
         broadcasts = len(transmissions) - len(addressed)
         self._counts[Outcome.out_of_range] += broadcasts * (len(self._node_ids) - 1) - near_ones
-        outcome, arrival_ns, cause = receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]
+        columns = receptions.outcome, receptions.arrival_ns, receptions.cause
+        outcome, arrival_ns, cause = (values.ravel().take(place) for values in columns)
         self._enter(transmissions, each, receiver, outcome, arrival_ns, cause)
         for number, copied, later_ns, planned in receptions.copies:
             again = np.flatnonzero(copied & (receptions.outcome[number] == PENDING))

@@ -269,7 +269,8 @@ class Receptions:
 
     def decide(self, mask: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
         """Give `outcome` to the pending receptions of a mask that broadcasts to (K, M)."""
-        np.copyto(self.outcome, np.uint8(outcome.value), where=(self.outcome == PENDING) & mask)
+        decided = (self.outcome == PENDING) & mask  # pending is zero, so adding is setting
+        self.outcome += decided.view(np.uint8) * np.uint8(outcome.value)
 
     def fault(self, index: int, columns: NDArray[np.bool_], cause: int) -> None:
         """Lose the frame at row `index` by fault number `cause` where it is still pending.

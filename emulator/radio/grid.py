@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,9 +74,13 @@ class Candidates(NamedTuple):
             return self
         index = np.flatnonzero(self.mask)
         most = int(np.ceil(share * self.mask.size))
-        order = np.lexsort((ties[index], self.power_mw.ravel()[index]))[:most]
+        power_mw = self.power_mw.ravel()[index]
+        if most < len(index):
+            bound_mw = np.partition(power_mw, most - 1)[most - 1]
+            less, equal = index[power_mw < bound_mw], index[power_mw == bound_mw]
+            index = np.concatenate([less, equal[np.argsort(ties[equal], kind="stable")[: most - len(less)]]])
         mask = np.zeros(self.mask.size, bool)
-        mask[index[order]] = True
+        mask[index] = True
         return self._replace(mask=mask.reshape(self.mask.shape))
 
     def within(self, first: int, last: int) -> Candidates:
@@ -99,6 +103,14 @@ class Places(NamedTuple):
         """Yield the place of each frame: the index of its slot, its first subchannel, and their number."""
         return zip(self.slot.tolist(), self.first.tolist(), self.length.tolist(), strict=True)
 
+    def resources(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Return all resources that are used: of each the frame, the index of its slot, and its subchannel."""
+        if self.length.max(initial=0) <= 1:
+            return np.arange(len(self.slot)), self.slot, self.first
+        each = np.repeat(np.arange(len(self.slot)), self.length)
+        nth = np.arange(len(each)) - np.repeat(np.cumsum(self.length) - self.length, self.length)
+        return each, self.slot[each], self.first[each] + nth
+
 
 class Heard(NamedTuple):
     """Frames of some slots: received powers (K, N) in mW, who decoded what they reserve, and their places.
@@ -109,7 +121,7 @@ class Heard(NamedTuple):
     power_mw: Array
     decoded: Mask
     places: Places
-    periods: Sequence[int]
+    periods: IntArray
 
 
 class SensedGrid:
@@ -132,11 +144,19 @@ class SensedGrid:
         first = max(self._next, slot - self._ring)
         if first >= slot:
             return
-        rows = np.arange(first, slot) % self._ring
-        self._reserved_dbm[:, rows], self._period[:, rows], self._deaf[:, rows] = NOT_RESERVED_DBM, 0, False
-        if self._power_mw is not None:
-            self._power_mw[:, rows] = 0
+        for rows, _ in self._spans(first, slot - first):
+            self._reserved_dbm[:, rows], self._period[:, rows], self._deaf[:, rows] = NOT_RESERVED_DBM, 0, False
+            if self._power_mw is not None:
+                self._power_mw[:, rows] = 0
         self._next = slot
+
+    def _spans(self, first: int, count: int) -> Iterator[tuple[slice, slice]]:
+        """Yield where the ring has successive slots, in one piece or two, and which of the slots these are."""
+        row = first % self._ring
+        before = min(count, self._ring - row)
+        yield slice(row, row + before), slice(0, before)
+        if before < count:
+            yield slice(0, count - before), slice(before, count)
 
     def sense(self, slots: Sequence[int], power_mw: Array, deaf: Mask, heard: Heard) -> None:
         """Note slots: the power (slots, subchannels, N) at each vehicle, who transmitted, and what others reserve.
@@ -145,37 +165,49 @@ class SensedGrid:
         counts.
         """
         self.advance(slots[0])
-        index = [slot - slots[0] for slot in slots]
+        index = np.array(slots) - slots[0]
         shape = slots[-1] - slots[0] + 1, *power_mw.shape[1:]
-        reserved_dbm, period = np.full(shape, NOT_RESERVED_DBM, np.float16), np.zeros(shape, np.int16)
-        dbm = np.full(heard.power_mw.shape, NOT_RESERVED_DBM)
-        np.log10(heard.power_mw, out=dbm, where=heard.decoded)
-        dbm = (10 * dbm).astype(np.float16)
-        frames = zip(dbm, heard.periods, heard.places.each(), strict=True)
-        for own_dbm, reserved_for, (slot, first, length) in frames:
-            if reserved_for:
-                place = index[slot], slice(first, first + length)
-                stronger = own_dbm > reserved_dbm[place]
-                np.copyto(reserved_dbm[place], own_dbm, where=stronger)
-                np.copyto(period[place], reserved_for, where=stronger)
-        self._put(self._reserved_dbm, slots[0], reserved_dbm)
-        self._put(self._period, slots[0], period)
+        reserved_dbm, period = self._reservations(shape, index, heard)
         silent = np.zeros((shape[0], shape[2]), bool)
         silent[index] = deaf
-        self._put(self._deaf, slots[0], silent)
+        sensed_mw = None
         if self._power_mw is not None:
             sensed_mw = np.zeros(shape, np.float32)
             sensed_mw[index] = np.where(deaf[:, None] | (power_mw < self._busy_mw), 0, power_mw)
-            self._put(self._power_mw, slots[0], sensed_mw)
+        for rows, some in self._spans(slots[0], shape[0]):
+            self._reserved_dbm[:, rows] = reserved_dbm[some].transpose(2, 0, 1)
+            self._period[:, rows] = period[some].transpose(2, 0, 1)
+            self._deaf[:, rows] = silent[some].T
+            if self._power_mw is not None and sensed_mw is not None:
+                self._power_mw[:, rows] = sensed_mw[some].transpose(2, 0, 1)
         self._next = slots[-1] + 1
 
-    def _put(self, kept: NDArray[Any], first: int, values: NDArray[Any]) -> None:
-        """Put values (slots, …, N) of successive slots where what is kept (N, ring, …) has them."""
-        row, count = first % self._ring, len(values)
-        values = values.transpose(-1, *range(values.ndim - 1))
-        before = min(count, self._ring - row)
-        kept[:, row : row + before] = values[:, :before]
-        kept[:, : count - before] = values[:, before:]
+    def _reservations(
+        self, shape: tuple[int, ...], index: IntArray, heard: Heard
+    ) -> tuple[NDArray[np.float16], NDArray[np.int16]]:
+        """Return the strongest reservation that each vehicle decodes on each resource, and its period.
+
+        Both have the `shape` (slots, subchannels, N); `index` are the slots of the frames.
+        """
+        each_dbm = np.full(heard.power_mw.shape, NOT_RESERVED_DBM)
+        np.log10(heard.power_mw, out=each_dbm, where=heard.decoded)
+        each_dbm *= 10
+        each_dbm[heard.periods == 0] = NOT_RESERVED_DBM
+        each_period = (each_dbm > NOT_RESERVED_DBM) * heard.periods[:, None].astype(np.int16)
+        frame, slot, subchannel = heard.places.resources()
+        row, index = index[slot] * shape[1] + subchannel, np.arange(len(frame))
+        first = np.zeros(shape[0] * shape[1], np.intp)
+        first[row[::-1]] = index[::-1]  # of several the one assigned last stays
+        is_first = first[row] == index
+        reserved_dbm = np.full((len(first), shape[2]), NOT_RESERVED_DBM, np.float16)
+        period = np.zeros((len(first), shape[2]), np.int16)
+        reserved_dbm[row[is_first]], period[row[is_first]] = each_dbm[frame[is_first]], each_period[frame[is_first]]
+        for number in np.flatnonzero(~is_first).tolist():
+            place, dbm = row[number], each_dbm[frame[number]].astype(np.float16)
+            stronger = dbm > reserved_dbm[place]
+            np.copyto(reserved_dbm[place], dbm, where=stronger)
+            np.copyto(period[place], each_period[frame[number]], where=stronger)
+        return reserved_dbm.reshape(shape), period.reshape(shape)
 
     def candidates(self, now: int, wanted: Wanted) -> Candidates:
         """Return the candidates among the resources that a vehicle looks for in slot `now`.
@@ -202,20 +234,27 @@ class SensedGrid:
 
     def _slot_of(self, row: NDArray[np.intp]) -> IntArray:
         """Return the last slots that rows of the ring stand for."""
-        return np.asarray(self._next - 1 - (self._next - 1 - row) % self._ring)
+        last = self._next - 1
+        return np.asarray(row + (last - last % self._ring) - self._ring * (row > last % self._ring))
 
     def _strongest_dbm(self, now: int, wanted: Wanted) -> Array:
         """Return the strongest signal (slots, places) whose sender has reserved a part of each resource."""
-        row, subchannel = np.nonzero(self._period[wanted.node])
+        periods = self._period[wanted.node].ravel()
+        place = np.flatnonzero(periods != 0)
+        row = place // self._mac.subchannels
         slot = self._slot_of(row)
         known = (slot < now) & (slot >= now - self._slots)
-        row, slot, subchannel = row[known], slot[known], subchannel[known]
-        period = self._period[wanted.node, row, subchannel].astype(np.int64)
-        dbm = self._reserved_dbm[wanted.node, row, subchannel].astype(float)
+        if not known.all():
+            place, row, slot = place[known], row[known], slot[known]
+        subchannel = place - row * self._mac.subchannels
+        period = periods[place].astype(np.int64)
+        dbm = self._reserved_dbm[wanted.node].ravel()[place].astype(float)
         window = wanted.last - wanted.first + 1
         strongest_dbm = np.full((window, self._mac.subchannels), NOT_RESERVED_DBM)
         scale = min(100 * NS_PER_MS // self._mac.slot_ns, self._mac.sensing_slots)
-        repeats = np.where((period < scale) & (now - slot <= period), -(-scale // period), 1)
+        repeats = np.ones(len(period), np.int64)
+        short = np.flatnonzero((period < scale) & (now - slot <= period))
+        repeats[short] = -(-scale // period[short])
         for nth in range(1, int(repeats.max(initial=0)) + 1):
             if nth > 1:
                 again = nth <= repeats
@@ -232,10 +271,12 @@ class SensedGrid:
     ) -> None:
         """Mark the resources whose use, now or in one of the periods to come, would meet a reserved slot."""
         period = max(wanted.period, 1)
-        offset = (reserved - wanted.first) % period if wanted.times > 1 else reserved - wanted.first
+        later = offset = reserved - wanted.first
+        if wanted.times > 1:
+            offset = later - later // period * period  # much faster than the remainder
         for lap in range(0, len(strongest_dbm), period):
             index = offset + lap
-            ahead = reserved - wanted.first - index
+            ahead = later - index
             meets = (index >= 0) & (index < len(strongest_dbm)) & (ahead >= 0) & (ahead < wanted.times * period)
             place = index[meets] * strongest_dbm.shape[1] + subchannel[meets]  # `at` is slow with two indices
             np.maximum.at(strongest_dbm.reshape(-1), place, dbm[meets])
@@ -263,14 +304,16 @@ class SensedGrid:
         step = min(wanted.period, hundred) if wanted.period else hundred
         slots = np.arange(wanted.first, wanted.last + 1)
         latest = slots - step * -(-(slots - now + 1) // step)
-        each = latest[:, None] - step * np.arange((self._slots - 1) // step)
-        known = (each >= 0) & (each >= now - self._slots)
+        each = latest - step * np.arange((self._slots - 1) // step)[:, None]
+        known = each >= max(now - self._slots, 0)
         rows = each % self._ring
-        counts = np.count_nonzero(known & ~self._deaf[wanted.node][rows], axis=1)
+        counts = np.add.reduce(known & ~self._deaf[wanted.node].take(rows), axis=0, dtype=np.intp)
         sensed_mw = self._power_mw[wanted.node].take(rows, axis=0)
         if not known.all():
             sensed_mw *= known[:, :, None]
-        power_mw = sensed_mw.sum(axis=1, dtype=np.float64)  # it was silent in slots in which it transmitted
+        power_mw = np.zeros(sensed_mw.shape[1:])  # it was silent in slots in which it transmitted
+        for in_period_mw in sensed_mw:
+            power_mw += in_period_mw
         power_mw /= np.maximum(counts, 1)[:, None]
         places = self._mac.subchannels - wanted.length + 1
         return np.asarray(sum(power_mw[:, n : n + places] for n in range(wanted.length)) / wanted.length)

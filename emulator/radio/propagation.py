@@ -213,6 +213,8 @@ class Nakagami:
     def __init__(self, fading: Fading | None) -> None:
         self._until_m = np.array(fading.until_m if fading is not None else ())
         self._factor = np.concatenate([_quantiles(m) for m in fading.m]) if fading is not None else np.ones(1)
+        self.fades = fading is not None
+        """True if any factor is not one."""
 
     def shape(self, distance_m: Array) -> NDArray[np.intp]:
         """Return the table offsets of the shapes at these distances (any shape), as `factor` takes them."""

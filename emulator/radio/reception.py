@@ -65,9 +65,11 @@ class Signals:
         assert topology.power_mw is not None
         assert topology.fading is not None
         mean_mw = topology.power_mw[sender]
-        steps = (random_draws & _LAST).view(np.int64)  # of the type of an index, which numpy need not convert
-        power_mw = mean_mw * self.nakagami.factor(topology.fading[sender], steps)
-        power_mw[sender] = mean_mw[sender]
+        power_mw = mean_mw.copy()
+        if self.nakagami.fades:
+            steps = (random_draws & _LAST).view(np.int64)  # of the type of an index, which numpy need not convert
+            power_mw *= self.nakagami.factor(topology.fading[sender], steps)
+            power_mw[sender] = mean_mw[sender]
         if frame.gain_db:
             power_mw *= 10 ** (frame.gain_db / 10)
         return Signal(random_draws, power_mw, random_draws.item(sender))
@@ -138,9 +140,12 @@ class Reception:
                 signal = self._signal(sent)
                 own_mw[index] = signal.power_mw
                 others_mw[index] = self._threshold.noise_mw + self._interference_mw(sent, signal)
-        power_mw = own_mw[frame_index, receiver]
+        place = (
+            frame_index * self._signals.count + receiver
+        )  # a look-up with one index is much faster than with two
+        power_mw = own_mw.ravel()[place]
         power_mw[power_mw == 0] = np.nan
-        return np.asarray(10 * np.log10([power_mw, power_mw / others_mw[frame_index, receiver]]))
+        return np.asarray(10 * np.log10([power_mw, power_mw / others_mw.ravel()[place]]))
 
     def _interference_mw(self, sent: Transmission, signal: Signal) -> Array | float:
         """Return the mean power (N,) of all other signals during a frame's payload."""

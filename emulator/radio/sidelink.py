@@ -29,7 +29,7 @@ from emulator.radio.frames import Frame, Receptions, Signal, Transmission
 from emulator.radio.grid import BusyMeter, Candidates, Heard, Places, SensedGrid, Wanted
 from emulator.radio.mac import Mac, ThrottledQueue
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
-from emulator.radio.outcomes import Outcome
+from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.reception import JITTER, Signals, milliwatts, reception_draws, sender_draw
 from emulator.scenario.radio import Receiver
 from emulator.scenario.random_streams import Draws
@@ -476,16 +476,20 @@ class Sidelink(Mac):
         deaf = np.zeros((count, self._signals.count), bool)
         deaf[places.slot, nodes] = True
         sensed_mw = self._link.sensed_mw(power_mw, places)
-        places_mw = [sensed_mw[slot, first : first + length] for slot, first, length in places.each()]
-        others_mw = np.array([each_mw[0] if len(each_mw) == 1 else each_mw.sum(axis=0) for each_mw in places_mw])
+        others_mw = sensed_mw[places.slot, places.first]
+        for nth in range(1, int(places.length.max())):
+            longer = np.flatnonzero(places.length > nth)
+            others_mw[longer] += sensed_mw[places.slot[longer], places.first[longer] + nth]
         others_mw -= power_mw
         np.maximum(others_mw, 0.0, out=others_mw)
         decoded = self._link.decodes_reservation(power_mw, others_mw, places.length) & ~deaf[places.slot]
-        busy = (sensed_mw >= self._link.busy_mw).sum(axis=1)
+        is_busy = (sensed_mw >= self._link.busy_mw).view(np.uint8)
+        busy = np.add.reduce(is_busy, axis=1, dtype=np.uint8).astype(np.int64)
         busy[places.slot, nodes] = places.length
         for booking, each_mw, index in zip(on_air, others_mw, places.slot.tolist(), strict=True):
             _signal(booking.sent).slots.append((each_mw, deaf[index]))
-        self._grid.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, [each.period for each in on_air]))
+        periods = np.array([booking.period for booking in on_air])
+        self._grid.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods))
         for slot, each in zip(slots, busy, strict=True):
             self._meter.add(slot, each)
 
@@ -539,6 +543,7 @@ class Link:
         self._leak = milliwatts(-mac.in_band_emission_db)
         self._sci = milliwatts(SCI_SNR_DB)
         self._table = np.array(mac.bler_sinr_db), np.array(mac.bler)
+        self._clear = milliwatts(mac.bler_sinr_db[-1]) * (1 + 1e-9)
         self._bytes = mac.subchannel_bytes
 
     def noise_mw(self, length: int) -> float:
@@ -557,7 +562,8 @@ class Link:
         for leaked_mw, own_mw, (slot, first, length) in frames:
             in_slot_mw = sensed_mw[slot]
             in_slot_mw += leaked_mw
-            in_slot_mw[first : first + length] += own_mw
+            in_place_mw = in_slot_mw[first] if length == 1 else in_slot_mw[first : first + length]
+            in_place_mw += own_mw
         return sensed_mw
 
     def decodes_reservation(self, own_mw: Array, others_mw: Array, lengths: IntArray) -> Mask:
@@ -567,7 +573,10 @@ class Link:
 
     def error_rate(self, ratio: Array) -> Array:
         """Return the block error rates at these ratios (any shape) of signal to noise and interference."""
-        return np.asarray(np.interp(10 * np.log10(np.maximum(ratio, 1e-30)), *self._table))
+        rates = np.full(ratio.shape, self._table[1][-1])
+        some = ratio < self._clear  # beyond it the table stays as it is
+        rates[some] = np.interp(10 * np.log10(np.maximum(ratio[some], 1e-30)), *self._table)
+        return rates
 
 
 class SidelinkReception:
@@ -588,10 +597,11 @@ class SidelinkReception:
             return
         signals = [_signal(transmissions[index]) for index in sent]
         sizes = [self._link.length(transmissions[index].frame.size_bytes) for index in sent]
-        noise_mw = np.array([self._link.noise_mw(length) for length in sizes])[:, None]
+        noise_mw = np.array([self._link.noise_mw(length) for length in sizes])
         power_mw = np.array([signal.power_mw for signal in signals])
         words = np.array([signal.random_draws for signal in signals])
         detected = power_mw >= self._link.sensing_mw
+        undecided = detected & (receptions.outcome[sent] == PENDING)
         deaf, alone, received = np.ones((3, *power_mw.shape), bool)
         alone[:], received[:] = False, False
         for nth in range(max(len(signal.slots) for signal in signals)):
@@ -599,11 +609,11 @@ class SidelinkReception:
             silent = np.array([np.ones(self._count, bool) if slot is None else slot[1] for slot in slots])
             others_mw = np.array([np.zeros(self._count) if slot is None else slot[0] for slot in slots])
             deaf &= silent
-            able = detected & ~silent
-            own_mw, noise = power_mw[able], np.broadcast_to(noise_mw, able.shape)[able]
-            draws = reception_draws(words[able] * _SECOND if nth else words[able])
-            alone[able] |= draws >= self._link.error_rate(own_mw / noise)
-            received[able] |= draws >= self._link.error_rate(own_mw / (noise + others_mw[able]))
+            able = np.flatnonzero(undecided & ~silent)
+            own_mw, noise, drawn = power_mw.ravel()[able], noise_mw[able // self._count], words.ravel()[able]
+            draws = reception_draws(drawn * _SECOND if nth else drawn)
+            alone.ravel()[able] |= draws >= self._link.error_rate(own_mw / noise)
+            received.ravel()[able] |= draws >= self._link.error_rate(own_mw / (noise + others_mw.ravel()[able]))
         for mask, outcome in (
             (deaf, Outcome.half_duplex),
             (~detected, Outcome.below_sensing),
@@ -627,9 +637,10 @@ class SidelinkReception:
                 own_mw[index] = signal.power_mw
                 others_mw[index] = self._link.noise_mw(self._link.length(sent.frame.size_bytes))
                 others_mw[index] += reduce(np.minimum, [others for others, _ in signal.slots])
-        power_mw = own_mw[frame_index, receiver]
+        place = frame_index * self._count + receiver  # a look-up with one index is much faster than with two
+        power_mw = own_mw.ravel()[place]
         power_mw[power_mw == 0] = np.nan
-        return np.asarray(10 * np.log10([power_mw, power_mw / others_mw[frame_index, receiver]]))
+        return np.asarray(10 * np.log10([power_mw, power_mw / others_mw.ravel()[place]]))
 
 
 def _signal(sent: Transmission | None) -> Signal:

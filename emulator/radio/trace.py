@@ -195,8 +195,9 @@ class Trace:
 
     def powers(self, rows: IntArray) -> tuple[list[float], list[float]]:
         """Return received powers in dBm, and their ratios to noise and interference in dB, of rows (n,)."""
-        powers = self._powers.records[rows]
-        return (powers["rssi_dbm"] / POWER_STEPS_DB).tolist(), (powers["snr_db"] / POWER_STEPS_DB).tolist()
+        powers = self._powers.records.view(np.int16).reshape(-1, 2).take(rows, axis=0) / POWER_STEPS_DB
+        rssi_dbm, snr_db = powers.T.tolist()
+        return rssi_dbm, snr_db
 
     def alter(self, row: int, payload_digest: int) -> None:
         """Set the digest of the altered payload that arrives in this row."""

@@ -27,7 +27,7 @@ def sense(grid: SensedGrid, mac: Sidelink, slot: int, frames: list[tuple[int, in
     decoded = np.array([[True, False]] * len(frames))
     starts, lengths, periods, _ = (np.array(column) for column in zip(*frames, strict=True))
     places = Places(np.zeros(len(frames), np.int64), starts, lengths)
-    grid.sense([slot], power_mw[None], np.array([[False, True]]), Heard(own_mw, decoded, places, periods.tolist()))
+    grid.sense([slot], power_mw[None], np.array([[False, True]]), Heard(own_mw, decoded, places, periods))
 
 
 frame_lists = st.lists(
@@ -97,10 +97,10 @@ def test_slots_that_are_sensed_at_once_are_as_if_one_by_one(
     power_mw = np.stack([10 ** (dbm / 10), np.ones(len(dbm))], axis=1)
     decoded = np.array([[True, False]] * len(dbm))
     sensed_mw = np.zeros((len(slots), 4, 2))
-    for own_mw, (slot, start, count) in zip(power_mw, places.each(), strict=True):
+    for own_mw, (slot, start, count) in zip(power_mw, np.column_stack(places).tolist(), strict=True):
         sensed_mw[slot, start : start + count, 0] += own_mw[0] / count
     deaf = np.array([[False, True]] * len(slots))
-    at_once.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods.tolist()))
+    at_once.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods))
     for slot in slots:
         sense(one_by_one, mac, slot, [each[1:] for each in frames if each[0] == slot])
     for node in (0, 1):
