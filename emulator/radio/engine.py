@@ -327,6 +327,7 @@ class Engine:
         self._node_ids = tuple(node_ids)
         self._radio = radio
         self._max_payload_bytes = radio.max_payload_bytes
+        self._periods_ms = () if radio.sidelink is None else radio.sidelink.periods_ms
         count = len(node_ids)
         signals = Signals(seed, radio.fading, count) if radio.is_physical else None
         nakagami = signals.nakagami if signals is not None else None
@@ -479,7 +480,7 @@ class Engine:
             "bitrate_mbps": bitrate_mbps,
             "to": to,
             "ticket": ticket,
-            "period_ms": allowed_period_ms(self._radio, asked),
+            "period_ms": allowed_period_ms(self._periods_ms, asked),
         }
 
     def _enqueue(self, frames: Sequence[Frame]) -> None:
@@ -541,8 +542,8 @@ class Engine:
         near_ones = len(receiver) - (int(each[addressed].sum()) if addressed else 0)
         broadcasts = len(transmissions) - len(addressed)
         self._counts[Outcome.out_of_range] += broadcasts * (len(self._node_ids) - 1) - near_ones
-        columns = receptions.outcome, receptions.arrival_ns, receptions.cause
-        outcome, arrival_ns, cause = (values.ravel().take(place) for values in columns)
+        outcome, cause = receptions.outcome.ravel().take(place), receptions.cause.ravel().take(place)
+        arrival_ns = receptions.arrival_ns.ravel().take(place)
         self._enter(transmissions, each, receiver, outcome, arrival_ns, cause)
         for number, copied, later_ns, planned in receptions.copies:
             again = np.flatnonzero(copied & (receptions.outcome[number] == PENDING))

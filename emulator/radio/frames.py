@@ -67,14 +67,13 @@ def allowed_choices(radio: Radio, asked: SentFrame, largest_dbm: float | None) -
     if asked.power_dbm is not None and largest_dbm is not None and math.isfinite(asked.power_dbm):
         power_dbm = max(asked.power_dbm, MIN_POWER_DBM)
         gain_db = round(min(power_dbm - largest_dbm, 0.0), DIGITS)
-    if radio.is_physical and radio.sidelink is None and asked.rate_mbps in RATES_MBPS:
+    if asked.rate_mbps in RATES_MBPS and radio.is_physical and radio.sidelink is None:
         bitrate_mbps = float(asked.rate_mbps or bitrate_mbps)
     return gain_db, bitrate_mbps
 
 
-def allowed_period_ms(radio: Radio, asked: SentFrame) -> int:
-    """Return the reservation interval that a program has asked for; 0 for none, or one that the radio lacks."""
-    periods_ms = () if radio.sidelink is None else radio.sidelink.periods_ms
+def allowed_period_ms(periods_ms: tuple[int, ...], asked: SentFrame) -> int:
+    """Return the reservation interval that a program has asked for; 0 for none, or one that is not among these."""
     return int(asked.period_ms) if asked.period_ms in periods_ms else 0
 
 
