@@ -372,15 +372,16 @@ class InformationEstimator:
         increments = [self._increment, *[frame.increment for frame in frames]]
         if not self._options.defence:
             return priors, increments
-        if frames and min(self._used_shares) < 1:
-            each = zip(increments[1:], self._used_shares, strict=True)
-            increments[1:] = [scaled_by(increment, share) for increment, share in each]
         own, largest = traces_of([self._increment, self._prior])
         traces = sorted(traces_of(increments))
         usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
         self._largest_increment = max(usual, self.own.largest_increment)
         if traces[-1] > self._largest_increment:
             increments = scaled_down(increments, self._largest_increment)
+        # Shares are of what is left: who claims more is not to weigh as the honest do.
+        if frames and min(self._used_shares) < 1:
+            each = zip(increments[1:], self._used_shares, strict=True)
+            increments[1:] = [scaled_by(increment, share) for increment, share in each]
         return scaled_down(priors, PRIOR_FACTOR * largest), increments
 
     def _weigh(
@@ -428,7 +429,8 @@ class InformationEstimator:
         used = self._shares_used(origins, increments, ((x, y), (p, q, r)), True)
         if min(used) < 1:
             self._reject("passed", sum(share < COUNTED_SHARE for share in used))
-            increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]
+            cut = zip(scaled_down(increments, self._largest_increment), used, strict=True)
+            return [scaled_by(increment, share) for increment, share in cut]
         return scaled_down(increments, self._largest_increment)
 
     # What goes out.

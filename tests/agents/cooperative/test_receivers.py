@@ -179,6 +179,24 @@ def test_increments_of_a_minority_that_colludes_do_not_take_over(count: int) -> 
     assert root_mean_square_m(network, 30, liars, bold) < 0.8
 
 
+@pytest.mark.parametrize(("count", "most_m"), [(1, 0.55), (2, 1.2)])
+def test_increments_of_lanes_that_claim_much_do_not_weigh_as_the_honest_do(count: int, most_m: float) -> None:
+    """One or two of six precise receivers claim 900 m⁻² of the direction that their lane tells, 0.3 m off."""
+    liars = {f"v{k}" for k in range(count)}
+    network = MixedNetwork([Receiver(0.1)] * 6, 0)
+
+    def bold(name: str, frame: InformationFrame) -> InformationFrame:
+        a, b, kind, x, age = frame.increment
+        if name not in liars or kind >= 0 or not (a or b):
+            return frame
+        more = 30.0 / math.hypot(a, b)
+        return replace(frame, increment=(more * a, more * b, kind, more * x + 30.0 * 0.3, age))
+
+    for _ in range(30):
+        network.advance()
+    assert root_mean_square_m(network, 50, liars, bold) < most_m
+
+
 @pytest.mark.parametrize("reach", [1, 8])
 def test_who_claims_ever_older_memories_does_not_stop_the_exchange(reach: int) -> None:
     network = MixedNetwork([Receiver(0.1)] * 8, 0, reach)
