@@ -313,11 +313,19 @@ def test_configuration_of_a_session_counts_or_is_refused_by_name(
                 zenoh.open(config(key, value))
             except zenoh.ZError as error:
                 print(error)
+        print(zenoh.open(config("id", '"ab02"')).zid())
         """
     )
     assert log(run)[0] == "['Timeout'] 0.3"
     assert log(run)[1].startswith("namespace")
     assert "missing field" in log(run)[2]
+    assert log(run)[3] == "ab02"
+
+
+def test_nothing_is_no_payload(drive: Drive) -> None:
+    """As at Zenoh itself, where the end of such a program is seen."""
+    run = drive("import zenoh; zenoh.open(zenoh.Config()).put('a', None)")
+    assert run.verdict == "invalid"
 
 
 def test_a_program_has_a_working_directory_and_sleeps_of_its_own(drive: Drive) -> None:

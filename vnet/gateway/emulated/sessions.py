@@ -386,7 +386,6 @@ class Session:
     def __init__(self, vehicle: Vehicle, outlet: Outlet, config: zenoh.Config) -> None:
         self.vehicle, self.outlet = vehicle, outlet
         self.entity_numbers = count(1)
-        self._zid = vehicle.new_zid()
         self._is_closed = False
         self._declared: dict[Entity, str] = {}
         self._at_close: list[Callable[[], object]] = []
@@ -396,6 +395,8 @@ class Session:
 
         for name in filter(setting, _REFUSED_SETTINGS):
             raise zenoh.ZError(f"{name} of a configuration is not available on virtual time")
+        given = setting("id")
+        self._zid = vehicle.new_zid() if given is None else ZenohId(int(given, 16))
         timeout_ms = setting("queries_default_timeout")
         self._timeout_s = QUERY_TIMEOUT_S if timeout_ms is None else timeout_ms / 1000
         enabled, mode = setting("timestamping/enabled"), setting("mode") or "peer"

@@ -53,7 +53,7 @@ class ZenohId(msgspec.Struct, frozen=True, gc=False):
         return f"{self.number:x}"
 
     def __bytes__(self) -> bytes:
-        return self.number.to_bytes(6, "little")
+        return self.number.to_bytes(-(-self.number.bit_length() // 8), "little")
 
     @classmethod
     def of(cls, *parts: object) -> ZenohId:
@@ -208,7 +208,9 @@ def encoding_of(encoding: Any, default: zenoh.Encoding = NO_ENCODING) -> zenoh.E
 
 
 def zbytes_of(content: Any) -> zenoh.ZBytes:
-    """Return what a program has given as a payload as one."""
+    """Return what a program has given as a payload as one. Raises TypeError, for None too."""
+    if content is None:
+        raise TypeError("argument 'payload': expected bytes/str type, found 'NoneType'")
     return content if isinstance(content, zenoh.ZBytes) else zenoh.ZBytes(content)
 
 
