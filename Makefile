@@ -18,7 +18,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # What `make test-all` tests with, each in a virtual environment of its own, if it is installed.
 PYTHONS ?= 3.11 3.12 3.13
 
-.PHONY: demo test tests coverage test-all quick lint docs site bench soak fuzz hunt sumo setup clean
+.PHONY: demo test tests coverage test-all quick lint docs site bench soak fuzz hunt sumo radios setup clean
 
 setup: $(READY)
 
@@ -90,6 +90,9 @@ sumo: $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt libsumo
 	$(BIN)/pytest -n 0 tests/emulator/world/driven/test_sumo_itself.py
 	$(BIN)/pytest -n 0 tests/docs/test_blocks.py -k sumo-in-the-loop
+
+radios: $(READY)
+	CURVES_S="60 60 3" $(BIN)/pytest -n 2 tests/benchmarks/test_cv2x.py -k published_curves
 
 hunt: $(READY)
 	$(BIN)/python -m tests.hunt
