@@ -167,7 +167,7 @@ class OwnVehicle:
 
         Fewer place no vehicle: one may be an outlier, and at 1 Hz two are as far apart where a vehicle drives.
         """
-        if len(before) < 2:
+        if len(before) < 2 or before[1][0] <= 0:  # the clock of a vehicle may be set back
             return False
         (_, first), (gap_s, second) = before
         more = since_s / gap_s

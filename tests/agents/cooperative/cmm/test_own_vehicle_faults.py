@@ -107,3 +107,11 @@ def test_a_vehicle_that_begins_again_forgets_the_fixes_of_before() -> None:
     own.restart(Information.of(COMMON_M, 0.01 * np.eye(2)))
     own.step(0.1, fix(rng, np.zeros(2)))
     assert own.position_m() is None
+
+
+def test_fixes_without_time_between_them_place_no_vehicle() -> None:
+    """A clock that is set back has the program read such."""
+    own, rng = vehicle(), np.random.default_rng(5)
+    for _ in range(4):
+        own.step(0.0, fix(rng, np.zeros(2)))
+    assert own.position_m() is None
