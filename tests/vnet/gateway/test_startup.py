@@ -75,9 +75,14 @@ def test_a_sitecustomize_of_the_users_own_runs_and_its_errors_are_told(
 
 def test_a_zenoh_of_another_protocol_is_named(tmp_path: Path) -> None:
     """Alone it would only say that nobody answers."""
-    (tmp_path / "zenoh.py").touch()
-    (about := tmp_path / "eclipse_zenoh-0.11.0.dist-info").mkdir()
-    (about / "METADATA").write_text("Name: eclipse-zenoh\nVersion: 0.11.0\n")
+    (tmp_path / "zenoh.py").write_text("def open(): ...")
     done = start(tmp_path, code="import zenoh")
     assert done.returncode == 1
-    assert "eclipse-zenoh 0.11.0" in done.stderr.splitlines()[-1]
+    assert str(tmp_path / "zenoh.py") in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", ["calendar", "csv", "email", "random", "string", "tempfile"])
+def test_a_module_of_the_program_is_found_before_pythons(tmp_path: Path, name: str) -> None:
+    """It would not be if the start had loaded Python's."""
+    (tmp_path / f"{name}.py").write_text("OWN = True")
+    assert start(tmp_path, code=f"import zenoh, {name}; print({name}.OWN)").stdout == "True\n"

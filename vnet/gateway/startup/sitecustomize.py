@@ -9,10 +9,8 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from importlib import import_module
 from importlib.machinery import ModuleSpec
-from importlib.metadata import PackageNotFoundError, version
 from types import ModuleType
 from typing import Any
 
@@ -33,19 +31,17 @@ class ZenohFinder:
 
             def load(module: ModuleType) -> None:
                 execute(module)
-                check_version()
+                check_version(module)
                 open_with_override(module)
 
             spec.loader.exec_module = load  # type: ignore[method-assign]
         return spec
 
 
-def check_version() -> None:
+def check_version(zenoh: Any) -> None:
     """Raise ImportError for a Zenoh of another protocol, which would only find that nobody answers."""
-    with suppress(PackageNotFoundError):
-        installed = version("eclipse-zenoh")
-        if not installed.startswith("1."):
-            raise ImportError(f"eclipse-zenoh {installed} cannot connect to vnet's endpoints, which are of Zenoh 1")
+    if not hasattr(zenoh, "ZBytes"):  # as importlib.metadata would say, with modules that programs may have, too
+        raise ImportError(f"{zenoh.__file__} cannot connect to vnet's endpoints, which are of Zenoh 1")
 
 
 def open_with_override(zenoh: Any) -> None:
