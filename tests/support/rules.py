@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import signal
 import threading
 import time
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from emulator import Answer, RadioFrame
+from emulator.scenario import rule_watch
 
 State = dict[str, Any]
 
@@ -104,6 +106,11 @@ def locks_up(frame: RadioFrame, state: State) -> Answer:
     lock = threading.Lock()
     with lock, lock:
         return Answer()
+
+
+def alarms(frame: RadioFrame, state: State) -> None:
+    """Send the process the signal that interrupts rules which wait."""
+    signal.raise_signal(rule_watch.WAKE_UP)
 
 
 def silences(frame: RadioFrame, state: State) -> list[bytes] | None:
