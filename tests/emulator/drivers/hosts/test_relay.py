@@ -14,6 +14,16 @@ def granted(*process_ids: str) -> Relay:
     return made
 
 
+def test_the_yields_of_a_barrier_are_one_bundle() -> None:
+    host = granted("v01", "v02", "v03")
+    for node in ("v02", "v01"):
+        host.take(node, YIELD)
+        assert host.take_bundle() == []
+    host.take("v03", YIELD)
+    assert host.take_bundle() == [("message", node, YIELD) for node in ("v02", "v01", "v03")]
+    assert host.take_bundle() == []
+
+
 def test_what_a_unit_sends_over_the_backbone_goes_with_the_yield_that_refers_to_it() -> None:
     host = granted("v01", "rsu01")
     host.take_unit("rsu01", b"message")
@@ -27,6 +37,30 @@ def test_what_a_unit_sends_over_the_backbone_goes_with_the_yield_that_refers_to_
     ]
     host.take_unit("rsu01", b"late")
     assert host.take_bundle() == [("backbone", "rsu01", b"late")]
+
+
+def test_who_ends_owes_nothing() -> None:
+    host = granted("v01", "v02")
+    host.take("v01", YIELD)
+    host.ended("v02")
+    assert host.take_bundle() == [("message", "v01", YIELD)]
+
+
+def test_what_is_no_yield_goes_at_once_and_takes_along_what_is_there() -> None:
+    host = granted("v01", "v02")
+    host.take("v01", YIELD)
+    host.take("v02", FINAL)
+    assert host.take_bundle() == [("message", "v01", YIELD), ("message", "v02", FINAL)]
+    host.add(("token", "v02", False))
+    assert host.take_bundle() == [("token", "v02", False)]
+    assert set(host.awaited) == {"v02"}, "it still owes its yield"
+
+
+def test_an_emulator_that_asks_does_not_wait_for_those_that_are_stuck() -> None:
+    host = granted("v01", "v02")
+    host.take("v01", YIELD)
+    host.hurry()
+    assert host.take_bundle() == [("message", "v01", YIELD)]
 
 
 def test_a_bundle_does_not_grow_without_bound() -> None:
