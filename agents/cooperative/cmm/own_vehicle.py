@@ -92,6 +92,8 @@ class OwnVehicle:
         self._is_placed = False
         self._outliers_s = 0.0
         self._latest: list[tuple[float, Observation]] = []  # two fixes, each with the time since the one before
+        self._taken: list[tuple[float, Observation]] = []  # the two that were taken last, likewise
+        self._untaken_s = 0.0
         self._since_s = 0.0
         self.prior = self._filter.belief
         self.took_fix = False
@@ -147,8 +149,11 @@ class OwnVehicle:
             if not self._agree(before, fix, since_s):
                 return NOTHING
             self._place(fix)
-        noise_m2 = fix.white_covariance_m2
-        increment = self._filter.take(fix.position_m, noise_m2, GATE_SIGMAS**2)
+            self._taken, self._untaken_s = before, 0.0
+        self._untaken_s += since_s
+        noise_m2, increment = fix.white_covariance_m2, None
+        if self._is_likely(before, fix, since_s):
+            increment = self._filter.take(fix.position_m, noise_m2, GATE_SIGMAS**2)
         if increment is None:
             self._is_placed = was_placed  # along a lane nothing is known before a fix has been taken
             self._outliers_s += since_s
@@ -158,9 +163,16 @@ class OwnVehicle:
             increment = self._filter.take(fix.position_m, noise_m2)
             assert increment is not None, "without a gate each fix is taken"
         self._outliers_s = 0.0
+        self._taken, self._untaken_s = [*self._taken[-1:], (self._untaken_s, fix)], 0.0
         self.took_fix = True
         self._go_on()
         return increment
+
+    def _is_likely(self, before: list[tuple[float, Observation]], fix: Observation, since_s: float) -> bool:
+        """Tell whether the gate may judge a fix: on no road that allows for any turn, and fixes must lead there."""
+        if isinstance(self._filter, OwnRbpf) or self._filter.model is not self._unknown:
+            return True
+        return self._agree(self._taken, fix, self._untaken_s) or self._agree(before, fix, since_s)
 
     def _agree(self, before: list[tuple[float, Observation]], fix: Observation, since_s: float) -> bool:
         """Tell whether a fix, `since_s` after two others, is where these lead at any constant speed.

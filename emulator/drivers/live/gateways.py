@@ -361,7 +361,9 @@ class Gateways:
         vehicle.received_seq = batch.seq + 1
         if batch.origin_ns is not None and not vehicle.on_air:
             delay_s = max(batch.origin_ns + batch.start_ns - time.monotonic_ns(), 0) / NS_PER_S
-            self._loop.call_later(delay_s, self._go_on_air, vehicle)
+            turn = self._emulation.number[vehicle.gateway.node] / len(self._emulation.number)
+            turn_s = 0.0 if batch.start_ns else TURNS_S * turn  # who comes back is alone
+            self._loop.call_later(delay_s, self._go_on_air, vehicle, turn_s)
         late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
         for each_ns in late_ns:
             vehicle.lateness[wire.lateness_bin(each_ns)] += 1
@@ -375,11 +377,10 @@ class Gateways:
             except ValueError as error:  # bytes that a fault has changed
                 self._note(vehicle, "debug", f"a frame of {packet.sender} is no sample: {error}")
 
-    def _go_on_air(self, vehicle: _Vehicle) -> None:
+    def _go_on_air(self, vehicle: _Vehicle, turn_s: float) -> None:
         """Begin to send what the programs put; in its turn also what they have put, and what is told regularly."""
         vehicle.on_air = True
-        turn = self._emulation.number[vehicle.gateway.node] / len(self._emulation.number)
-        self._loop.call_later(TURNS_S * turn, self._take_turn, vehicle)
+        self._loop.call_later(turn_s, self._take_turn, vehicle)
 
     def _take_turn(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
