@@ -255,8 +255,8 @@ class Launcher:
             if credentials is not None:
                 read_end, write_end = os.pipe()
                 descriptors.append(read_end)
-                os.write(write_end, credentials.dumps().encode())
-                os.close(write_end)
+                with os.fdopen(write_end, "w") as pipe:
+                    pipe.write(credentials.dumps())
                 command = [_filled(word, {CREDENTIALS: f"/dev/fd/{read_end}"}) for word in command]
             inherit = nullcontext() if name in self._services else default_time_slice()
             with (self.logs / f"{name}.log").open("ab") as log, inherit:
