@@ -7,12 +7,13 @@ payload asks for. Both sides of the wall read them: gateways and emulated sessio
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from itertools import count
 from typing import Annotated, Any, Literal
 
 import msgspec
+import zenoh
 
 from vnet.units import NS_PER_S
 
@@ -20,6 +21,8 @@ FRAGMENT_BYTES = 24
 """Most bytes of a frame around its part of a message."""
 MOST_UNFINISHED = 64
 """Messages in parts that are kept of each sender until the rest has come; the oldest go first."""
+MOST_WHOLE = 1024
+"""Messages of one frame that are kept decoded, for all who receive it."""
 MOST_FRAGMENTS = 65_535
 MOST_MESSAGES = 2**32
 """Messages that an incarnation of a sender has numbers for."""
@@ -31,6 +34,10 @@ Priority = Literal[
 Seconds = Annotated[int, msgspec.Meta(ge=0, lt=2**32)]
 Nanoseconds = Annotated[int, msgspec.Meta(ge=0, lt=NS_PER_S)]
 TimestampId = Annotated[bytes, msgspec.Meta(min_length=1, max_length=16)]
+
+
+SourceOf = Callable[[Any], tuple[int, int]]
+"""Returns what stands for a `SourceInfo` on the radio."""
 
 
 class CrossingSample(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
@@ -92,9 +99,9 @@ class Fragment(msgspec.Struct, array_like=True, frozen=True):
     content: bytes
 
 
-def crossing_of(sample: Any, source: tuple[int, int] | None) -> CrossingSample:
-    """Return what of a sample of Zenoh's, or of an emulated session, crosses the radio."""
-    stamp, time = sample.timestamp, None
+def crossing_sample(sample: Any, source_of: SourceOf) -> CrossingSample:
+    """Return what of a sample crosses the radio."""
+    stamp, time, source = sample.timestamp, None, sample.source_info
     if stamp is not None:
         ntp = stamp.get_time_as_ntp64()
         time = ntp.as_secs(), ntp.subsec_nanos(), bytes(stamp.get_id())
@@ -102,17 +109,47 @@ def crossing_of(sample: Any, source: tuple[int, int] | None) -> CrossingSample:
         str(sample.key_expr),
         sample.payload.to_bytes(),
         str(sample.encoding),
-        name_of(sample.kind) == "DELETE",
-        None if sample.attachment is None else sample.attachment.to_bytes(),
-        name_of(sample.priority),
-        name_of(sample.congestion_control),
+        sample.kind == zenoh.SampleKind.DELETE,
+        _bytes(sample.attachment),
+        _name_of(sample.priority),
+        _name_of(sample.congestion_control),
         sample.express,
         time,
-        source,
+        None if source is None else source_of(source),
     )
 
 
-def name_of(member: object) -> Any:
+def crossing_query(number: int, query: Any) -> CrossingQuery:
+    """Return what of a query crosses the radio."""
+    encoding = None if query.encoding is None else str(query.encoding)
+    return CrossingQuery(number, str(query.selector), _bytes(query.payload), encoding, _bytes(query.attachment))
+
+
+def crossing_reply(asker: str, query: CrossingQuery, reply: Any, source_of: SourceOf) -> CrossingReply:
+    """Return what of a reply to another vehicle's query crosses the radio."""
+    if reply.ok is not None:
+        return CrossingReply(asker, query.number, crossing_sample(reply.ok, source_of))
+    return CrossingReply(asker, query.number, None, (reply.err.payload.to_bytes(), str(reply.err.encoding)))
+
+
+@lru_cache(maxsize=MOST_WHOLE)
+def sample_options(sample: CrossingSample) -> Mapping[str, Any]:
+    """Return what a sample has beside key, payload, kind, encoding and source, the same at all receivers."""
+    time = sample.time
+    return {
+        "attachment": None if sample.attachment is None else zenoh.ZBytes(sample.attachment),
+        "priority": getattr(zenoh.Priority, sample.priority),
+        "congestion_control": getattr(zenoh.CongestionControl, sample.congestion),
+        "express": sample.express,
+        "timestamp": None if time is None else zenoh.Timestamp(zenoh.NTP64(*time[:2]), time[2]),
+    }
+
+
+def _bytes(content: zenoh.ZBytes | None) -> bytes | None:
+    return None if content is None else content.to_bytes()
+
+
+def _name_of(member: object) -> Any:
     """Return the name of a member of one of Zenoh's enumerations."""
     return str(member).rpartition(".")[2]
 
@@ -129,7 +166,7 @@ def decode_message(content: bytes) -> Message:
     return message
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=MOST_WHOLE)
 def whole_message(payload: bytes) -> Message | None:
     """Return the message of a frame that has all of it, the same at all receivers; None for a part.
 

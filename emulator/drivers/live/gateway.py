@@ -13,12 +13,11 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache, lru_cache
+from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
 import zenoh
 
 from emulator.drivers.agent_keys import Hear
@@ -30,15 +29,15 @@ from vnet.gateway.frames import (
     CrossingSample,
     CrossingTokens,
     Message,
-    Reassembly,
-    crossing_of,
+    crossing_reply,
+    crossing_sample,
+    sample_options,
 )
-from vnet.gateway.keys import FIX_KEY, OWN_KEYS, REPORT_KEY, fix_content
+from vnet.gateway.keys import FIX_KEY, REPORT_KEY, fix_content
+from vnet.gateway.radio_side import RadioSide
 from vnet.gateway.ros2 import Published, Ros2
-from vnet.gateway.tokens import TOKEN_PERIODS, HeardTokens
 from vnet.transport.session import open_local_router, router_endpoint
 from vnet.transport.wire import WireFix
-from vnet.units import NS_PER_S
 
 MOST_SOURCES = 100_000
 """Instances of `SourceInfo` that are kept for samples on their way."""
@@ -52,7 +51,7 @@ _sources: OrderedDict[int, zenoh.SourceInfo] = OrderedDict()
 _source_numbers = count()
 
 
-class Gateway:
+class Gateway(RadioSide[zenoh.Query]):
     """One incarnation of a vehicle's gateway. Methods are for the run's loop, except `open`.
 
     `keys` cross the radio. `hear` takes on any thread "gateway", what programs do ("message", "query", "token",
@@ -63,18 +62,14 @@ class Gateway:
     def __init__(
         self, node: str, keys: Sequence[str], settings: ZenohSessions, hear: Hear, ros2: Ros2 | None = None
     ) -> None:
-        self.node = node
-        self._keys, self._settings, self._hear, self._ros2 = keys, settings, hear, ros2
+        super().__init__(node, keys, settings.query_s, settings.liveliness_s, ros2)
+        self._settings, self._tell_run = settings, hear
         self._session: zenoh.Session | None = None
         self._watches: list[Any] = []
-        self._queries: dict[int, zenoh.Query] = {}
-        self._query_numbers = count()
-        self._reassembly = Reassembly()
         self._declared: dict[str, zenoh.LivelinessToken | None] = {}
         """Tokens of other vehicles, which are declared at this one's programs; None while that is under way."""
         self._taken_back: dict[str, float] = {}
         """Tokens of other vehicles that were taken back lately, and until when (s of the loop) echoes may come."""
-        self._heard_tokens = HeardTokens(round(TOKEN_PERIODS * settings.liveliness_s * NS_PER_S))
         self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
         self.sessions: set[str] = set()
@@ -118,7 +113,7 @@ class Gateway:
     # Threads of Zenoh's.
 
     def _tell(self, what: str, item: Any) -> None:
-        self._hear("gateway", what, (self, item))
+        self._tell_run("gateway", what, (self, item))
 
     def _telling(self, take: Callable[[T], None]) -> Callable[[T], None]:
         """Return a callback for Zenoh that tells of its own exceptions."""
@@ -131,15 +126,12 @@ class Gateway:
 
         return told
 
-    def _crosses(self, key: str) -> bool:
-        return not key.startswith(OWN_KEYS) and (self._ros2 is None or self._ros2.crosses(key))
-
     def _put(self, sample: zenoh.Sample) -> None:
-        if self._crosses(str(sample.key_expr)):
-            self._tell("message", crossing_of(sample, _source_of(sample)))
+        if self.crosses(str(sample.key_expr)):
+            self._tell("message", crossing_sample(sample, _source_of))
 
     def _asked(self, query: zenoh.Query) -> None:
-        if self._crosses(str(query.key_expr)):
+        if self.crosses(str(query.key_expr)):
             self._tell("query", query)
         else:
             query.drop()  # type: ignore[no-untyped-call]
@@ -159,7 +151,7 @@ class Gateway:
         """Close the router, with all that is connected to it."""
         session, self._session = self._session, None
         self._declared, self._watches = {}, []
-        self._heard_tokens = HeardTokens(self._heard_tokens.lifetime_ns)
+        self._told = {}
         if session is not None:
             with suppress(zenoh.ZError):
                 await asyncio.to_thread(session.close)
@@ -173,7 +165,7 @@ class Gateway:
                 message: Message = item
                 return message
             case "query":
-                return self._question(item)
+                return self.keep(item)
             case "token":
                 return self._take_token(*item)
             case "session":
@@ -181,21 +173,12 @@ class Gateway:
                 (self.sessions.add if is_there else self.sessions.discard)(who)
         return None
 
-    def _question(self, query: zenoh.Query) -> CrossingQuery:
-        """Keep a query for as long as replies are awaited; returns what crosses the radio."""
-        number = next(self._query_numbers)
-        self._queries[number] = query
-        asyncio.get_running_loop().call_later(self._settings.query_s, self._conclude, number)
-        encoding = None if query.encoding is None else str(query.encoding)
-        payload, attachment = _bytes(query.payload), _bytes(query.attachment)
-        return CrossingQuery(number, str(query.selector), payload, encoding, attachment)
-
-    def _conclude(self, number: int) -> None:
-        self._queries.pop(number).drop()  # type: ignore[no-untyped-call]
+    def _conclude(self, query: zenoh.Query) -> None:
+        query.drop()  # type: ignore[no-untyped-call]
 
     def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
         """Take a token that has appeared or is gone; those that other vehicles have told of are echoes."""
-        if key in self._declared or not self._crosses(key) or (key in self._tokens) == is_there:
+        if key in self._declared or not self.crosses(key) or (key in self._tokens) == is_there:
             return None
         if self._taken_back.get(key, 0.0) > asyncio.get_running_loop().time():
             return None
@@ -208,32 +191,15 @@ class Gateway:
 
     # To the programs.
 
-    def receive(self, sender: str, payload: bytes, time_ns: int) -> None:
-        """Give the programs what a frame carries. Raises ValueError for bytes that a fault has changed."""
-        if self._session is None:
-            return
-        try:
-            message = self._reassembly.take(sender, payload)
-            if message is not None:
-                self._give(sender, message, time_ns)
-        except (msgspec.MsgspecError, zenoh.ZError, LookupError, OverflowError) as error:
-            raise ValueError(str(error)) from None
-
-    def _give(self, sender: str, message: Message, time_ns: int) -> None:
-        match message:
-            case CrossingSample():
-                self._show(message)
-            case CrossingQuery():
-                self._pass_on(sender, message)
-            case CrossingReply():
-                self._reply(message)
-            case CrossingTokens():
-                self.hear_tokens(sender, message, time_ns)
+    def hear(self, sender: str, payload: bytes, time_ns: int, only_tokens: bool = False) -> None:
+        """As `RadioSide.hear`, while the router is open."""
+        if self._session is not None:
+            super().hear(sender, payload, time_ns, only_tokens)
 
     def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int) -> None:
-        """Take word of another vehicle's tokens."""
+        """As `RadioSide.hear_tokens`, while the router is open."""
         if self._session is not None:
-            self._show_tokens(self._heard_tokens.hear(sender, tokens.keys, time_ns))
+            super().hear_tokens(sender, tokens, time_ns)
 
     def show_fix(self, fix: WireFix) -> None:
         """Put a fix of the vehicle's receiver at its programs."""
@@ -254,24 +220,17 @@ class Gateway:
 
     def _show(self, sample: CrossingSample) -> None:
         assert self._session is not None
-        options: dict[str, Any] = {**_options(sample), "allowed_destination": REMOTE}
+        options = {**sample_options(sample), "source_info": _known_source(sample), "allowed_destination": REMOTE}
         if sample.is_delete:
             self._session.delete(sample.key, **options)
         else:
             self._session.put(sample.key, sample.payload, encoding=sample.encoding, **options)
 
-    def _pass_on(self, asker: str, query: CrossingQuery) -> None:
-        """Ask the programs of this vehicle; their replies are messages to the asker."""
+    def _answer(self, asker: str, query: CrossingQuery) -> None:
         assert self._session is not None
 
         def answered(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                answer = CrossingReply(asker, query.number, crossing_of(reply.ok, _source_of(reply.ok)))
-            else:
-                assert reply.err is not None
-                error = reply.err.payload.to_bytes(), str(reply.err.encoding)
-                answer = CrossingReply(asker, query.number, None, error)
-            self._tell("message", answer)
+            self._tell("message", crossing_reply(asker, query, reply, _source_of))
 
         self._session.get(
             query.selector,
@@ -285,44 +244,33 @@ class Gateway:
             allowed_destination=REMOTE,
         )
 
-    def _reply(self, answer: CrossingReply) -> None:
-        """Give a reply to the program that has asked, if it still waits."""
-        query = self._queries.get(answer.number) if answer.to == self.node else None
-        if query is None:
-            return
+    def _reply(self, query: zenoh.Query, answer: CrossingReply) -> None:
         if answer.sample is None:
             assert answer.error is not None
             query.reply_err(answer.error[0], encoding=answer.error[1])
             return
-        sample, options = answer.sample, _options(answer.sample)
-        if "source_info" in options:  # which Python cannot give a reply, and advanced subscribers need
+        sample, options = answer.sample, sample_options(answer.sample)
+        if _known_source(sample) is not None:  # which Python cannot give a reply, and advanced subscribers need
             self._show(sample)
             return
-        kept = {name: options[name] for name in ("attachment", "express", "timestamp") if name in options}
+        kept = {name: options[name] for name in ("attachment", "express", "timestamp")}
         if sample.is_delete:
             query.reply_del(sample.key, **kept)
         else:
             query.reply(sample.key, sample.payload, encoding=sample.encoding, **kept)
 
-    def forget_tokens(self, time_ns: int) -> None:
-        """Forget the tokens of vehicles that have not told of any lately."""
-        if self._session is not None:
-            self._show_tokens(self._heard_tokens.expire(time_ns))
-
-    def _show_tokens(self, changes: Sequence[tuple[str, bool]]) -> None:
-        """Declare tokens of other vehicles at the programs, or take them back."""
-        assert self._session is not None
+    def _show_token(self, key: str, is_there: bool) -> None:
+        """Declare a token of another vehicle at the programs, or take it back."""
         now_s = asyncio.get_running_loop().time()
-        self._taken_back = {key: until_s for key, until_s in self._taken_back.items() if until_s > now_s}
-        for key, is_there in changes:
-            if not is_there:
-                if (token := self._declared.pop(key, None)) is not None:
-                    token.undeclare()  # type: ignore[no-untyped-call]
-                self._taken_back[key] = now_s + ECHO_S
-            elif key not in self._tokens:
-                # Before the declaration, whose echo must not count as a token of this vehicle's own.
-                self._declared[key] = None
-                self._declared[key] = self._session.liveliness().declare_token(key)
+        self._taken_back = {each: until_s for each, until_s in self._taken_back.items() if until_s > now_s}
+        if not is_there:
+            if (token := self._declared.pop(key, None)) is not None:
+                token.undeclare()  # type: ignore[no-untyped-call]
+            self._taken_back[key] = now_s + ECHO_S
+        elif key not in self._tokens and self._session is not None:
+            # Before the declaration, whose echo must not count as a token of this vehicle's own.
+            self._declared[key] = None
+            self._declared[key] = self._session.liveliness().declare_token(key)
 
 
 def session_name(session: zenoh.Transport | zenoh.Hello) -> str:
@@ -358,24 +306,11 @@ def session_environment(
     return {**inherited, **session_variables(node, endpoint, client, path), "PYTHONPATH": python_path}
 
 
-@lru_cache(maxsize=64)
-def _options(sample: CrossingSample) -> Mapping[str, Any]:
-    """Return the arguments with which a sample is put, deleted or replied, at each receiver."""
-    options: dict[str, Any] = {
-        "attachment": sample.attachment,
-        "priority": getattr(zenoh.Priority, sample.priority),
-        "congestion_control": getattr(zenoh.CongestionControl, sample.congestion),
-        "express": sample.express,
-    }
-    if sample.time is not None:
-        options["timestamp"] = zenoh.Timestamp(zenoh.NTP64(*sample.time[:2]), sample.time[2])
-    if sample.source is not None and sample.source[0] == _this_process() and sample.source[1] in _sources:
-        options["source_info"] = _sources[sample.source[1]]
-    return options
-
-
-def _bytes(content: zenoh.ZBytes | None) -> bytes | None:
-    return None if content is None else content.to_bytes()
+def _known_source(sample: CrossingSample) -> zenoh.SourceInfo | None:
+    """Return the `SourceInfo` of a sample that a gateway of this process has sent."""
+    if sample.source is None or sample.source[0] != _this_process():
+        return None
+    return _sources.get(sample.source[1])
 
 
 @cache
@@ -384,14 +319,10 @@ def _this_process() -> int:
     return secrets.randbits(62)
 
 
-def _source_of(sample: zenoh.Sample) -> tuple[int, int] | None:
-    """Return what stands for a sample's `SourceInfo` on the radio."""
-    return None if sample.source_info is None else (_this_process(), _number_of(sample.source_info))
-
-
-def _number_of(source: zenoh.SourceInfo) -> int:
+def _source_of(source: zenoh.SourceInfo) -> tuple[int, int]:
+    """Return what stands for a `SourceInfo` on the radio."""
     number = next(_source_numbers)
     _sources[number] = source
     if len(_sources) > MOST_SOURCES:
         _sources.popitem(last=False)
-    return number
+    return _this_process(), number

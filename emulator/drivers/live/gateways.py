@@ -297,7 +297,7 @@ class Gateways:
         self._emulation.folder.event(self._now_ns(), EventKind.router_restarted, None, down_s=down_s)
 
     async def _open_again(self, vehicle: _Vehicle) -> None:
-        node = vehicle.gateway.node
+        node = vehicle.gateway.node_id
         if self._vehicles.get(node) is not vehicle:  # a fault has ended it meanwhile
             return
         try:
@@ -361,7 +361,7 @@ class Gateways:
         vehicle.received_seq = batch.seq + 1
         if batch.origin_ns is not None and not vehicle.on_air:
             delay_s = max(batch.origin_ns + batch.start_ns - time.monotonic_ns(), 0) / NS_PER_S
-            turn = self._emulation.number[vehicle.gateway.node] / len(self._emulation.number)
+            turn = self._emulation.number[vehicle.gateway.node_id] / len(self._emulation.number)
             turn_s = 0.0 if batch.start_ns else TURNS_S * turn  # who comes back is alone
             self._loop.call_later(delay_s, self._go_on_air, vehicle, turn_s)
         late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
@@ -373,7 +373,7 @@ class Gateways:
             vehicle.gateway.show_fix(fix)
         for packet in batch.packets:
             try:
-                vehicle.gateway.receive(packet.sender, packet.payload, now_ns)
+                vehicle.gateway.hear(packet.sender, packet.payload, now_ns)
             except ValueError as error:  # bytes that a fault has changed
                 self._note(vehicle, "debug", f"a frame of {packet.sender} is no sample: {error}")
 
@@ -413,12 +413,12 @@ class Gateways:
             self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)
 
     def _is_there(self, vehicle: _Vehicle) -> bool:
-        return self._vehicles.get(vehicle.gateway.node) is vehicle and vehicle.on_air
+        return self._vehicles.get(vehicle.gateway.node_id) is vehicle and vehicle.on_air
 
     # In the place of an agent: what it says.
 
     def _say_hello(self, vehicle: _Vehicle, ready: bool = False, failure: str | None = None) -> None:
-        node, pid, host = vehicle.gateway.node, os.getpid(), socket.gethostname()
+        node, pid, host = vehicle.gateway.node_id, os.getpid(), socket.gethostname()
         hello = wire.Hello(node, node, vehicle.nonce, pid, host, ready, failure, wire.VERSION)
         self._tell("local", node, hello)
 
@@ -431,7 +431,7 @@ class Gateways:
             self._find(told)
             return
         assert gateway is not None
-        vehicle = self._vehicles.get(gateway.node)
+        vehicle = self._vehicles.get(gateway.node_id)
         if vehicle is None or vehicle.gateway is not gateway:  # it is gone
             return
         if what == "report":
@@ -455,7 +455,7 @@ class Gateways:
         A reply is sent to one vehicle, if the MAC repeats what is lost.
         """
         assert vehicle.fragments is not None
-        node, to = vehicle.gateway.node, None
+        node, to = vehicle.gateway.node_id, None
         if isinstance(message, CrossingTokens) and self._ros2 is not None and self._ros2.graph == "always":
             for other in self._vehicles.values():
                 if other is not vehicle:
@@ -488,7 +488,7 @@ class Gateways:
             self._flush_soon(vehicle)
 
     def _note(self, vehicle: _Vehicle, level: Literal["debug", "warning", "error"], text: str) -> None:
-        vehicle.notes.append(wire.Note(vehicle.gateway.node, self._now_ns(), "log", level, text))
+        vehicle.notes.append(wire.Note(vehicle.gateway.node_id, self._now_ns(), "log", level, text))
         self._flush_soon(vehicle)
 
     def _flush_soon(self, vehicle: _Vehicle) -> None:
@@ -509,13 +509,13 @@ class Gateways:
         )
         vehicle.late = []
         vehicle.seq += 1
-        self._tell("frames", vehicle.gateway.node, (frames, arrived_ns or time.monotonic_ns()))
+        self._tell("frames", vehicle.gateway.node_id, (frames, arrived_ns or time.monotonic_ns()))
 
     # Sessions.
 
     def _look_at_sessions(self, vehicle: _Vehicle) -> None:
         """Say that a vehicle is ready once its programs have connected; tell of sessions that are too many."""
-        node, connected = vehicle.gateway.node, vehicle.gateway.sessions
+        node, connected = vehicle.gateway.node_id, vehicle.gateway.sessions
         commands = len(self._program.of(node).commands) if self._starts else 0
         if not vehicle.is_ready and vehicle.fragments is not None and len(connected) >= max(commands, 1):
             vehicle.is_ready = True

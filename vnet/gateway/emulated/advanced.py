@@ -11,7 +11,7 @@ import re
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, partialmethod
 from typing import Any, Literal
 
 import msgspec
@@ -20,8 +20,8 @@ from zenoh.ext import UInt32, z_deserialize, z_serialize
 
 from vnet.gateway.emulated.modules import EPOCH_NS
 from vnet.gateway.emulated.queries import ALL_REPLIES, ANY_KEY, Asking, Entity, Query
-from vnet.gateway.emulated.sessions import Listening, LivelinessToken, Publisher, Session, Watcher
-from vnet.gateway.emulated.values import Direct, EntityGlobalId, Reply, Sample, SourceInfo, ZenohId, key_of
+from vnet.gateway.emulated.sessions import Listening, LivelinessToken, Publisher, Session, Subscriber, Watcher
+from vnet.gateway.emulated.values import Direct, EntityGlobalId, Reply, Sample, Sink, SourceInfo, ZenohId, key_of
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
@@ -105,32 +105,33 @@ class AdvancedPublisher(Publisher):
     def __init__(
         self,
         session: Session,
-        key: Any,
+        key_expr: Any,
         *,
         cache: CacheConfig | None = None,
         sample_miss_detection: MissDetectionConfig | None = None,
         publisher_detection: bool | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(session, key, **options)
+        super().__init__(session, key_expr, **options)
         misses = sample_miss_detection
         if misses is None and cache is not None and not session.stamps:
-            self._is_declared = False
             raise zenoh.ZError(
                 f"Cannot create AdvancedPublisher {self.key_expr} with Sequencing::Timestamp: the 'timestamping' "
                 "setting must be enabled in the Zenoh configuration."
             )
         self._number: int | None = None if misses is None else 0
+        self._told = 0
         eid = self.id.eid if misses is not None else _WITHOUT_ID
         own_key = key_of(f"{self.key_expr}/@adv/pub/{session.zid()}/{eid}/_")
-        self._cache = None if cache is None else _Cache(session, own_key, cache)
-        self._token = LivelinessToken(session, own_key) if publisher_detection else None
-        self._heart: asyncio.Task[None] | None = None
-        self._told = 0
+        self._cache, self._ends = None if cache is None else _Cache(session, cache), []
+        if self._cache is not None:
+            queryable = Entity("queryable", session, session.id, own_key, Direct(self._cache.answer))
+            self._ends.append(session.declare(queryable))
+        if publisher_detection:
+            self._ends.append(LivelinessToken(session, own_key).undeclare_if_declared)
         if misses is not None and (period_s := misses.heartbeat or misses.sporadic_heartbeat) is not None:
-            self._heart = _every(period_s, partial(self._beat, own_key, misses.heartbeat is None))
-            session.at_close(self._heart.cancel)
-        self._end = self._end_all
+            heart = _every(period_s, partial(self._beat, own_key, misses.heartbeat is None))
+            self._ends.append(session.until_closed(heart.cancel))
 
     def _beat(self, key: zenoh.KeyExpr, sporadic: bool) -> None:
         number = self._number or 0
@@ -147,27 +148,17 @@ class AdvancedPublisher(Publisher):
             self._cache.samples.append(sample)
         return sample
 
-    def _end_all(self) -> None:
-        if self._heart is not None:
-            self._heart.cancel()
-        if self._token is not None:
-            self._token.undeclare_if_declared()
-        if self._cache is not None:
-            self._cache.end()
-
 
 class _Cache:
-    """The last samples of a publisher, and a queryable that has them."""
+    """The last samples of a publisher."""
 
-    def __init__(self, session: Session, key: zenoh.KeyExpr, config: CacheConfig) -> None:
+    def __init__(self, session: Session, config: CacheConfig) -> None:
         self.samples: deque[Sample] = deque(maxlen=config.max_samples or 1)
         self._replies = config.replies_config or RepliesConfig()
-        entity = Entity(session, key, Direct(self._answer))
-        session.declare("queryable", entity)
         self._node = session.vehicle.node
-        self.end = partial(session.end, entity)
 
-    def _answer(self, query: Query) -> None:
+    def answer(self, query: Query) -> None:
+        """Reply with the samples that a query asks for."""
         first, last = _range_of(query.parameters.get("_sn"))
         since_ns = _start_of(query.parameters.get("_time"), EPOCH_NS + self._node.now_ns)
         found = [each for each in self.samples if _is_in(each, first, last) and _is_since(each, since_ns)]
@@ -207,182 +198,170 @@ def _start_of(text: str | None, unix_ns: int) -> int | None:
 
 
 def _is_since(sample: Sample, since_ns: int | None) -> bool:
-    if since_ns is None or sample.timestamp is None:
-        return True
-    time = sample.timestamp.get_time_as_ntp64()
-    return time.as_secs() * NS_PER_S + time.subsec_nanos() >= since_ns
+    return since_ns is None or sample.timestamp is None or _time_ns(sample.timestamp) >= since_ns
+
+
+def _time_ns(stamp: zenoh.Timestamp) -> int:
+    return stamp.get_time_as_ntp64().as_nanos()
 
 
 class _Source:
-    """State of one publisher at a subscriber: samples by number, or by timestamp."""
+    """A publisher at a subscriber. Its samples have places: their numbers, or without numbers their timestamps."""
 
-    def __init__(self) -> None:
-        self.last: Any = None
-        """Number or timestamp of the last sample that was passed on."""
-        self.waiting: dict[Any, Sample] = {}
+    def __init__(self, source_id: EntityGlobalId | bytes) -> None:
+        self.id = source_id
+        """Of the publisher, or of the timestamps of its samples."""
+        self.last: int | None = None
+        """Place of the last sample that was passed on."""
+        self.waiting: dict[int, Sample] = {}
         self.queries = 0
         self.timer: asyncio.Task[None] | None = None
 
+    @property
+    def has_numbers(self) -> bool:
+        """True if a sample that is missed leaves a gap between places."""
+        return isinstance(self.id, EntityGlobalId)
 
-class AdvancedSubscriber(Listening):
+
+class SampleMissListener(Listening):
+    """A listener that is told of samples that are missed for good."""
+
+    def __init__(self, subscriber: AdvancedSubscriber, handler: Any = None) -> None:
+        super().__init__(handler, subscriber.session.outlet)
+        subscriber.miss_sinks.append(self._sink)
+        self._ends = [partial(subscriber.miss_sinks.remove, self._sink), self._sink.close]
+
+
+class AdvancedSubscriber(Subscriber):
     """A subscriber that asks caches for what it has missed."""
 
     def __init__(
         self,
         session: Session,
-        key: Any,
-        handler: Any,
+        key_expr: Any,
+        handler: Any = None,
         *,
         allowed_origin: zenoh.Locality | None = None,
         history: HistoryConfig | None = None,
         recovery: RecoveryConfig | None = None,
         subscriber_detection: bool | None = None,
     ) -> None:
-        session.check_open()
-        self._history, self._recovery, self.session = history, recovery, session
-        for name, value in (("max_samples", self._most), ("max_age", history and history.max_age)):
-            if value == 0:
+        self._history, self._recovery = history or HistoryConfig(), recovery
+        for name in ("max_samples", "max_age"):
+            if getattr(self._history, name) == 0:
                 raise zenoh.ZError(f"{name} must not be zero")
-        super().__init__(handler, session.outlet)
-        self._sources: dict[EntityGlobalId, _Source] = {}
-        self._stamped: dict[bytes, _Source] = {}
-        self._queries = 0 if history is None else 1
-        self._misses: list[SampleMissListener] = []
-        self._ends: list[Callable[[], object]] = [self._stop_timers]
-        self._end = self._end_all
-        sink = Direct(self._take, self._sink.close)
-        self._main = Entity(session, key_of(key), sink, allowed_origin, eid=next(session.entity_numbers))
-        self.id, self.key_expr = self._main.id, self._main.key
-        self._declare("subscriber", self._main)
+        self._sources: dict[EntityGlobalId | bytes, _Source] = {}
+        self._begins = history is not None
+        """True until the replies to its query for history are there."""
+        self.miss_sinks: list[Sink] = []
+        """Destinations of what is missed for good."""
+        super().__init__(session, key_expr, handler, allowed_origin=allowed_origin)
+        ends = [*(self._ends or ()), session.until_closed(self._stop)]
         publishers = key_of(f"{self.key_expr}/@adv/pub/**")
+
+        def declare(kind: Literal["subscriber", "watcher"], take: Callable[[Sample], None]) -> Entity:
+            entity = Entity(kind, session, self.id, publishers, Direct(take), allowed_origin)
+            ends.append(session.declare(entity))
+            return entity
+
         if history is not None:
-            self._ask(f"{self.key_expr}/@adv/**", history.parameters(), self._initial_done)
+            self._ask(f"{self.key_expr}/@adv/**", history.parameters(), self._begun)
             if history.detect_late_publishers:
-                watcher = Entity(session, publishers, Direct(self._publisher_changed))
-                self._declare("watcher", watcher)
-                session.vehicle.tell_present(watcher)
+                session.vehicle.tell_present(declare("watcher", self._publisher_changed))
         if recovery is not None and recovery.heartbeat:
-            self._declare("subscriber", Entity(session, publishers, Direct(self._hear_heartbeat), allowed_origin))
+            declare("subscriber", self._hear_heartbeat)
         if subscriber_detection:
             token = LivelinessToken(session, f"{self.key_expr}/@adv/sub/{session.zid()}/{self.id.eid}/_")
-            self._ends.append(token.undeclare_if_declared)
-        session.at_close(self._stop_timers)
+            ends.append(token.undeclare_if_declared)
+        self._ends = ends
 
-    id: EntityGlobalId
-    key_expr: zenoh.KeyExpr
+    def _intake(self) -> Sink:
+        return Direct(self._take, self._sink.close)
 
-    def _declare(self, kind: str, entity: Entity) -> None:
-        self.session.declare(kind, entity)
-        self._ends.append(partial(self.session.end, entity))
-
-    def _end_all(self) -> None:
-        for end in self._ends:
-            end()
-
-    @property
-    def _most(self) -> int | None:
-        return None if self._history is None else self._history.max_samples
-
-    def sample_miss_listener(self, handler: Any = None) -> SampleMissListener:
-        """Declare a listener that is told of samples that are missed for good."""
-        return SampleMissListener(self, handler)
+    sample_miss_listener = partialmethod(SampleMissListener)
 
     def detect_publishers(self, handler: Any = None, *, history: bool | None = None) -> Watcher:
         """Declare a subscriber of the tokens of advanced publishers."""
         return Watcher(self.session, f"{self.key_expr}/@adv/pub/**", handler, history)
 
-    def _stop_timers(self) -> None:
+    def _stop(self) -> None:
         for source in self._sources.values():
             if source.timer is not None:
                 source.timer.cancel()
-        for listener in self._misses:
-            listener._sink.close()
+        for sink in self.miss_sinks:
+            sink.close()
 
     # Samples.
 
     def _take(self, sample: Sample) -> None:
         """Take a sample that was published just now, and ask for what lies before it."""
-        is_new = self._handle(sample)
-        if sample.source_info is None:
+        info = sample.source_info
+        is_new = info is not None and info.source_id not in self._sources
+        self._handle(sample)
+        if info is None:
             return
-        source_id = sample.source_info.source_id
-        source = self._sources[source_id]
+        source = self._sources[info.source_id]
         if is_new:
-            self._query_periodically(source_id, source)
+            self._query_periodically(source)
         if self._recovery is not None and source.queries == 0 and source.waiting:
-            self._recover(source_id, source)
+            self._recover(source)
 
-    def _handle(self, sample: Sample) -> bool:
-        """Pass a sample on, or have it wait for those before it; return whether its publisher is a new one."""
+    def _handle(self, sample: Sample) -> None:
+        """Pass a sample on, or have it wait for those before it, unless it has gone by."""
         if sample.source_info is not None:
-            is_new = sample.source_info.source_id not in self._sources
-            source = self._sources.setdefault(sample.source_info.source_id, _Source())
-            self._handle_numbered(sample, sample.source_info, source)
-            return is_new
-        if sample.timestamp is None:
+            source, place = self._source(sample.source_info.source_id), sample.source_info.source_sn
+        elif sample.timestamp is not None:
+            source, place = self._source(bytes(sample.timestamp.get_id())), _time_ns(sample.timestamp)
+        else:
             self._sink.push(sample)
-            return False
-        source = self._stamped.setdefault(bytes(sample.timestamp.get_id()), _Source())
-        if source.last is None or not source.last >= sample.timestamp:
-            if (self._queries == 0 and source.queries == 0) or self._most == 1:
-                source.last = sample.timestamp
-                self._sink.push(sample)
-            else:
-                source.waiting.setdefault(sample.timestamp, sample)
-                if self._most is not None and len(source.waiting) >= self._most:
-                    self._flush_stamped(source)
-        return False
+            return
+        if source.last is not None and place <= source.last:
+            return
+        if self._waits(source, place):
+            source.waiting[place] = sample
+            self._pass_surplus(source)
+        else:
+            self._pass_on(source, place, sample)
 
-    def _handle_numbered(self, sample: Sample, info: SourceInfo, source: _Source) -> None:
-        number = info.source_sn
-        if source.last is None and self._queries:
-            if self._most == 1:
-                source.last = number
-                self._sink.push(sample)
-                return
-            source.waiting[number] = sample
-            if self._most is not None and len(source.waiting) >= self._most:
-                first = min(source.waiting)
-                self._pass_on(source, first, source.waiting.pop(first))
-        elif source.last is None or number == source.last + 1:
-            self._pass_on(source, number, sample)
-        elif number > source.last:
-            if self._recovery is not None:
-                source.waiting[number] = sample
-            else:
-                self._miss(info.source_id, number - source.last - 1)
-                source.last = number
-                self._sink.push(sample)
+    def _source(self, source_id: EntityGlobalId | bytes) -> _Source:
+        return self._sources.setdefault(source_id, _Source(source_id))
 
-    def _pass_on(self, source: _Source, number: int, sample: Sample) -> None:
-        """Pass a sample on, and those that wait for it."""
+    def _waits(self, source: _Source, place: int) -> bool:
+        """Return whether a sample is to wait: for those in a gap before it, or for the history."""
+        if source.has_numbers and source.last is not None:
+            return self._recovery is not None and place > source.last + 1
+        is_asked = self._begins or (not source.has_numbers and source.queries > 0)
+        return is_asked and self._history.max_samples != 1
+
+    def _pass_on(self, source: _Source, place: int, sample: Sample) -> None:
+        """Pass a sample on, and those that follow it at once; those between it and the last one are missed."""
+        if isinstance(source.id, EntityGlobalId) and source.last is not None and place > source.last + 1:
+            for sink in self.miss_sinks:
+                sink.push(Miss(source.id, place - source.last - 1))
         self._sink.push(sample)
-        while (following := source.waiting.pop(number + 1, None)) is not None:
+        while source.has_numbers and (following := source.waiting.pop(place + 1, None)) is not None:
+            place += 1
             self._sink.push(following)
-            number += 1
-        source.last = number
+        source.last = place
 
-    def _miss(self, source_id: EntityGlobalId, count: int) -> None:
-        for listener in self._misses:
-            listener.push(Miss(source_id, count))
+    def _pass_surplus(self, source: _Source) -> None:
+        """Pass on what waits beyond the number of samples that a history may have."""
+        most = self._history.max_samples
+        if most is None or len(source.waiting) < most:
+            return
+        if not source.has_numbers:
+            self._flush(source)
+        elif source.last is None:
+            first = min(source.waiting)
+            self._pass_on(source, first, source.waiting.pop(first))
 
-    def _flush(self, source_id: EntityGlobalId, source: _Source) -> None:
-        """Pass on what waits: what is not there by now is missed."""
+    def _flush(self, source: _Source) -> None:
+        """Pass on what waits, if no more replies are awaited."""
         if source.queries == 0:
-            for number in sorted(source.waiting):
-                sample = source.waiting.pop(number)
-                if source.last is not None and number <= source.last:
-                    continue
-                if source.last is not None and number > source.last + 1:
-                    self._miss(source_id, number - source.last - 1)
-                source.last = number
-                self._sink.push(sample)
-
-    def _flush_stamped(self, source: _Source) -> None:
-        if source.queries == 0:
-            for stamp in sorted(source.waiting, key=lambda stamp: stamp.get_time_as_ntp64().as_nanos()):
-                source.last = stamp
-                self._sink.push(source.waiting.pop(stamp))
+            waiting, source.waiting = source.waiting, {}
+            for place in sorted(waiting):
+                if source.last is None or place > source.last:
+                    self._pass_on(source, place, waiting[place])
 
     # Queries of caches.
 
@@ -392,43 +371,42 @@ class AdvancedSubscriber(Listening):
         asking.expire_after(RECOVERY_TIMEOUT_S)
         self.session.vehicle.ask(asking, self.session, to_own=True, to_others=True)
 
+    def _ask_about(self, source: _Source, key: str, parameters: str) -> None:
+        source.queries += 1
+        self._ask(key, parameters, partial(self._told_about, source))
+
     def _replied(self, reply: Reply) -> None:
         if reply.ok is not None and self.key_expr.intersects(reply.ok.key_expr):
             self._handle(reply.ok)
 
-    def _initial_done(self) -> None:
-        self._queries = max(self._queries - 1, 0)
-        if self._queries == 0:
-            for source_id, source in self._sources.items():
-                self._flush(source_id, source)
-                self._query_periodically(source_id, source)
-            for source in self._stamped.values():
-                self._flush_stamped(source)
+    def _begun(self) -> None:
+        self._begins = False
+        for source in self._sources.values():
+            self._flush(source)
+            self._query_periodically(source)
 
-    def _recover(self, source_id: EntityGlobalId, source: _Source, last: int | None = None, key: str = "") -> None:
-        source.queries += 1
-        first = "" if source.last is None else source.last + 1
-        self._ask(
-            key or f"{self.key_expr}/@adv/*/{source_id.zid}/{source_id.eid}/**",
-            f"_sn={first}..{'' if last is None else last}",
-            partial(self._source_done, source_id, source),
-        )
-
-    def _source_done(self, source_id: EntityGlobalId, source: _Source) -> None:
+    def _told_about(self, source: _Source) -> None:
         source.queries -= 1
-        if self._queries == 0:
-            self._flush(source_id, source)
+        if not self._begins:
+            self._flush(source)
 
-    def _query_periodically(self, source_id: EntityGlobalId, source: _Source) -> None:
-        if self._recovery is not None and self._recovery.periodic_queries is not None:
+    def _recover(self, source: _Source, last: int | None = None, key: str = "") -> None:
+        """Ask for what follows the last sample of a publisher with numbers."""
+        assert isinstance(source.id, EntityGlobalId)
+        first = "" if source.last is None else source.last + 1
+        key = key or f"{self.key_expr}/@adv/*/{source.id.zid}/{source.id.eid}/**"
+        self._ask_about(source, key, f"_sn={first}..{'' if last is None else last}")
+
+    def _query_periodically(self, source: _Source) -> None:
+        period = None if self._recovery is None else self._recovery.periodic_queries
+        if period is not None and source.has_numbers:
             if source.timer is not None:
                 source.timer.cancel()
-            period = self._recovery.periodic_queries
             period_s = period.total_seconds() if hasattr(period, "total_seconds") else period
-            source.timer = _every(period_s, partial(self._recover, source_id, source))
+            source.timer = _every(period_s, partial(self._recover, source))
 
     def _hear_heartbeat(self, sample: Sample) -> None:
-        source_id = _source_of(sample.key_expr)
+        source_id = _publisher_of(sample.key_expr)
         if sample.kind != zenoh.SampleKind.PUT or not isinstance(source_id, EntityGlobalId):
             return
         try:
@@ -436,71 +414,32 @@ class AdvancedSubscriber(Listening):
         except zenoh.ext.ZDeserializeError:
             return
         is_new = source_id not in self._sources
-        source = self._sources.setdefault(source_id, _Source())
-        if is_new and self._queries:
+        source = self._source(source_id)
+        if is_new and self._begins:
             return
         if (source.last is None or number > source.last) and source.queries == 0:
-            self._recover(source_id, source, number, str(sample.key_expr))
+            self._recover(source, number, str(sample.key_expr))
 
     # Publishers that come later.
 
     def _publisher_changed(self, token: Sample) -> None:
-        assert self._history is not None
-        source_id = _source_of(token.key_expr)
+        source_id = _publisher_of(token.key_expr)
         if token.kind != zenoh.SampleKind.PUT or source_id is None:
             return
-        if isinstance(source_id, EntityGlobalId):
-            is_new = source_id not in self._sources
-            source = self._sources.setdefault(source_id, _Source())
-            if is_new:
-                self._query_periodically(source_id, source)
-            done: Callable[[], object] = partial(self._source_done, source_id, source)
-        else:
-            source = self._stamped.setdefault(bytes(source_id), _Source())
-            done = partial(self._stamped_done, source)
-        source.queries += 1
-        self._ask(str(token.key_expr), self._history.parameters(), done)
-
-    def _stamped_done(self, source: _Source) -> None:
-        source.queries -= 1
-        if self._queries == 0:
-            self._flush_stamped(source)
+        is_new = source_id not in self._sources
+        source = self._source(source_id)
+        if is_new:
+            self._query_periodically(source)
+        self._ask_about(source, str(token.key_expr), self._history.parameters())
 
 
-def _source_of(key: zenoh.KeyExpr) -> EntityGlobalId | ZenohId | None:
-    """Return the publisher that a key `…/@adv/pub/ZID/EID/_` names; its session alone if it has no number."""
+def _publisher_of(key: zenoh.KeyExpr) -> EntityGlobalId | bytes | None:
+    """Return the publisher that a key `…/@adv/pub/ZID/EID/_` names; without numbers the id of its timestamps."""
     found = re.search(r"(?:^|/)@adv/pub/([0-9a-f]+)/(\w+)(?:/|$)", str(key))
     if found is None or not (found[2] == _WITHOUT_ID or found[2].isdigit()):
         return None
     zid = ZenohId(int(found[1], 16))
-    return zid if found[2] == _WITHOUT_ID else EntityGlobalId(zid, int(found[2]))
+    return bytes(zid) if found[2] == _WITHOUT_ID else EntityGlobalId(zid, int(found[2]))
 
 
-class SampleMissListener(Listening):
-    """A listener that is told of samples that are missed for good."""
-
-    def __init__(self, subscriber: AdvancedSubscriber, handler: Any) -> None:
-        self._listeners = subscriber._misses
-        super().__init__(handler, subscriber.session.outlet)
-        self._listeners.append(self)
-        self._end = self._stop
-
-    def push(self, miss: Miss) -> None:
-        """Tell of a miss."""
-        self._sink.push(miss)
-
-    def _stop(self) -> None:
-        self._listeners.remove(self)
-        self._sink.close()
-
-
-def declare_advanced_publisher(session: Session, key_expr: Any, **options: Any) -> AdvancedPublisher:
-    """Declare an advanced publisher."""
-    return AdvancedPublisher(session, key_expr, **options)
-
-
-def declare_advanced_subscriber(
-    session: Session, key_expr: Any, handler: Any = None, **options: Any
-) -> AdvancedSubscriber:
-    """Declare an advanced subscriber."""
-    return AdvancedSubscriber(session, key_expr, handler, **options)
+declare_advanced_publisher, declare_advanced_subscriber = AdvancedPublisher, AdvancedSubscriber

@@ -19,6 +19,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from contextvars import ContextVar
 from functools import cache, partial
@@ -72,6 +73,7 @@ _ABSENT = ("_asyncio", "_queue")
 _SHARED = ("vnet", "agents", "emulator", "greenlet")
 
 
+_shared_code = cache(SourceFileLoader.get_code)
 _present: ContextVar[ProgramModules | None] = ContextVar("vnet_zenoh_program", default=None)
 
 
@@ -253,8 +255,8 @@ class ProgramModules:
         vars(module)["__builtins__"] = self._builtins
         try:
             if isinstance(spec.loader, SourceFileLoader):  # else a folder without code
-                code = _shared_code if _is_own_copy(name) else _code
-                exec(code(spec.loader, name), vars(module))
+                code: Any = _shared_code(spec.loader, name) if _is_own_copy(name) else spec.loader.get_code(name)
+                exec(code, vars(module))
         except BaseException:
             self.modules.pop(name, None)
             raise
@@ -321,26 +323,20 @@ class ProgramModules:
     def _time(self) -> ModuleType:
         node = self.node
 
-        def ns() -> int:
+        def ns(start_ns: int = 0) -> int:
             look()
-            return node.now_ns
+            return start_ns + node.now_ns
 
-        def seconds() -> float:
-            return ns() / NS_PER_S
-
-        def unix_ns() -> int:
-            return EPOCH_NS + ns()
-
-        def unix() -> float:
-            return (EPOCH_NS + ns()) / NS_PER_S
+        def seconds(start_ns: int = 0) -> float:
+            return ns(start_ns) / NS_PER_S
 
         def utc(at: float | None = None) -> time.struct_time:
-            return time.gmtime(unix() if at is None else at)
+            return time.gmtime(seconds(EPOCH_NS) if at is None else at)
 
-        clocks = {time.CLOCK_REALTIME: unix_ns}
+        starts_ns = defaultdict(int, {time.CLOCK_REALTIME: EPOCH_NS})
         own: dict[str, Any] = {
-            "time": unix,
-            "time_ns": unix_ns,
+            "time": partial(seconds, EPOCH_NS),
+            "time_ns": partial(ns, EPOCH_NS),
             "monotonic": seconds,
             "monotonic_ns": ns,
             "perf_counter": seconds,
@@ -349,8 +345,8 @@ class ProgramModules:
             "process_time_ns": lambda: 0,
             "thread_time": lambda: 0.0,
             "thread_time_ns": lambda: 0,
-            "clock_gettime": lambda clock: clocks.get(clock, ns)() / NS_PER_S,
-            "clock_gettime_ns": lambda clock: clocks.get(clock, ns)(),
+            "clock_gettime": lambda clock: seconds(starts_ns[clock]),
+            "clock_gettime_ns": lambda clock: ns(starts_ns[clock]),
             "sleep": sleep,
             "gmtime": utc,
             "localtime": utc,
@@ -488,13 +484,6 @@ def _is_python(spec: ModuleSpec) -> bool:
     return isinstance(spec.loader, SourceFileLoader) or (
         spec.loader is None or type(spec.loader).__name__ == "NamespaceLoader"
     )
-
-
-def _code(loader: SourceFileLoader, name: str) -> Any:
-    return loader.get_code(name)
-
-
-_shared_code = cache(_code)
 
 
 @cache

@@ -18,16 +18,12 @@ from vnet.gateway.emulated.modules import ProgramModules
 from vnet.gateway.emulated.values import Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
 
+_NO_TRANSPORT = "sessions of the emulator have no transport"
+_NO_STACK = "a frame of the radio carries no stack of timestamps"
 REFUSED = {
-    "Link": "sessions of the emulator have no transport",
-    "LinkEvent": "sessions of the emulator have no transport",
-    "LinkEventsListener": "sessions of the emulator have no transport",
-    "TimestampContext": "a frame of the radio carries no stack of timestamps",
-    "TimestampStack": "a frame of the radio carries no stack of timestamps",
-    "TimestampStackRecord": "a frame of the radio carries no stack of timestamps",
-    "Transport": "sessions of the emulator have no transport",
-    "TransportEvent": "sessions of the emulator have no transport",
-    "TransportEventsListener": "sessions of the emulator have no transport",
+    **dict.fromkeys(["Link", "LinkEvent", "LinkEventsListener"], _NO_TRANSPORT),
+    **dict.fromkeys(["TimestampContext", "TimestampStack", "TimestampStackRecord"], _NO_STACK),
+    **dict.fromkeys(["Transport", "TransportEvent", "TransportEventsListener"], _NO_TRANSPORT),
 }
 """Names of Zenoh that virtual time does not have, and why."""
 _EMULATED = (values, queries, sessions, advanced)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal
 
 import zenoh
 
@@ -21,7 +21,6 @@ from vnet.gateway.emulated.values import (
     Sample,
     Sink,
     SourceInfo,
-    ZenohId,
     bytes_or_none,
     encoding_of,
     key_of,
@@ -34,35 +33,24 @@ ALL_REPLIES: dict[str, Any] = {"target": zenoh.QueryTarget.ALL, "consolidation":
 """Options of queries that all are asked, and of which each reply counts."""
 
 
-class Owner(Protocol):
-    """A session, as the vehicle has it."""
-
-    def zid(self) -> ZenohId:
-        """Return its id."""
-        ...
-
-
 @dataclass(eq=False)
 class Entity:
-    """A subscriber, a queryable, a token or a subscriber of tokens of a session."""
+    """An entity of a session, as the vehicle has it."""
 
-    session: Owner
+    kind: Literal["subscriber", "queryable", "token", "watcher"]
+    """A "watcher" is a subscriber of tokens."""
+    session: object
+    id: EntityGlobalId
     key: zenoh.KeyExpr
     sink: Sink = field(default_factory=lambda: Direct(lambda item: None))
     origin: zenoh.Locality | None = None
     is_complete: bool = False
-    eid: int = 0
     told: set[str] = field(default_factory=set)
     """Keys of living tokens of which a subscriber of tokens has been told."""
 
     def __post_init__(self) -> None:
         self.is_local = self.origin != zenoh.Locality.REMOTE
         self.is_remote = self.origin != zenoh.Locality.SESSION_LOCAL
-
-    @property
-    def id(self) -> EntityGlobalId:
-        """Its id."""
-        return EntityGlobalId(self.session.zid(), self.eid)
 
 
 @dataclass(eq=False)

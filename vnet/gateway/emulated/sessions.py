@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, partialmethod
 from itertools import count
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import zenoh
@@ -25,6 +25,7 @@ from vnet.gateway.emulated.values import (
     Outlet,
     Reply,
     Sample,
+    Sink,
     SourceInfo,
     ZenohId,
     bytes_or_none,
@@ -60,9 +61,8 @@ def _refuse(**given: object) -> None:
 class Declared:
     """An entity that a session has declared; a `with` block undeclares it."""
 
-    _is_declared = False
-    _end: Callable[[], object] = staticmethod(lambda: None)
-    """Does what undeclaring is."""
+    _ends: list[Callable[[], object]] | None = None
+    """Undeclare it, one after another; None unless it is declared."""
 
     def __enter__(self) -> Any:
         return self
@@ -70,17 +70,21 @@ class Declared:
     def __exit__(self, *_args: object, **_kwargs: object) -> None:
         self.undeclare_if_declared()
 
+    def check_declared(self) -> None:
+        """Raise ZError if it has been undeclared."""
+        if self._ends is None:
+            raise zenoh.ZError(f"Undeclared {type(self).__name__}")
+
     def undeclare(self) -> None:
         """Undeclare it. Raises ZError if it has been."""
-        if not self._is_declared:
-            raise zenoh.ZError(f"Undeclared {type(self).__name__}")
-        self._is_declared = False
-        self._end()
+        self.check_declared()
+        self.undeclare_if_declared()
 
     def undeclare_if_declared(self) -> None:
         """Undeclare it unless it has been."""
-        if self._is_declared:
-            self.undeclare()
+        ends, self._ends = self._ends, None
+        for end in ends or ():
+            end()
 
 
 class Listening(Declared):
@@ -88,8 +92,7 @@ class Listening(Declared):
 
     def __init__(self, handler: Any, outlet: Outlet) -> None:
         self._sink, self.handler, self._is_background = sink_of(handler, outlet)
-        self._end: Callable[[], object] = self._sink.close
-        self._is_declared = True
+        self._ends = [self._sink.close]
 
     handler: Any
     _is_background = True
@@ -117,26 +120,29 @@ class Listening(Declared):
 class Subscriber(Listening):
     """A subscriber."""
 
-    kind = "subscriber"
+    kind: Literal["subscriber", "queryable", "watcher"] = "subscriber"
 
     def __init__(
         self,
         session: Session,
-        key: Any,
-        handler: Any,
+        key_expr: Any,
+        handler: Any = None,
+        *,
         allowed_origin: zenoh.Locality | None = None,
         complete: bool | None = None,
     ) -> None:
-        session.check_open()
-        expression = key_of(key)
+        own_id, key = session.new_id(), key_of(key_expr)
         super().__init__(handler, session.outlet)
-        number = next(session.entity_numbers)
-        self._entity = Entity(session, expression, self._sink, allowed_origin, bool(complete), number)
-        self._end = partial(session.end, self._entity)
-        session.declare(self.kind, self._entity)
+        self.session = session
+        self._entity = Entity(self.kind, session, own_id, key, self._intake(), allowed_origin, bool(complete))
+        self._ends = [session.declare(self._entity)]
 
     id = property(lambda self: self._entity.id)
     key_expr = property(lambda self: self._entity.key)
+
+    def _intake(self) -> Sink:
+        """Return where the vehicle puts its items."""
+        return self._sink
 
 
 class Queryable(Subscriber):
@@ -160,11 +166,7 @@ class LivelinessToken(Declared):
     """A token."""
 
     def __init__(self, session: Session, key: Any) -> None:
-        session.check_open()
-        entity = Entity(session, key_of(key), eid=next(session.entity_numbers))
-        self._end = partial(session.end, entity)
-        self._is_declared = True
-        session.declare("token", entity)
+        self._ends = [session.declare(Entity("token", session, session.new_id(), key_of(key)))]
 
     def __del__(self) -> None:
         self.undeclare_if_declared()
@@ -234,30 +236,50 @@ class Liveliness:
 
 
 class MatchingListener(Listening):
-    """A listener that is told whether there is anybody at the other end."""
+    """A listener that is told whether there may be anybody at the other end."""
 
-    def __init__(self, owner: Publisher | Querier, handler: Any) -> None:
-        session = owner.session
-        super().__init__(handler, session.outlet)
+    def __init__(self, owner: Sending, handler: Any = None) -> None:
+        super().__init__(handler, owner.session.outlet)
         self._owner, self._matching = owner, False
-        self._end = partial(session.vehicle.on_matching.remove, self._look)
-        session.vehicle.on_matching.append(self._look)
+        listeners = owner.session.vehicle.on_matching
+        self._ends = [partial(listeners.remove, self._look)]
+        listeners.append(self._look)
         self._look()
 
     def _look(self) -> None:
-        status: MatchingStatus = self._owner.matching_status
+        status = self._owner.matching_status
         if status.matching != self._matching:
             self._matching = status.matching
             self._sink.push(status)
 
 
-class Publisher(Declared):
+class Sending(Declared):
+    """A publisher or a querier."""
+
+    key_expr: zenoh.KeyExpr
+    id: EntityGlobalId
+    _matches: Callable[[], bool]
+    """Returns whether anybody may take its samples, or may answer."""
+
+    def __init__(self, session: Session, key: Any) -> None:
+        self.session, self.id, self.key_expr = session, session.new_id(), key_of(key)
+        self._ends = []
+
+    @property
+    def matching_status(self) -> MatchingStatus:
+        """True for `matching` if there may be anybody at the other end."""
+        return MatchingStatus(self._matches())
+
+    declare_matching_listener = partialmethod(MatchingListener)
+
+
+class Publisher(Sending):
     """A publisher."""
 
     def __init__(
         self,
         session: Session,
-        key: Any,
+        key_expr: Any,
         *,
         encoding: Any = None,
         congestion_control: zenoh.CongestionControl | None = None,
@@ -266,10 +288,8 @@ class Publisher(Declared):
         reliability: zenoh.Reliability | None = None,
         allowed_destination: zenoh.Locality | None = None,
     ) -> None:
-        session.check_open()
-        self.session = session
-        self.key_expr = key_of(key)
-        self.id = EntityGlobalId(session.zid(), next(session.entity_numbers))
+        super().__init__(session, key_expr)
+        self._matches = partial(session.vehicle.matches_subscriber, self.key_expr)
         self.encoding = encoding_of(encoding)
         self.congestion_control = congestion_control or zenoh.CongestionControl.DEFAULT
         self.priority = priority or zenoh.Priority.DEFAULT
@@ -280,19 +300,11 @@ class Publisher(Declared):
             "express": express,
             "allowed_destination": allowed_destination,
         }
-        self._is_declared = True
 
-    key_expr: zenoh.KeyExpr
-    id: EntityGlobalId
     encoding: zenoh.Encoding
     congestion_control: zenoh.CongestionControl
     priority: zenoh.Priority
     reliability: zenoh.Reliability
-
-    @property
-    def matching_status(self) -> MatchingStatus:
-        """True for `matching` if anybody may take its samples."""
-        return MatchingStatus(self.session.vehicle.matches_subscriber(self.key_expr))
 
     def put(self, payload: Any, *, encoding: Any = None, **options: Any) -> None:
         """Put a sample."""
@@ -303,54 +315,34 @@ class Publisher(Declared):
         self._publish(DELETE, NOTHING, **options)
 
     def _publish(self, kind: zenoh.SampleKind, payload: Any, **options: Any) -> Sample:
-        if not self._is_declared:
-            raise zenoh.ZError("Undeclared Publisher")
+        self.check_declared()
         return self.session.publish(kind, self.key_expr, payload, **self._qos, **options)
 
-    def declare_matching_listener(self, handler: Any = None) -> MatchingListener:
-        """Declare a listener that is told whether anybody may take its samples."""
-        return MatchingListener(self, handler)
 
-
-class Querier(Declared):
+class Querier(Sending):
     """A querier."""
 
     def __init__(
         self,
         session: Session,
-        key: Any,
+        key_expr: Any,
         *,
         target: zenoh.QueryTarget | None = None,
         accept_replies: zenoh.ReplyKeyExpr | None = None,
         **options: Any,
     ) -> None:
-        session.check_open()
-        self.session = session
-        self.key_expr = key_of(key)
-        self.id = EntityGlobalId(session.zid(), next(session.entity_numbers))
+        super().__init__(session, key_expr)
+        all_complete = target == zenoh.QueryTarget.ALL_COMPLETE
+        self._matches = partial(session.vehicle.matches_queryable, self.key_expr, all_complete)
         self.accept_replies = accept_replies or zenoh.ReplyKeyExpr.DEFAULT
-        self._complete = target == zenoh.QueryTarget.ALL_COMPLETE
         self._options = {**options, "target": target, "accept_replies": accept_replies}
-        self._is_declared = True
 
-    key_expr: zenoh.KeyExpr
-    id: EntityGlobalId
     accept_replies: zenoh.ReplyKeyExpr
-
-    @property
-    def matching_status(self) -> MatchingStatus:
-        """True for `matching` if anybody may answer."""
-        return MatchingStatus(self.session.vehicle.matches_queryable(self.key_expr, self._complete))
 
     def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
         """Ask for replies."""
-        if not self._is_declared:
-            raise zenoh.ZError("Undeclared Querier")
+        self.check_declared()
         return self.session.get(zenoh.Selector(self.key_expr, parameters), handler, **self._options, **options)
-
-    def declare_matching_listener(self, handler: Any = None) -> MatchingListener:
-        """Declare a listener that is told whether anybody may answer."""
-        return MatchingListener(self, handler)
 
 
 class SessionInfo:
@@ -385,10 +377,10 @@ class Session:
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, config: zenoh.Config) -> None:
         self.vehicle, self.outlet = vehicle, outlet
-        self.entity_numbers = count(1)
+        self._entity_numbers = count(1)
         self._is_closed = False
-        self._declared: dict[Entity, str] = {}
-        self._at_close: list[Callable[[], object]] = []
+        self._ends: dict[Callable[[], object], None] = {}
+        """Undeclare what is declared, in the order of declarations."""
 
         def setting(name: str) -> Any:
             return msgspec.json.decode(config.get_json(name))
@@ -419,10 +411,8 @@ class Session:
     def close(self) -> None:
         """Undeclare all that the session has declared."""
         if not self._is_closed:
-            for end in self._at_close:
-                end()
-            for entity in list(self._declared):
-                self.end(entity)
+            for end in list(self._ends):
+                self._end(end)
             self._is_closed = True
 
     def is_closed(self) -> bool:
@@ -435,19 +425,25 @@ class Session:
         if self._is_closed:
             raise zenoh.ZError("session closed")
 
-    def declare(self, kind: str, entity: Entity) -> None:
-        """Declare an entity, until the session is closed."""
-        self._declared[entity] = kind
-        self.vehicle.declare(kind, entity)
+    def new_id(self) -> EntityGlobalId:
+        """Return the id of a further entity. Raises ZError if the session has been closed."""
+        self.check_open()
+        return EntityGlobalId(self._zid, next(self._entity_numbers))
 
-    def end(self, entity: Entity) -> None:
-        """Undeclare an entity, unless it has been."""
-        if (kind := self._declared.pop(entity, None)) is not None:
-            self.vehicle.undeclare(kind, entity)
+    def declare(self, entity: Entity) -> Callable[[], None]:
+        """Declare an entity until the session is closed; return what undeclares it before."""
+        self.vehicle.declare(entity)
+        return self.until_closed(partial(self.vehicle.undeclare, entity))
 
-    def at_close(self, end: Callable[[], object]) -> None:
-        """Have `end` called when the session is closed."""
-        self._at_close.append(end)
+    def until_closed(self, end: Callable[[], object]) -> Callable[[], None]:
+        """Have `end` called when the session is closed; return what calls it before."""
+        self._ends[end] = None
+        return partial(self._end, end)
+
+    def _end(self, end: Callable[[], object]) -> None:
+        if end in self._ends:
+            del self._ends[end]
+            end()
 
     def undeclare(self, obj: Any) -> None:
         """Undeclare a key expression, which is none the less valid."""
@@ -529,21 +525,10 @@ class Session:
         self.vehicle.ask(asking, self, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return seen
 
-    def declare_subscriber(self, key_expr: Any, handler: Any = None, **options: Any) -> Subscriber:
-        """Declare a subscriber."""
-        return Subscriber(self, key_expr, handler, **options)
-
-    def declare_queryable(self, key_expr: Any, handler: Any = None, **options: Any) -> Queryable:
-        """Declare a queryable."""
-        return Queryable(self, key_expr, handler, **options)
-
-    def declare_publisher(self, key_expr: Any, **options: Any) -> Publisher:
-        """Declare a publisher."""
-        return Publisher(self, key_expr, **options)
-
-    def declare_querier(self, key_expr: Any, **options: Any) -> Querier:
-        """Declare a querier."""
-        return Querier(self, key_expr, **options)
+    declare_subscriber = partialmethod(Subscriber)
+    declare_queryable = partialmethod(Queryable)
+    declare_publisher = partialmethod(Publisher)
+    declare_querier = partialmethod(Querier)
 
     def liveliness(self) -> Liveliness:
         """Return what has tokens."""
@@ -559,6 +544,4 @@ class Scout(Listening):
         if matcher.matches(zenoh.WhatAmI.ROUTER):
             self._sink.push(Hello(zenoh.WhatAmI.ROUTER, vehicle.zid, []))
 
-    def stop(self) -> None:
-        """Stop scouting."""
-        self.undeclare_if_declared()
+    stop = Declared.undeclare_if_declared

@@ -7,6 +7,7 @@ result. One strand runs at a time, until it blocks.
 
 from __future__ import annotations
 
+import _thread
 import asyncio
 import os
 import sys
@@ -24,6 +25,7 @@ from typing import Any, TypeVar
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
+from vnet.gateway.emulated.facade import Facade
 from vnet.runtime.asyncio_internals import note_greenlet
 from vnet.runtime.outside_loop import tell_failed_thread
 from vnet.runtime.own_asyncio import Task, present_node
@@ -463,14 +465,14 @@ class Threads:
             self._handles.pop().join()
 
     def module(self) -> ModuleType:
-        """Return the module `_thread`, with the names that `threading` needs in Python 3.11 to 3.13."""
-        module = ModuleType("_thread")
-        vars(module).update(
+        """Return the module `_thread`, with what `threading` needs of it in Python 3.11 to 3.13."""
+        return Facade(
+            _thread,
+            RLock=None,  # `threading` has one in Python
             allocate_lock=Lock,
             allocate=Lock,
             lock=Lock,
             LockType=Lock,
-            error=RuntimeError,
             TIMEOUT_MAX=LONGEST_WAIT_S,
             start_new_thread=self.start,
             start_new=self.start,
@@ -478,22 +480,15 @@ class Threads:
             get_native_id=number_of_thread,
             stack_size=lambda size=0: 0,
             _excepthook=_thread_failed,
-            _ExceptHookArgs=threading.ExceptHookArgs,
-            exit=sys.exit,
             interrupt_main=lambda signum=2: self.on_interrupt(),
             _count=lambda: self._alive,
             _set_sentinel=self._set_sentinel,
-            daemon_threads_allowed=lambda: True,
-            _is_main_interpreter=lambda: True,
             _get_main_thread_ident=lambda: 1,
             _ThreadHandle=ThreadHandle,
             _make_thread_handle=ThreadHandle,
             start_joinable_thread=self._start_joinable,
             _shutdown=self._shutdown,
         )
-        if sys.version_info >= (3, 12):  # `threading` wants it at its beginning, and gets the real one at its end
-            vars(module)["_local"] = type("_local", (), {})
-        return module
 
 
 def number_of_thread() -> int:

@@ -15,7 +15,6 @@ import msgspec
 import zenoh
 from zenoh.handlers import Callback
 
-from vnet.gateway import frames
 from vnet.gateway.emulated.strands import (
     IDLE,
     Strand,
@@ -27,17 +26,12 @@ from vnet.gateway.emulated.strands import (
     idle,
     look,
 )
-from vnet.gateway.frames import CrossingReply, CrossingSample
+from vnet.gateway.frames import MOST_WHOLE, CrossingReply, CrossingSample, sample_options
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
 EID_BITS = 16
 """Bits of an entity's number: session and entity cross the radio as one number of 64 bits."""
-PRIORITIES = {
-    name: getattr(zenoh.Priority, name)
-    for name in ("REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND")
-}
-CONGESTION_CONTROLS = {name: getattr(zenoh.CongestionControl, name) for name in ("DROP", "BLOCK", "BLOCK_FIRST")}
 
 
 class _Value(msgspec.Struct, frozen=True, eq=False, gc=False):
@@ -178,14 +172,9 @@ def timestamp_at(unix_ns: int, zid: ZenohId) -> zenoh.Timestamp:
     return zenoh.Timestamp(zenoh.NTP64(*divmod(unix_ns, NS_PER_S)), bytes(zid))
 
 
-def crossing_of(sample: Sample) -> CrossingSample:
-    """Return what of a sample crosses the radio."""
-    source = sample.source_info
-    if source is None:
-        return frames.crossing_of(sample, None)
-    return frames.crossing_of(
-        sample, (source.source_id.zid.number << EID_BITS | source.source_id.eid, source.source_sn)
-    )
+def number_of(source: SourceInfo) -> tuple[int, int]:
+    """Return what stands for a `SourceInfo` on the radio."""
+    return source.source_id.zid.number << EID_BITS | source.source_id.eid, source.source_sn
 
 
 PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
@@ -224,23 +213,20 @@ def token_sample(key: zenoh.KeyExpr, alive: bool) -> Sample:
     return Sample(key, NOTHING, PUT if alive else DELETE, NO_ENCODING)
 
 
+@lru_cache(maxsize=MOST_WHOLE)
 def sample_of(crossing: CrossingSample) -> Sample:
     """Return the sample that has crossed the radio. Raises ZError, ValueError or OverflowError for none."""
-    time, origin, source = crossing.time, crossing.source, None
+    origin, source = crossing.source, None
     if origin is not None:
         zid = ZenohId(origin[0] >> EID_BITS & (1 << 48) - 1)
         source = SourceInfo(EntityGlobalId(zid, origin[0] & (1 << EID_BITS) - 1), origin[1])
     return Sample(
         key_of(crossing.key),
         zenoh.ZBytes(crossing.payload),
-        zenoh.SampleKind.DELETE if crossing.is_delete else zenoh.SampleKind.PUT,
+        DELETE if crossing.is_delete else PUT,
         encoding_of(crossing.encoding),
-        None if time is None else zenoh.Timestamp(zenoh.NTP64(*time[:2]), time[2]),
-        CONGESTION_CONTROLS[crossing.congestion],
-        PRIORITIES[crossing.priority],
-        crossing.express,
-        None if crossing.attachment is None else zenoh.ZBytes(crossing.attachment),
-        source,
+        source_info=source,
+        **sample_options(crossing),
     )
 
 
@@ -266,11 +252,8 @@ class FifoChannel(DefaultHandler):
         self.capacity = capacity
 
 
-class RingChannel(DefaultHandler):
+class RingChannel(FifoChannel):
     """A channel that keeps the newest items."""
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
 
 
 class Handler:

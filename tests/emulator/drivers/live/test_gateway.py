@@ -55,7 +55,7 @@ class Vehicle:
         if not self.is_lost(len(self.frames) - 1):
             for other in self.others:
                 try:
-                    other.gateway.receive(self.gateway.node, payload, other.time_ns)
+                    other.gateway.hear(self.gateway.node_id, payload, other.time_ns)
                 except ValueError as error:
                     other.unread.append(str(error))
 
@@ -402,5 +402,5 @@ def test_an_exception_on_a_thread_of_zenohs_is_told(monkeypatch: pytest.MonkeyPa
         bug: Exception = heard[1]
         return bug
 
-    monkeypatch.setattr("emulator.drivers.live.gateway.crossing_of", lambda *_: 1 / 0)
+    monkeypatch.setattr("emulator.drivers.live.gateway.crossing_sample", lambda *_: 1 / 0)
     assert isinstance(asyncio.run(first_bug()), ZeroDivisionError)

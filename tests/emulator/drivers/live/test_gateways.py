@@ -41,7 +41,7 @@ class Rig:
         self.gateways.start_agents("", Access.create("fake", []), [[node] for node in emulation.world.node_ids])
 
     def _open_none(self, gateway: Gateway, listen: str) -> str:
-        self.routers[gateway.node] = gateway
+        self.routers[gateway.node_id] = gateway
         return listen
 
     def _tell(self, *item: Any) -> None:

@@ -1,0 +1,121 @@
+"""The programs of one vehicle as seen from the radio: what crosses it, queries on their way, tokens of others."""
+
+from __future__ import annotations
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import count
+from typing import Generic, TypeVar
+
+import msgspec
+import zenoh
+
+from vnet.gateway.frames import (
+    CrossingQuery,
+    CrossingReply,
+    CrossingSample,
+    CrossingTokens,
+    Reassembly,
+    crossing_query,
+)
+from vnet.gateway.keys import OWN_KEYS
+from vnet.gateway.ros2 import MOST_KEYS, Ros2
+from vnet.units import NS_PER_S
+
+TOKEN_PERIODS = 3
+"""Times `liveliness_s` without word of a vehicle's tokens after which they are gone."""
+
+Q = TypeVar("Q")
+
+
+class RadioSide(ABC, Generic[Q]):
+    """Common part of a gateway and of emulated sessions; `Q` are their queries."""
+
+    def __init__(
+        self, node_id: str, keys: Sequence[str], query_s: float, liveliness_s: float, ros2: Ros2 | None
+    ) -> None:
+        self.node_id, self._keys, self._query_s, self._ros2 = node_id, keys, query_s, ros2
+        self._expressions = [zenoh.KeyExpr(key) for key in keys]
+        self._reassembly = Reassembly()
+        self._queries: dict[int, Q] = {}
+        """Queries of this vehicle to which replies are awaited."""
+        self._query_numbers = count()
+        self._tokens_ns = round(TOKEN_PERIODS * liveliness_s * NS_PER_S)
+        self._told: dict[str, tuple[int, tuple[str, ...]]] = {}
+        """Instant of the last frame with tokens, and their keys, by vehicle."""
+        self.crosses = lru_cache(MOST_KEYS)(self._crosses)
+        """Return whether what has this key is sent by the radio."""
+
+    def _crosses(self, key: str) -> bool:
+        if key.startswith(OWN_KEYS) or (self._ros2 is not None and not self._ros2.crosses(key)):
+            return False
+        return any(each.intersects(key) for each in self._expressions)
+
+    def keep(self, query: Q) -> CrossingQuery:
+        """Keep a query for as long as replies are awaited; return what crosses the radio."""
+        number = next(self._query_numbers)
+        self._queries[number] = query
+        asyncio.get_running_loop().call_later(self._query_s, lambda: self._conclude(self._queries.pop(number)))
+        return crossing_query(number, query)
+
+    def hear(self, sender: str, payload: bytes, time_ns: int, only_tokens: bool = False) -> None:
+        """Give the programs what a frame carries. Raises ValueError for bytes that a fault has changed."""
+        try:
+            match self._reassembly.take(sender, payload):
+                case CrossingTokens() as tokens:
+                    self.hear_tokens(sender, tokens, time_ns)
+                case _ if only_tokens:
+                    pass
+                case CrossingSample() as sample:
+                    self._show(sample)
+                case CrossingQuery() as query:
+                    self._answer(sender, query)
+                case CrossingReply() as answer if answer.to == self.node_id:
+                    if (asked := self._queries.get(answer.number)) is not None:
+                        self._reply(asked, answer)
+        except (msgspec.MsgspecError, zenoh.ZError, LookupError, OverflowError) as error:
+            raise ValueError(str(error)) from None
+
+    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int) -> None:
+        """Take word of another vehicle's tokens. Raises ZError for what is no key."""
+        for key in tokens.keys:
+            zenoh.KeyExpr(key)
+        self._retell({**self._told, sender: (time_ns, tokens.keys)})
+
+    def forget_tokens(self, time_ns: int) -> None:
+        """Forget the tokens of vehicles that have not told of any lately."""
+        self._retell({one: told for one, told in self._told.items() if time_ns - told[0] < self._tokens_ns})
+
+    @property
+    def heard_tokens(self) -> dict[str, None]:
+        """The tokens of other vehicles, in the order in which their vehicles were first heard."""
+        return dict.fromkeys(key for _, keys in self._told.values() for key in keys)
+
+    def _retell(self, told: dict[str, tuple[int, tuple[str, ...]]]) -> None:
+        before, self._told = self.heard_tokens, told
+        after = self.heard_tokens
+        for key in [*before, *after]:
+            if (key in before) != (key in after):
+                self._show_token(key, is_there=key in after)
+
+    @abstractmethod
+    def _conclude(self, query: Q) -> object:
+        """End a query: no more replies are awaited."""
+
+    @abstractmethod
+    def _show(self, sample: CrossingSample) -> None:
+        """Give the programs a sample."""
+
+    @abstractmethod
+    def _answer(self, asker: str, query: CrossingQuery) -> None:
+        """Ask the programs on behalf of another vehicle; their replies are messages to it."""
+
+    @abstractmethod
+    def _reply(self, query: Q, answer: CrossingReply) -> None:
+        """Give a reply to the program that has asked."""
+
+    @abstractmethod
+    def _show_token(self, key: str, is_there: bool) -> None:
+        """Tell the programs that a token of another vehicle has come, or is gone."""
