@@ -210,7 +210,7 @@ class _Source:
 
     def __init__(self, source_id: EntityGlobalId | bytes) -> None:
         self.id = source_id
-        """Of the publisher, or of the timestamps of its samples."""
+        """Id of the publisher, or of the timestamps of its samples."""
         self.last: int | None = None
         """Place of the last sample that was passed on."""
         self.waiting: dict[int, Sample] = {}
