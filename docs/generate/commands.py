@@ -35,7 +35,7 @@ emulator, is refused, or loses it.
 CHAPTERS = {
     "Run a scenario": ("run", "simulate", "demo", "new", "emulator", "host", "access"),
     "A running emulator": ("status", "fault"),
-    "Judge and compare runs": ("check", "report", "compare", "diff", "radio", "trace"),
+    "Judge and compare runs": ("check", "report", "compare", "radio", "trace"),
     "Look at runs": ("view", "record", "render", "export"),
     "Many runs": ("campaign", "sweep"),
     "Networks and maps": ("analyze", "map"),

@@ -1,4 +1,4 @@
-"""`vnet check`, `vnet diff` and `vnet trace`: judge a run's folder again, and look into it."""
+"""`vnet check` and `vnet trace`: judge a run's folder again, and look into it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
 from emulator.cli.options import LATEST, ChecksOption, RunArgument, path_of
-from emulator.records.parting import FrameEntry, Parting, before, frame_log, partings
+from emulator.records.parting import FrameEntry, frame_log
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.program import from_here, split_file
 from emulator.terminal.console import one_line_errors
@@ -23,8 +22,6 @@ from vnet.errors import VnetError, did_you_mean, printable, shown
 from vnet.runtime.programs import error_line, search_programs_in
 from vnet.units import NS_PER_S
 
-LONGEST = 300
-"""Characters of what a run has at a parting."""
 COLUMNS = ("s", "sender", "frame", "bytes", "content", "receivers")
 LONGEST_CONTENT = 200
 """Characters of a content that are shown."""
@@ -52,39 +49,6 @@ def check(
         judgement = check_run(folder, own_checks, [from_here(each) for each in check or ()])
         print_checks(judgement, SafeConsole(), RecordedRun.open(folder).record.reproduce)
         raise typer.Exit(judgement.exit_status)
-
-
-def diff(
-    run: RunArgument,
-    other: Annotated[Path, typer.Argument(parser=path_of, metavar="OTHER", help="Another run's folder.")],
-) -> None:
-    """Show where two runs part: decision, frame, reception, event or value, and what had happened before.
-
-    Status 0: the runs agree; 1: they part; 2: error.
-    """
-    with one_line_errors():
-        ours, theirs = RecordedRun.open(run), RecordedRun.open(other)
-        found = partings(ours, theirs)
-        console = SafeConsole()
-        if not found:
-            console.print("the runs agree in all decisions, frames, receptions, events and reported values")
-            return
-        first = found[0]
-        console.print(f"the runs part at {first.time_ns / NS_PER_S:.6f} s: a {first.kind} of {first.node}")
-        console.print(_table(found, str(run), str(other)))
-        if told := before(ours.trace, ours.events, first.node, first.time_ns):
-            console.print(f"{first.node} until then:", highlight=False)
-            for line in told:
-                console.print(Text(f"  {line}"))
-        raise typer.Exit(1)
-
-
-def _table(found: list[Parting], ours: str, theirs: str) -> Table:
-    table = Table("s", "first", "vehicle", escape(printable(ours)), escape(printable(theirs)))
-    for each in found:
-        shown = [Text(printable(text, LONGEST) or "–") for text in (each.first, each.second)]
-        table.add_row(f"{each.time_ns / NS_PER_S:.6f}", each.kind, each.node, *shown)
-    return table
 
 
 def trace(

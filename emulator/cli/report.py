@@ -50,7 +50,10 @@ def compare(
         Path | None, typer.Option(metavar="FILE.html", help="Write a page with the curves of both as well.")
     ] = None,
 ) -> None:
-    """Set two runs side by side, and show where they first differ. Status 0: same trace; 1: another; 2: error."""
+    """Set two runs side by side, and show where they part: decision, frame, reception, event or value.
+
+    Status 0: same trace; 1: another; 2: error.
+    """
     from emulator.report.comparison import Comparison, print_comparison
 
     with one_line_errors():

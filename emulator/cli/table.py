@@ -67,10 +67,7 @@ COMMANDS = (
     Command("status", Panel.LOOK, "fault", "status", "Show how a run that is on is getting on."),
     Command("check", Panel.LOOK, "folders", "check", "Judge a finished run again."),
     Command("report", Panel.LOOK, "report", "report", "Write a run's report, or a list of runs, as a page."),
-    Command(
-        "compare", Panel.LOOK, "report", "compare", "Set two runs side by side, and show where they first differ."
-    ),
-    Command("diff", Panel.LOOK, "folders", "diff", "Show where two runs part for the first time."),
+    Command("compare", Panel.LOOK, "report", "compare", "Set two runs side by side, and show where they part."),
     Command(
         "radio", Panel.LOOK, "export", "radio", "Show delivery by distance, latency, age, and the worst links."
     ),

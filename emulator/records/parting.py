@@ -43,8 +43,7 @@ def partings(first: OpenedRun, second: OpenedRun) -> list[Parting]:
     """
     found = [
         _first_entry("decision", _decisions(first), _decisions(second)),
-        _first_entry("frame", _frames(first), _frames(second)),
-        _first_entry("reception", _receptions(first), _receptions(second)),
+        *_first_in_traces(first, second),
         _first_entry("event", _events(first), _events(second)),
         _first_vehicle(first, second),
         _first_value(first.states, second.states),
@@ -120,6 +119,13 @@ def _line(details: dict[str, Any]) -> str:
 
 
 Row = dict[str, Any]
+
+
+def _first_in_traces(first: OpenedRun, second: OpenedRun) -> Iterator[Parting | None]:
+    """Yield the first frame and the first reception that differ; traces may have millions of rows."""
+    if not first.trace.equals(second.trace):
+        yield _first_entry("frame", _frames(first), _frames(second))
+        yield _first_entry("reception", _receptions(first), _receptions(second))
 
 
 def _frames(run: OpenedRun) -> list[Entry]:

@@ -17,20 +17,24 @@ from emulator.checks.replay import compare_folders
 from emulator.pages.canvas import BLUE, RED, Canvas, FaultSpan, canvas, legend
 from emulator.pages.page import SIGNS, put_page, render, table
 from emulator.pages.text import cell
+from emulator.records.parting import Parting, before, partings
+from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import ReportedFigure, figure_text
 from emulator.records.run_folder import check_is_run
-from emulator.records.verdicts import CheckResult, Finding, Record, Verdict
+from emulator.records.verdicts import CheckResult, Record, Verdict
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
 from emulator.report.program_figures import MOST_CHARTS, is_number, label_of, mean_over_time
 from emulator.report.radio_figures import bin_width_ns, broadcasts, decided, latencies_ms
 from emulator.report.source import NothingToShow, Source
 from emulator.scenario.loading import parse_toml
-from vnet.errors import VnetError
+from vnet.errors import VnetError, printable
 from vnet.units import NS_PER_S, title_of
 
 A, B = "A", "B"
 NOT_APPLICABLE = "not applicable"
 LONGEST_VALUE = 200
+LONGEST_ENTRY = 300
+"""Characters of what a run has at a parting."""
 Row = dict[str, Any]
 
 
@@ -50,7 +54,7 @@ class Comparison:
         sources = Source(first), Source(second)
         for source in sources:
             _ = source.record, source.scenario
-        return cls(*sources, _told(compare_folders(first, second)))
+        return cls(*sources, compare_folders(first, second))
 
     @property
     def records(self) -> tuple[Record, Record]:
@@ -61,6 +65,35 @@ class Comparison:
     def same_trace(self) -> bool:
         """True if the traces are the same; states and metrics may still differ."""
         return self.finding.figures.get("table") != "trace"
+
+    @cached_property
+    def partings(self) -> list[Row]:
+        """The first difference of each kind, the earliest first."""
+        return [
+            {
+                "time (s)": f"{each.time_ns / NS_PER_S:.6f}",
+                "first": each.kind,
+                "vehicle": each.node,
+                A: printable(each.first, LONGEST_ENTRY) or "–",
+                B: printable(each.second, LONGEST_ENTRY) or "–",
+            }
+            for each in self._partings
+        ]
+
+    @cached_property
+    def before(self) -> list[str]:
+        """Lines on what the vehicle had done and heard before the first parting."""
+        first, run = self._partings[0], self._whole[0]
+        return before(run.trace, run.events, first.node, first.time_ns)
+
+    @cached_property
+    def _partings(self) -> list[Parting]:
+        return partings(*self._whole)
+
+    @cached_property
+    def _whole(self) -> tuple[OpenedRun, OpenedRun]:
+        """The runs with all columns, of which pages need some."""
+        return RecordedRun.open(self.first.folder), RecordedRun.open(self.second.folder)
 
     @cached_property
     def scenario(self) -> list[Row]:
@@ -115,15 +148,6 @@ class Comparison:
                 percent = [None if share is None else 100 * share for share in shares]
                 rows.append(_difference(f"{name} (%)", percent[0], percent[1], ".2f"))
         return rows
-
-
-def _told(finding: Finding) -> CheckResult:
-    """The finding with the runs called by their letters."""
-    assert isinstance(finding, CheckResult), "two folders were compared"
-    figures = dict(finding.figures)
-    if "rows" in figures:
-        figures["rows"] = [{**row, "run": name} for row, name in zip(figures["rows"], (A, B), strict=True)]
-    return CheckResult("first difference", finding.verdict, finding.text, figures)
 
 
 def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -185,8 +209,15 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
     console.print(_table("verdicts", comparison.checks, _verdict_style))
     finding = comparison.finding
     console.print(Text(finding.text, style="green" if finding.verdict is Verdict.VALID else "bold red"))
-    if rows := finding.figures.get("rows"):
-        console.print(_turned(rows))
+    if not comparison.partings:
+        return
+    first, *_ = comparison.partings
+    console.print(f"the runs part at {first['time (s)']} s: a {first['first']} of {first['vehicle']}")
+    console.print(_table("", comparison.partings))
+    if comparison.before:
+        console.print(f"{first['vehicle']} until then:", highlight=False)
+    for line in comparison.before:
+        console.print(Text(f"  {line}"))
 
 
 def _table(title: str, rows: Sequence[Mapping[str, Any]], style: Any = lambda text: "") -> Table:
@@ -203,17 +234,6 @@ def _verdict_style(value: object) -> str:
     return {"valid": "green", "invalid": "bold red", "unknown": "yellow"}.get(str(value), "")
 
 
-def _turned(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Two rows of a table as columns: long rows do not fit into a terminal."""
-    return _table("", turned(rows))
-
-
-def turned(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
-    """Two rows of a table, A and B, as columns."""
-    names = dict.fromkeys(key for row in rows for key in row if key != "run")
-    return [{"column": name, A: rows[0].get(name), B: rows[1].get(name)} for name in names]
-
-
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
 REPORTED = "reported by the programs: means and 5 to 95 % of all reports of all vehicles"
 
@@ -227,13 +247,12 @@ def comparison_page(comparison: Comparison) -> str:
     """Return the whole page."""
     charts, missing = _draw(comparison)
     finding = comparison.finding
-    rows = finding.figures.get("rows")
     outcomes = "outcomes, as shares of the attempted receptions; B − A in percentage points"
     return render(
         "comparison.html.j2",
         runs=list(_runs(comparison)),
         difference=finding.text if finding.verdict is Verdict.VALID else f"{SIGNS[Verdict.INVALID]} {finding.text}",
-        difference_rows=table(turned(rows)) if rows else None,
+        partings=table(comparison.partings) if comparison.partings else None,
         scenario=table(comparison.scenario, "keys that differ") if comparison.scenario else None,
         key_figures=table(comparison.figures, "errors are means after the first fifth of the run"),
         reported=table(comparison.reported, REPORTED) if comparison.reported else None,

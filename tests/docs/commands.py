@@ -30,7 +30,6 @@ HERE = (
     "export",
     "report",
     "compare",
-    "diff",
     "map",
     "trace",
     "docs",

@@ -108,10 +108,10 @@ def test_a_parting_names_the_entry_that_one_run_lacks(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "other, status, told",
-    [("a", 0, "the runs agree"), ("b", 1, "the runs part at 0.000000 s"), ("nothing", 2, "nothing")],
+    [("a", 0, "two runs agree"), ("b", 1, "the runs part at 0.000000 s"), ("nothing", 2, "nothing")],
 )
 def test_the_command_tells_it(other: str, status: int, told: str, tmp_path: Path) -> None:
     simulated(tmp_path / "a")
     simulated(tmp_path / "b", run={"order": "shuffle", "duration_s": 1.0})
-    done = CliRunner().invoke(app, ["diff", str(tmp_path / "a"), str(tmp_path / other)])
+    done = CliRunner().invoke(app, ["compare", str(tmp_path / "a"), str(tmp_path / other)])
     assert done.exit_code == status and told in done.output.replace("\n", "")

@@ -98,16 +98,16 @@ def of_states(folder: Path) -> None:
     ("command", "edits"),
     [
         *((command, [of_events, of_verdict, of_states]) for command in ("check", "report", "compare")),
-        *((command, [of_events, of_verdict, of_states]) for command in ("radio", "trace", "diff")),
+        *((command, [of_events, of_verdict, of_states]) for command in ("radio", "trace")),
         ("check", [of_manifest]),
     ],
-    ids=["check", "report", "compare", "radio", "trace", "diff", "manifest"],
+    ids=["check", "report", "compare", "radio", "trace", "manifest"],
 )
 def test_no_command_sends_what_a_folder_holds(run: Path, tmp_path: Path, command: str, edits: list[Edit]) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     for edit in edits:
         edit(copy)
-    arguments = [command, str(copy), *([str(run)] if command in ("compare", "diff") else [])]
+    arguments = [command, str(copy), *([str(run)] if command == "compare" else [])]
     done = CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, arguments)
     assert done.exit_code in (0, 1, 2), done.output
     assert is_plain(done.output), repr(done.output)
