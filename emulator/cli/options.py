@@ -6,10 +6,13 @@ import json
 import math
 import re
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields
 from enum import StrEnum
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -82,15 +85,6 @@ class OutputOptions:
     def only_the_result(self) -> bool:
         """True if standard output is for the result alone, and not for what programs print."""
         return self.quiet or self.log_format is LogFormat.JSON
-
-
-@dataclass(frozen=True)
-class OrderOptions:
-    """The order of simultaneous events that was asked for."""
-
-    order: Order | None = None
-    seed: int | None = None
-    tape: Path | None = None
 
 
 ScenarioArgument = Annotated[
@@ -221,6 +215,69 @@ RerunVehicleOption = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of each command that runs one scenario."""
+
+    scenario: ScenarioArgument
+    program: ProgramOption = None
+    seed: SeedOption = None
+    duration: DurationOption = None
+    order: OrderOption = None
+    order_seed: OrderSeedOption = None
+    tape: TapeOption = None
+    out: OutOption = None
+    overrides: SetOption = None
+    option: ProgramOptionsOption = None
+    checks: ChecksOption = None
+    rerun: RerunOption = None
+    rerun_vehicle: RerunVehicleOption = None
+    log_format: LogFormatOption = LogFormat.TEXT
+    quiet: QuietOption = False
+    verbose: VerboseOption = False
+    report: ReportOption = True
+
+    def output(self, check_determinism: Compared | None = None) -> OutputOptions:
+        """Return the output that is asked for."""
+        return OutputOptions(self.log_format, self.quiet, check_determinism, self.report, self.verbose)
+
+    def load(self, pacing: Pacing | None) -> Scenario:
+        """Load the scenario as these options change it. Raises VnetError."""
+        changes = self.overrides, self.program, pacing, self.seed, self.duration, self.option, self.checks
+        return load(self.scenario, *changes, self.order, self.order_seed, self.tape)
+
+
+@dataclass(frozen=True)
+class LiveOptions(RunOptions):
+    """Those of each command that runs it live."""
+
+    pacing: PacingOption = None
+    rerun_bind: RerunBindOption = None
+    rerun_port: RerunPortOption = None
+
+
+def spread(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that takes the fields of its first parameter, a dataclass, as options of its own."""
+    options, *others = signature(command, eval_str=True).parameters.values()
+    hints = get_type_hints(options.annotation, include_extras=True)
+    defaults = {
+        each.name: Parameter.empty if each.default is MISSING else each.default
+        for each in fields(options.annotation)
+    }
+
+    @wraps(command)
+    def spread_out(**given: Any) -> None:
+        own = {each.name: given.pop(each.name) for each in others if each.name in given}
+        command(options.annotation(**given), **own)
+
+    kind = Parameter.KEYWORD_ONLY
+    shared = [Parameter(name, kind, default=default, annotation=hints[name]) for name, default in defaults.items()]
+    every = [*shared, *(each.replace(kind=kind) for each in others)]
+    spread_out.__signature__ = Signature(every)  # type: ignore[attr-defined]
+    spread_out.__annotations__ = {each.name: each.annotation for each in every}
+    return spread_out
+
+
 def host_names(names: str | None) -> list[str]:
     """Return the names in `--hosts a,b,c`. Raises ScenarioError for an empty one."""
     found = [] if names is None else [name.strip() for name in names.split(",")]
@@ -238,18 +295,19 @@ def load(
     duration: float | None = None,
     program_options: list[str] | None = None,
     checks: list[str] | None = None,
-    order: OrderOptions | None = None,
+    order: Order | None = None,
+    order_seed: int | None = None,
+    tape: Path | None = None,
 ) -> Scenario:
     """Load a scenario as the options of a command change it. Raises VnetError."""
-    order = order or OrderOptions()
     options = {
         "program.entry": program and json.dumps(from_here(program)),
         "run.pacing": pacing and f'"{pacing.value}"',
         "run.seed": seed,
         "run.duration_s": duration,
-        "run.order": order.order and f'"{order.order.value}"',
-        "run.order_seed": order.seed,
-        "run.tape": order.tape and json.dumps(str(order.tape.absolute())),
+        "run.order": order and f'"{order.value}"',
+        "run.order_seed": order_seed,
+        "run.tape": tape and json.dumps(str(tape.absolute())),
     }
     given = [f"{key}={value}" for key, value in options.items() if value is not None]
     own = [_program_option(option) for option in program_options or ()]

@@ -15,42 +15,25 @@ import typer
 from emulator.cli.options import (
     DEFAULT_LISTEN,
     AgentOption,
-    ChecksOption,
     DebugOption,
     DeterminismOption,
     DurationOption,
     HostsOption,
-    LogFormatOption,
-    OrderOption,
-    OrderOptions,
-    OrderSeedOption,
+    LiveOptions,
     OutOption,
     OutputOptions,
     Pacing,
-    PacingOption,
     ProcessesOption,
-    ProgramOption,
-    ProgramOptionsOption,
-    QuietOption,
-    ReportOption,
-    RerunBindOption,
-    RerunOption,
-    RerunPortOption,
-    RerunVehicleOption,
-    ScenarioArgument,
-    SeedOption,
-    SetOption,
-    TapeOption,
-    VerboseOption,
+    RunOptions,
     debug_target,
     host_names,
-    load,
+    spread,
 )
 from emulator.cli.own_child import OwnChild, may_fork
 from emulator.scenario.faults import refuse_router_restart
 from emulator.scenario.loading import find_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.terminal.console import LogFormat, one_line_errors, say_first
+from emulator.terminal.console import one_line_errors, say_first
 from emulator.terminal.standard_output import result_only
 from emulator.viewer.sinks import choose_sinks
 from vnet.errors import VnetError
@@ -65,25 +48,10 @@ class RouterKind(StrEnum):
     SEPARATE = "separate"
 
 
+@spread
 def run(
-    scenario: ScenarioArgument,
-    program: ProgramOption = None,
-    pacing: PacingOption = None,
-    seed: SeedOption = None,
-    duration: DurationOption = None,
-    order: OrderOption = None,
-    order_seed: OrderSeedOption = None,
-    tape: TapeOption = None,
-    out: OutOption = None,
-    overrides: SetOption = None,
-    option: ProgramOptionsOption = None,
-    checks: ChecksOption = None,
-    rerun: RerunOption = None,
-    rerun_bind: RerunBindOption = None,
-    rerun_port: RerunPortOption = None,
-    rerun_vehicle: RerunVehicleOption = None,
+    asked: LiveOptions,
     check_determinism: DeterminismOption = None,
-    report: ReportOption = True,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
     ] = RouterKind.EMBEDDED,
@@ -95,79 +63,62 @@ def run(
     ] = None,
     agent: AgentOption = None,
     debug: DebugOption = None,
-    log_format: LogFormatOption = LogFormat.TEXT,
-    quiet: QuietOption = False,
-    verbose: VerboseOption = False,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
-    asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
-    with one_line_errors(log_format), result_only(asked.only_the_result) as output:
-        order_asked = OrderOptions(order, order_seed, tape)
-        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
+    output = asked.output(check_determinism)
+    with one_line_errors(asked.log_format), result_only(output.only_the_result) as stdout:
+        loaded = asked.load(asked.pacing)
         if check_determinism is not None and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         if router is not RouterKind.SEPARATE and not loaded.has_gateways:
             refuse_router_restart(loaded.fault)
-        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
+        sinks = choose_sinks(asked.rerun or (), asked.rerun_bind, asked.rerun_port, asked.rerun_vehicle)
         if debug is not None and hosts is not None:
             raise VnetError("--debug and --hosts exclude each other")
         if agent is not None and (debug is not None or hosts is not None or check_determinism is not None):
             raise VnetError("--agent excludes --debug, --hosts and --check-determinism")
-        asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
-        _announce(loaded, asked)
+        output = replace(output, debug=debug_target(debug, loaded, output.only_the_result))
+        _announce(loaded, output)
         with ended_at_once():
             from emulator.cli.execution import Request, run_with_processes
 
-        request = Request(loaded, scenario, out, sinks, asked, output)
+        request = Request(loaded, asked.scenario, asked.out, sinks, output, stdout)
         own_hosts = [str(1 + number) for number in range(hosts or 0)]
         run_with_processes(request, router is RouterKind.SEPARATE, own_hosts, agent)
 
 
+@spread
 def simulate(
-    scenario: ScenarioArgument,
-    program: ProgramOption = None,
-    seed: SeedOption = None,
-    duration: DurationOption = None,
-    order: OrderOption = None,
-    order_seed: OrderSeedOption = None,
-    tape: TapeOption = None,
-    out: OutOption = None,
-    overrides: SetOption = None,
-    option: ProgramOptionsOption = None,
-    checks: ChecksOption = None,
-    rerun: RerunOption = None,
-    rerun_vehicle: RerunVehicleOption = None,
+    asked: RunOptions,
     check_determinism: DeterminismOption = None,
     processes: ProcessesOption = "1",
     debug: DebugOption = None,
-    log_format: LogFormatOption = LogFormat.TEXT,
-    quiet: QuietOption = False,
-    verbose: VerboseOption = False,
-    report: ReportOption = True,
 ) -> None:
     """Run a scenario without Zenoh, in lockstep, in one process or in a few: the same trace, faster."""
-    asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
-    with one_line_errors(log_format), result_only(asked.only_the_result) as output:
-        order_asked = OrderOptions(order, order_seed, tape)
-        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, order_asked)
-        sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
+    output = asked.output(check_determinism)
+    with one_line_errors(asked.log_format), result_only(output.only_the_result) as stdout:
+        loaded = asked.load(Pacing.LOCKSTEP)
+        sinks = choose_sinks(asked.rerun or (), vehicle=asked.rerun_vehicle, live=False)
         if debug is not None and processes != "1":
             raise VnetError("--debug and --processes exclude each other")
-        asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
-        _announce(loaded, asked)
+        output = replace(output, debug=debug_target(debug, loaded, output.only_the_result))
+        _announce(loaded, output)
         child, apart = OwnChild(), None
-        if processes == "1" and asked.debug is None and may_fork():
+        if processes == "1" and output.debug is None and may_fork():
             apart = child.fork(loaded.run.stall_timeout_s)
-        if apart is not None and not asked.only_the_result:
+        if apart is not None and not output.only_the_result:
             say_first(f"{apart or 'a program'} {child.ending} the process of all: again, with a process a vehicle")
         with ended_at_once():
             from emulator.cli.execution import Request, run_simulated
 
-        run_simulated(Request(loaded, scenario, out, sinks, asked, output), processes, child.told, apart)
+        run_simulated(
+            Request(loaded, asked.scenario, asked.out, sinks, output, stdout), processes, child.told, apart
+        )
 
 
+@spread
 def emulator(
-    scenario: ScenarioArgument,
+    asked: LiveOptions,
     listen: Annotated[
         str | None,
         typer.Option(
@@ -185,41 +136,21 @@ def emulator(
         ),
     ] = None,
     hosts: HostsOption = None,
-    program: ProgramOption = None,
-    pacing: PacingOption = None,
-    seed: SeedOption = None,
-    duration: DurationOption = None,
-    order: OrderOption = None,
-    order_seed: OrderSeedOption = None,
-    tape: TapeOption = None,
-    out: OutOption = None,
-    overrides: SetOption = None,
-    option: ProgramOptionsOption = None,
-    checks: ChecksOption = None,
-    rerun: RerunOption = None,
-    rerun_bind: RerunBindOption = None,
-    rerun_port: RerunPortOption = None,
-    rerun_vehicle: RerunVehicleOption = None,
-    log_format: LogFormatOption = LogFormat.TEXT,
-    quiet: QuietOption = False,
-    verbose: VerboseOption = False,
-    report: ReportOption = True,
 ) -> None:
     """Run a scenario for hosts, or for agents that are started by hand, here or on other machines."""
-    asked = OutputOptions(log_format, quiet, report=report, verbose=verbose)
-    with one_line_errors(log_format), result_only(asked.only_the_result) as output:
+    output = asked.output()
+    with one_line_errors(asked.log_format), result_only(output.only_the_result) as stdout:
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
-        order_asked = OrderOptions(order, order_seed, tape)
-        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
+        loaded = asked.load(asked.pacing)
         if not loaded.has_gateways:
             refuse_router_restart(loaded.fault)
-        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
-        _announce(loaded, asked)
+        sinks = choose_sinks(asked.rerun or (), asked.rerun_bind, asked.rerun_port, asked.rerun_vehicle)
+        _announce(loaded, output)
         with ended_at_once():
             from emulator.cli.execution import Request, run_for_agents
 
-        request = Request(loaded, scenario, out, sinks, asked, output)
+        request = Request(loaded, asked.scenario, asked.out, sinks, output, stdout)
         run_for_agents(request, listen, connect, access, host_names(hosts))
 
 
@@ -237,4 +168,4 @@ def demo(duration: DurationOption = None, out: OutOption = None) -> None:
     """
     with one_line_errors():
         require("vnet demo", "rerun", "scipy", "osqp")
-    run(find_scenario("quickstart"), duration=duration, out=out, rerun=["save"])
+    run(scenario=find_scenario("quickstart"), duration=duration, out=out, rerun=["save"])

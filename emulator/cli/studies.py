@@ -14,7 +14,6 @@ from emulator.cli.options import (
     DeterminismOption,
     DurationOption,
     OrderOption,
-    OrderOptions,
     Pacing,
     ProgramOption,
     ProgramOptionsOption,
@@ -201,9 +200,7 @@ def campaign(
     from emulator.testing.campaign_plan import Plan, parse_ranges
 
     with one_line_errors(), result_only(True):
-        loaded = load(
-            scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, OrderOptions(order)
-        )
+        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, order)
         if check_determinism is Compared.PORTABLE:
             raise VnetError("--check-determinism=portable: is for vnet run and vnet simulate")
         jobs = jobs or (RUNS_ON_DASK if executor else None)
