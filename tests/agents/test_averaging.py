@@ -15,7 +15,6 @@ from emulator.drivers.simulate import simulate
 from emulator.scenario.scenario import Scenario
 from tests.support.recorded import prepared
 from vnet import Packet
-from vnet.errors import ProgramError
 
 PERIOD_NS = 100_000_000
 names = st.frozensets(st.integers(0, 10_000).map(lambda number: short_name(f"v{number}")), max_size=40)
@@ -59,25 +58,6 @@ def test_arbitrary_bytes_are_refused_or_sane(payload: bytes) -> None:
 def test_a_frame_of_absurd_numbers_is_refused(share: Share) -> None:
     with pytest.raises(ValueError, match="out of bounds"):
         decode(encode(share))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"rul": "ratio"}, "program.options.rul: unknown (did you mean rule?); allowed: rule, silent"),
-        ({"rule": "exact"}, "program.options.rule = 'exact': one of ratio, metropolis, max-degree expected"),
-        ({"silent": ["v1"]}, "program.options.silent = ['v1']: a table"),
-        ({"silent": {"v1": 3.0}}, "program.options.silent.v1 = 3.0: a list of 2 (each a number"),
-        ({"silent": {"v1": [3.0]}}, "program.options.silent.v1 = [3.0]: a list of 2"),
-        ({"silent": {"v1": [3.0, 2.0]}}, "program.options.silent.v1 = [3.0, 2.0]: [from_s, to_s] expected"),
-        ({"silent": {"v1": [0.0, float("nan")]}}, "program.options.silent.v1 = [0.0, nan]: a list of 2"),
-    ],
-)
-def test_a_wrong_option_is_one_line(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ProgramError) as caught:
-        Options.parse(options)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_silence_lasts_from_its_first_instant_to_before_its_last() -> None:

@@ -103,51 +103,20 @@ def test_there_are_pages_and_blocks() -> None:
     assert {"python", "toml", "csv", "sh", "text", "yaml"} <= {block.language for block in found}
 
 
-PROGRAM = "```python\n# hello.py\nfrom vnet import Node\n\n\nasync def main(node: Node) -> None:\n    {}\n```\n"
-BROKEN = {
-    "no language": ("```\nls\n```\n", "language ''"),
-    "an unknown language": ("```console\n$ ls\n```\n", "language 'console'"),
-    "Python that is none": ("```python\nprint(\n```\n", "SyntaxError"),
-    "Python that fails": ("```python\nassert 1 + 1 == 3\n```\n", "AssertionError"),
-    "output that is another": ("```python\nprint(2)\n```\n\nprints\n\n```text\n3\n```\n", "this is not an excerpt"),
-    "a test that fails": ("```python\ndef test_it():\n    assert False\n```\n", "1 failed"),
-    "a program that crashes": (PROGRAM.format("node.gnss.nothing()"), "invalid"),
-    "a program without its import": (PROGRAM.format("pass").replace("from vnet", "from venet"), "venet"),
-    "a file that is written twice, and never run": (2 * PROGRAM.format("pass"), "never run"),
-    "a key that a scenario has not": ("```toml\n[radio]\nlos = 0.1\n```\n", "radio.los"),
-    "a scenario that is not there": ("```sh\nvnet simulate nowhere.toml\n```\n", "nowhere.toml"),
-    "an option that a command has not": ("```sh\nvnet simulate scenarios/beacon.toml --sed 2\n```\n", "--sed"),
-    "an option of a command that is not run": ("```sh\nvnet-agent --nod v01\n```\n", "--nod"),
-    "an option of a long run": ("```sh\nvnet run scenarios/quickstart.toml --pacing fast\n```\n", "fast"),
-    "another exit status": ("```sh\nvnet simulate town.toml   # status 3\n```\n", "exit status 2, and not 3"),
-    "a command that is not there": ("```sh\nvnet simulated scenarios/beacon.toml\n```\n", "vnet simulated"),
-    "a command that fails in its terminal": ("```sh terminal\nvnet status\n```\n", "exit status 2, and not 0"),
-    "a command that prints something else in its terminal": (
-        "```sh terminal\nvnet status   # status 2\n```\n\n```text\n12 vehicles\n```\n",
-        "this is not what it prints",
-    ),
-    "a program that nobody has spoken of": ("```sh\nrm -rf town\n```\n", "rm: say"),
-    "a target that the Makefile has not": ("```sh\nmake dema\n```\n", "dema"),
-    "JSON that is none": ("```json\n{,}\n```\n", "JSONDecodeError"),
-    "a CSV file without a name": ("```csv\na,b\n```\n", "needs its name"),
-    "a workflow with a wrong command": (
-        "```yaml\non: push\njobs:\n  a:\n    runs-on: x\n    steps:\n      - run: vnet simulate\n```\n",
-        "SCENARIO",
-    ),
-    "an excerpt that is none": (
-        "```python of agents/beacon.py\nprint('not there')\n```\n",
-        "no excerpt of agents/beacon.py",
-    ),
-}
+BROKEN = re.findall(
+    r"^#### (.+?): (.+)\n((?:(?!####).*\n)+)",
+    (ROOT / "tests" / "docs" / "broken.txt").read_text(encoding="utf-8"),
+    re.MULTILINE,
+)
+"""Blocks: what is wrong with each, what is said of it, and its text."""
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_a_block_that_is_broken_fails(name: str, page: Page) -> None:
-    text, complaint = BROKEN[name]
+@pytest.mark.parametrize(("said", "text"), [each[1:] for each in BROKEN], ids=[each[0] for each in BROKEN])
+def test_a_block_that_is_broken_fails(said: str, text: str, page: Page) -> None:
     with pytest.raises(DocsError) as failed:
         page.follow(f"# A page\n\n{text}", "page.md")
-    assert "page.md:3: " in str(failed.value) or "excerpt" in complaint or "never run" in complaint
-    assert complaint in str(failed.value)
+    assert "page.md:3: " in str(failed.value) or "excerpt" in said or "never run" in said
+    assert said in str(failed.value)
 
 
 @pytest.mark.parametrize(

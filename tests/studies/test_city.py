@@ -73,20 +73,3 @@ def test_errors_are_those_of_the_place() -> None:
     corner, error = city.errors_by_place(states)
     assert corner.tolist() == [[0.0, 0.0], [100.0, 0.0]]
     assert error == pytest.approx([np.sqrt(25 / 2), 2.0])
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--trips", "trips.csv"], "--map is missing"),
-        (["--map", "cross.npz"], "--trips is missing"),
-        (["--trips", "nowhere.csv", "--map", "cross.npz"], "--trips nowhere.csv: no such file"),
-    ],
-)
-def test_trips_and_maps_are_needed_together(
-    files: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], said: str
-) -> None:
-    monkeypatch.chdir(files)
-    result = CliRunner().invoke(app, ["experiment", "city", *options])
-    assert result.exit_code == 2
-    assert said in result.output

@@ -1,12 +1,8 @@
 """The cells of the paper's tables, the report of the default profile, and cells selected by label."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.world.world import build_world
 from studies import paper, reports
 from studies.paper_values import PAPER_RANGE_M
@@ -26,23 +22,6 @@ def test_the_paper_profile_starts_at_the_truth_and_hears_whom_it_should() -> Non
     for node, heard in options["hears"].items():
         near = {o for o in position if o != node and np.hypot(*(position[o] - position[node])) <= PAPER_RANGE_M}
         assert abs(len(near) - len(heard)) <= 1 and len(near ^ set(heard)) <= 1  # offsets of centimetres
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["table2", "--networks", "nowhere"], "--networks nowhere: no file network_n1.csv in it"),
-        (["table1", "--only", "alpha=3"], "--only alpha=3: write it as label=value with one of seed, weights"),
-        (["table1", "--only", "weights=3"], "--only weights=3: no such cell; weights is one of 0.05"),
-    ],
-)
-def test_what_is_mistyped_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
-) -> None:
-    monkeypatch.setenv("PYTHONHASHSEED", "0")
-    result = CliRunner().invoke(app, ["experiment", *arguments, "--out", str(tmp_path / "out")])
-    assert result.exit_code == 2
-    assert message in result.output
 
 
 def made_up(rmse: dict[str, float]) -> list[dict[str, object]]:

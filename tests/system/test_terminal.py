@@ -16,10 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from emulator.cli.commands import app
 from emulator.drivers.control import ask, control_endpoint
 from emulator.drivers.status import Snapshot
-from emulator.terminal.console import run_app
 from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.screen import Screen
@@ -107,29 +105,6 @@ def test_the_docs_name_every_field(tmp_path: Path) -> None:
     assert progress.keys() - in_status == {"kind", "vehicles", "faults_acting"} | figures
     kinds = {line["kind"] for line in lines} | {"error"}
     assert kinds <= fields_in_the_docs("## JSON for machines")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["runn", "x"], "no such command 'runn'; did you mean 'run'?"),
-        (["run"], "missing argument 'SCENARIO' (vnet run --help says more)"),
-        (["run", "x", "--sed", "3"], "no such option: --sed; did you mean --seed or --set?"),
-        (["run", "x", "--seed", "y"], "invalid value for '--seed': a whole number is needed"),
-        (["run", "x", "y"], "got unexpected extra argument(s) (y)"),
-        (["analyze", "scenarios"], "scenarios: cannot be read: Is a directory; in it there are 80211p.toml"),
-        (["fault", "inject", "loss", "--set", "probabilty=1"], "fault: loss.probabilty: unknown key (did you mean"),
-    ],
-)
-def test_a_mistake_gets_one_line(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(ROOT)
-    assert run_app(app, arguments) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith(f"vnet: {said}")
-    assert told.err.count("\n") == 1
 
 
 def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:

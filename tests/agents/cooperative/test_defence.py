@@ -19,7 +19,6 @@ from emulator.drivers.simulate import simulate
 from emulator.scenario.scenario import Scenario
 from tests.support.recorded import prepared
 from vnet import Fix, Packet
-from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
 
 pytestmark = pytest.mark.slow
@@ -145,24 +144,6 @@ def test_a_lie_that_begins_late_does_not_poison_the_mean_of_before() -> None:
     for _ in range(40):
         town.run(1)
         assert np.linalg.norm(town.means()[1:] - town.estimates()[1:].mean(axis=0), axis=1).max() < 0.9
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"lie": "ofset"}, "program.options.lie = 'ofset': one of offset, overconfident, "),
-        ({"lie": "ofset"}, "(did you mean offset?)"),
-        ({"offset_m": [1.0]}, "program.options.offset_m = [1.0]: a list of 2 (each a number"),
-        ({"offset_m": [1.0, float("nan")]}, "program.options.offset_m = [1.0, nan]: a list of 2"),
-        ({"from_s": "later"}, "program.options.from_s = 'later': a number from"),
-        ({"particles": -1}, "program.options.particles = -1: a whole number from 0 to 100000 expected"),
-        ({"offset": 3}, "program.options.offset: unknown"),
-    ],
-)
-def test_a_wrong_option_of_the_attacker_is_one_line(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ProgramError) as caught:
-        Attack.split(options)
-    assert message in str(caught.value)
 
 
 def test_the_attackers_options_are_its_own_and_those_of_the_program_that_it_extends() -> None:

@@ -126,49 +126,6 @@ def test_old_foreign_and_future_frames_are_counted_and_left_out() -> None:
     assert subject.rejected == {"stale": 2, "length": 1}
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"fusoin": "none"},
-            "program.options.fusoin: unknown (did you mean fusion?); allowed: alpha, common_sigma_m",
-        ),
-        ({"roads_apart": True}, "program.options.roads_apart: renamed; use separate_map_update"),
-        (
-            {"fusion": "magic"},
-            "program.options.fusion = 'magic': one of optimized, random, metropolis, max-degree, ",
-        ),
-        ({"consensus": "exactly"}, "one of ratio, metropolis, max-degree, exact expected (did you mean exact?)"),
-        ({"profile": "mine"}, "program.options.profile = 'mine': one of default, paper expected"),
-        ({"relay": 1}, "program.options.relay = 1: true or false expected"),
-        ({"alpha": 1.01}, "program.options.alpha = 1.01: a number from 0 to 1 expected"),
-        (
-            {"start_m": [1.0]},
-            "program.options.start_m = [1.0]: a list of 2 (each a number from -327 to 327) expected",
-        ),
-        ({"start_m": [1.0, 400]}, "program.options.start_m = [1.0, 400]: a list of 2"),
-        (
-            {"hears": {"v1": ["v2"]}},
-            "program.options.hears = {'v1': ['v2']}: allowed with consensus = \"exact\" only",
-        ),
-        ({"hears": {"v1": "v2"}}, "program.options.hears.v1 = 'v2': a list (each text) expected"),
-        ({"hears": ["v1"]}, "program.options.hears = ['v1']: a table (each a list (each text)) expected"),
-        ({"common_sigma_m": float("inf")}, "program.options.common_sigma_m = inf: a number from 0 to 327 expected"),
-        ({"self_floor": 1.5}, "program.options.self_floor = 1.5: a number from 0 to 1 expected"),
-        ({"particles": "many"}, "program.options.particles = 'many': a whole number from 0 to 100000 expected"),
-        ({"particles": -1}, "program.options.particles = -1: a whole number from 0 to 100000 expected"),
-        ({"particles": True}, "program.options.particles = True: a whole number from 0 to 100000 expected"),
-        ({"lateral_tau_s": 0.0}, "program.options.lateral_tau_s = 0.0: a number above 0 expected"),
-        ({"common_tau_s": float("nan")}, "program.options.common_tau_s = nan: a number above 0 expected"),
-    ],
-)
-def test_a_wrong_option_is_one_line(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ProgramError) as caught:
-        Options.parse(options)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_the_papers_profile_sets_its_constants_and_what_is_set_besides_counts() -> None:
     options = Options.parse({"profile": "paper", "particles": 70})
     assert (options.particles, options.exchange, options.separate_map_update) == (70, "particles", True)

@@ -134,31 +134,6 @@ def test_shards_may_run_anywhere_and_the_last_makes_the_table(tmp_path: Path, in
     assert "3 runs: 3 valid" in second.output and len(in_this_process) == 3
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--vary", "radio.loss"], "--vary radio.loss: write it as KEY=VALUES"),
-        (["--vary", "radio.loss="], "radio.loss=: write its values with commas between"),
-        (["--vary", "radio.los=1,2"], "sweep, radio.los = 1: radio.los: unknown key (did you mean loss?)"),
-        (
-            ["--vary", "radio.loss=0", "--vary", "radio.loss=1"],
-            "--vary radio.loss: is given twice; write all values",
-        ),
-        (["--vary", "radio.loss=0,0.1,0"], "vary radio.loss: 0 is given twice"),
-        (["--shard", "3/2"], "--shard 3/2: write it as i/n"),
-        (["--executor", "ray"], "--executor ray: write it as dask://HOST:PORT"),
-    ],
-)
-def test_what_is_mistyped_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(command_app(command), ["beacon", *options])
-    assert result.exit_code == 2
-    assert message in result.output
-    assert not (tmp_path / "runs").exists()
-
-
 def test_confidence_intervals_are_those_of_student() -> None:
     assert mean_of([2.0]) == Mean(2.0, None, 1)
     three = mean_of([1.0, 2.0, 3.0])

@@ -268,36 +268,6 @@ def test_where_the_machine_did_not_keep_up_a_failed_own_check_is_unknown(recorde
     assert (found.verdict, found.text) == (Verdict.UNKNOWN, "too near; but the machine did not keep up")
 
 
-@pytest.mark.parametrize(
-    ("check", "said"),
-    [
-        ("own_checks.py:nothing", "program.checks = 'own_checks:nothing': module own_checks (/"),
-        (
-            "own_checks.py:number",
-            "program.checks = 'own_checks:number': is not a function of a run: def number(run)",
-        ),
-        ("own_checks.py:waiting", "program.checks = 'own_checks:waiting': is not a function of a run"),
-        (
-            "own_missing:check",
-            "program.checks = 'own_missing:check': cannot import: ModuleNotFoundError: No module",
-        ),
-        ("own_wrong.py", "program.checks = 'own_wrong:check': cannot import: SyntaxError: "),
-        ("own_program.py:check", "program.checks = 'own_program:check': is in the program's module: put it into"),
-    ],
-)
-@pytest.mark.parametrize("command", ["simulate", "run"])
-def test_a_check_that_cannot_be_used_ends_the_command_before_there_is_a_folder(
-    here: Path, command: str, check: str, said: str
-) -> None:
-    (here / "own_wrong.py").write_text("def check(:\n")
-    (here / "own_program.py").write_text("async def main(node):\n    pass\n\ndef check(run):\n    return []\n")
-    status, text = vnet(command, "own.toml", "--check", check, "--program", "own_program.py", "--out", "run")
-    (error,) = text.splitlines()[1:]  # after the run's name
-    assert status == 2
-    assert error.startswith(f"vnet: {said}")
-    assert not (here / "run").exists()
-
-
 def test_a_folder_is_judged_by_its_own_checks_as_recorded_and_nothing_is_imported(here: Path) -> None:
     simulate("sound", "broken")
     (here / "own_checks.py").write_text("raise AssertionError('imported')\n")

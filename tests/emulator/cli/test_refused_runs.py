@@ -8,7 +8,6 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cli.commands import app
-from emulator.terminal.console import run_app
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -24,11 +23,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A current folder with programs, one of which is good; this process forgets them."""
     programs = {
         "good": "async def main(node):\n    pass\n",
-        "wrong_syntax": "async def main(node:\n",
-        "lacks_module": "import none_such\n",
-        "raises_early": "raise ValueError('no key')\n",
         "leaves_early": "import os\nos._exit(7)\n",
-        "no_coroutine": "def main(node):\n    pass\n",
     }
     for name, code in programs.items():
         (tmp_path / f"{name}.py").write_text(code)
@@ -45,50 +40,11 @@ def vnet(*arguments: str) -> tuple[int, str]:
     return done.exit_code, done.stderr
 
 
-WRONG = [
-    (["--set", "radio.los=1"], "vnet: --set: radio.los: unknown key (did you mean loss?)"),
-    (["--set", "radio.loss=x"], "vnet: --set: radio.loss = 'x': a number is needed"),
-    (["--duration", "-1"], "vnet: --duration: run.duration_s = -1.0: must be greater than 0"),
-    (["--seed", "-1"], "vnet: --seed: run.seed = -1: must be greater than or equal to 0"),
-    (["--set", "run.seed=-1"], "vnet: --set: run.seed = -1: must be"),
-    (["--program", ""], "vnet: --program: program.entry = '': write it as package.module:function"),
-    (["--check", ""], "vnet: --check '': write it as my_checks.py:check"),
-    (["--program", "godo:main"], "No module named 'godo'"),
-    (["--program", "good:mainn"], "module good (good.py) has no 'mainn' (did you mean main?)"),
-    (["--program", "wrong_syntax:main"], "SyntaxError"),
-    (["--program", "lacks_module:main"], "No module named 'none_such'"),
-    (["--program", "raises_early:main"], "cannot import: ValueError: no key"),
-    (["--program", "no_coroutine:main"], "is not an async function"),
-    (["--rerun", "save", "--rerun-vehicle", "v99"], "--rerun-vehicle v99: no such vehicle"),
-    (["--rerun", "sve"], "--rerun sve"),
-    (["--set", 'fault=[{kind="kill", at_s=0.1, duration_s=0.1, nodes={ids=["v99"]}}]'], "v99"),
-]
-
-
-@pytest.mark.parametrize(
-    ("command", "options", "message"),
-    [("simulate", *each) for each in WRONG] + [("run", *each) for each in WRONG if each[0][0] == "--program"],
-    ids=lambda value: str(value)[:30],
-)
-def test_what_is_refused_leaves_nothing(command: str, options: list[str], message: str) -> None:
-    status, stderr = vnet(command, BEACON, *SHORT, *options)
-    assert (status, stderr.count("\n")) == (2, 1), stderr
-    assert message in stderr
+@pytest.mark.parametrize("command", ["run", "simulate"])
+def test_a_debugger_needs_a_terminal(command: str) -> None:
+    status, stderr = vnet(command, BEACON, "--duration", "1", "--debug", "v03")
+    assert status == 2 and stderr.endswith("--debug v03: needs a terminal on standard input and output\n")
     assert not Path("runs").exists()
-
-
-EMPTY = [
-    ["simulate", BEACON, "--out", ""],
-    *([command, ""] for command in ("simulate", "run", "campaign", "check")),
-]
-
-
-@pytest.mark.parametrize("arguments", EMPTY, ids=lambda words: words[0])
-def test_an_empty_path_is_none(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(app, arguments) == 2
-    stderr = capsys.readouterr().err
-    assert "'': a path is needed" in stderr
-    assert stderr.count("\n") == 1
 
 
 def test_users_of_a_run_are_made_for_its_program(here: Path) -> None:

@@ -94,26 +94,6 @@ def test_without_payloads_there_are_digests(bare: Path, capsys: pytest.CaptureFi
     assert line[0].endswith("has kept no payloads; set run.keep_payloads = true")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--node", "v9"], "--node v9: no such vehicle"),
-        (["--from", "2", "--to", "1"], "--to 1: must come after --from 2"),
-        (["--decode", "decode"], "--decode 'decode': write it as file.py:function or package.module:function"),
-        (
-            ["--decode", "decode.py"],
-            "--decode 'decode.py': write it as file.py:function or package.module:function",
-        ),
-        (["--decode", "nowhere:decode"], "--decode nowhere:decode: cannot import: ModuleNotFoundError"),
-    ],
-)
-def test_what_cannot_be_shown_is_one_line(
-    kept: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ((line, *_),) = trace(capsys, str(kept), *arguments, status=2)
-    assert said in line
-
-
 def test_exports_hold_what_was_kept(kept: Path, tmp_path: Path) -> None:
     recorded = RecordedRun.open(kept)
     capture, messages = io.BytesIO(), io.BytesIO()

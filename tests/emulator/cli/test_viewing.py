@@ -56,26 +56,6 @@ def test_what_was_there_stays_until_the_new_one_is_whole(watched: Watched, tmp_p
     assert not [path for path in folder.iterdir() if path.name.endswith(".part")]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["render", "NOWHERE"], "not a run's folder"),
-        (["view", "NOWHERE"], "not a run's folder"),
-        (["render", "RUN", "--out", "NOWHERE.rrd", "--rerun-vehicle", "v77"], "no such vehicle: v77"),
-        (["render", "RUN", "--out", "NOWHERE/x.rrd"], "there is no folder"),
-    ],
-)
-def test_what_cannot_be_is_said_in_one_line(
-    watched: Watched, tmp_path: Path, arguments: list[str], told: str
-) -> None:
-    places = {"RUN": str(watched.folder), "NOWHERE": str(tmp_path / "nowhere")}
-    given = [next((a.replace(k, v) for k, v in places.items() if k in a), a) for a in arguments]
-    status, output = vnet(*given)
-    assert status == 2
-    assert told in output
-    assert output.count("\n") == 1
-
-
 def test_nothing_asks_to_render_a_run_that_was_killed(watched: Watched, tmp_path: Path) -> None:
     for name in ("scenario.toml", "events.jsonl"):
         shutil.copy(watched.folder / name, tmp_path)

@@ -16,7 +16,6 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
-from vnet.errors import ScenarioError
 from vnet.runtime.programs import search_programs_in
 
 SAY = """
@@ -172,36 +171,6 @@ def test_given_folders_come_first_and_are_relative_to_the_scenario(here: Path) -
     assert loaded.folders == (here / "src", here)
 
 
-@pytest.mark.parametrize(
-    ("override", "said"),
-    [
-        ('program.entry="pp_no.py"', r"program.entry = 'pp_no.py': no such file in /.*/scenarios or in /"),
-        ('program.entry="pp-odd.py:main"', r"program.entry = 'pp-odd.py:main': not importable: name the file with"),
-        ('program.folders=["nowhere"]', r"program.folders: 'nowhere': no such folder"),
-        (
-            'program.entry="main"',
-            r"program.entry = 'main': write it as package.module:function, or as file.py:func",
-        ),
-        (
-            'program.checks=["x"]',
-            r"program.checks.0 = 'x': write it as package.module:function, or as file.py:func",
-        ),
-        (
-            'program={entry="pp_a.py", exceptions=[{entry="src/pp_a.py", nodes=["v01"]}]}',
-            r"there is another pp_a.py in .*src: rename one of them",
-        ),
-    ],
-)
-def test_what_cannot_be_found_is_named_in_one_line(here: Path, override: str, said: str) -> None:
-    for path in ("pp-odd.py", "pp_a.py", "src/pp_a.py"):
-        program(here / path, b"x")
-    key, _, value = override.partition("=")
-    if key == "program":
-        (here / "scenarios" / "own.toml").write_text(f"program = {value}\n")
-    with pytest.raises(ScenarioError, match=said):
-        load(*[] if key == "program" else [override])
-
-
 @pytest.mark.slow
 def test_an_option_is_short_for_a_key_of_the_scenario(here: Path) -> None:
     program(here / "pp_hello.py", b"x")
@@ -210,13 +179,6 @@ def test_an_option_is_short_for_a_key_of_the_scenario(here: Path) -> None:
     run = RecordedRun.open(Path("one"))
     assert run.scenario.program.options == {"size": 7, "word": "far away"}
     assert (run.value("size") == 7).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("option", ["size", "=7"])
-def test_an_option_without_key_or_value_is_refused(here: Path, option: str) -> None:
-    status, text = simulate("scenarios/own.toml", "--option", option)
-    assert (status, text) == (2, f"vnet: --option {option}: write it as KEY=VALUE, for example period_s=2\n")
 
 
 def test_folders_are_searched_last_and_those_of_another_run_no_more(here: Path) -> None:

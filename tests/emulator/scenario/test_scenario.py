@@ -63,39 +63,8 @@ def test_bytes_that_are_no_scenario_are_one_line(tmp_path: Path, folder: bool) -
     assert str(caught.value).startswith(f"{path}: {'cannot be read' if folder else 'not valid TOML'}")
 
 
-@pytest.mark.parametrize(
-    ("override", "parts"),
-    [
-        ("radio.loss=2", ["radio.loss = 2", "less than or equal to 1"]),
-        ("radio.loss=", ["radio.loss = ''", "number"]),
-        ("radio.loss=much", ["radio.loss = 'much'", "number"]),
-        ("radio.los=0.1", ["radio.los", "unknown key", "loss"]),
-        ('radio.mac={kind = "lte-mode4", one_sht = 1}', ["radio.mac.one_sht", "unknown key", "one_shot"]),
-        ("raido.loss=0.1", ["raido", "unknown key", "radio"]),
-        ("run.keep_payloads=yes", ["run.keep_payloads = 'yes'", "true or false"]),
-        ("run.pacing=fast", ["run.pacing = 'fast'", "'lockstep' or 'realtime'"]),
-    ],
-)
-def test_an_override_is_checked_like_the_file(tmp_path: Path, override: str, parts: list[str]) -> None:
-    path = write(tmp_path, "[radio]\nloss = 0.1")
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario(path, [override])
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(part in message for part in parts), message
-    assert str(path) not in message, "nothing is wrong with the file"
-
-
 def test_the_last_of_two_overrides_wins(tmp_path: Path) -> None:
     assert load_scenario(write(tmp_path, ""), ["run.seed=2", "run.seed=3"]).run.seed == 3
-
-
-@pytest.mark.parametrize("override", ["radio", "radio.loss", "loss=3", ".x=1", "radio.loss.x=1"])
-def test_a_wrong_override_says_how_it_is_written(tmp_path: Path, override: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario(write(tmp_path, "[radio]\nloss = 0.1"), [override])
-    assert override in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_dumped_scenario_is_the_same_scenario(tmp_path: Path) -> None:

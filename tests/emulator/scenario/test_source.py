@@ -67,11 +67,5 @@ def test_values_of_a_list_are_toml_or_bare_words(text: str, values: list[Any]) -
     assert parse_values("key", text) == values
 
 
-@pytest.mark.parametrize("text", ["", "1,,2", ","])
-def test_a_list_without_values_is_refused(text: str) -> None:
-    with pytest.raises(ScenarioError, match="write its values with commas between"):
-        parse_values("radio.loss", text)
-
-
 def test_overrides_are_one_line_each() -> None:
     assert as_overrides({"run.name": "ü\n", "radio.loss": 1}) == ['run.name="ü\\n"', "radio.loss=1"]

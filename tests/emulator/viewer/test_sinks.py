@@ -36,13 +36,6 @@ from vnet.transport import wire
 TIMEOUT_S = 60
 
 
-@pytest.fixture
-def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-
-
 @contextmanager
 def listening(port: int = 0) -> Iterator[int]:
     """Something that listens at a port of the loopback interface."""
@@ -72,29 +65,6 @@ def test_what_may_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (spawned.save, spawned.spawn, spawned.vehicle) == (Path("recording.rrd"), True, "v02")
     assert spawned.serve is not None
     assert spawned.inside(Path("runs/x")).save == Path("runs/x/recording.rrd")
-
-
-@pytest.mark.parametrize(
-    ("words", "address", "port", "live", "told"),
-    [
-        (["sve"], None, None, True, "--rerun sve: one or more of spawn, serve, save, off are allowed"),
-        (["off", "save"], None, None, True, "--rerun off,save: off excludes the others"),
-        (["spawn"], None, None, True, "--rerun spawn: there is no display here"),
-        (["serve"], "localhost", None, True, "--rerun-bind localhost: an IP address of this machine is wanted"),
-        (["serve"], "203.0.113.7", None, True, "cannot listen at 203.0.113.7"),
-        (["serve"], None, 65535, True, "--rerun-port 65535: cannot listen at 127.0.0.1, this port and the next"),
-        (["serve"], None, 0, True, "0 is no port"),
-        (["save"], "0.0.0.0", None, True, "are for --rerun serve"),
-        (["serve"], None, None, False, "a simulation is not watched: save it, and look at it with vnet view"),
-    ],
-)
-def test_what_is_refused(
-    no_display: None, words: list[str], address: str | None, port: int | None, live: bool, told: str
-) -> None:
-    with pytest.raises(VnetError) as refused:
-        choose_sinks(words, address, port, live=live)
-    assert told in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 def test_a_port_that_is_taken_is_passed_by_or_said() -> None:

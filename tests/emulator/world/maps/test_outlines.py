@@ -11,7 +11,7 @@ from emulator.world.buildings import Buildings
 from emulator.world.maps import files
 from emulator.world.maps.files import read_buildings
 from emulator.world.world import build_world
-from tests.support.maps import FRAME, ORIGIN, WAYS, collection, osm_xml, sumo_net
+from tests.support.maps import FRAME, ORIGIN, WAYS, collection, osm_xml
 from tests.support.motion import along, still, write_trips
 from vnet.errors import ScenarioError
 
@@ -111,19 +111,6 @@ def test_a_table_has_corners_in_metres(tmp_path: Path) -> None:
 
     found = read_buildings(path, lambda: pytest.fail("no degrees"))
     assert rings(found) == [[list(p) for p in HOUSE], [[60, 10], [70, 10], [70, 20]]]
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("b.poly.xml", "line 2: <net>: a file of SUMO's polygons starts with <additional>"),
-        ("b.net.xml", r"no buildings are read from it; allowed are \*.csv"),
-    ],
-)
-def test_a_network_of_sumo_has_no_buildings(tmp_path: Path, name: str, message: str) -> None:
-    (tmp_path / name).write_text(sumo_net())
-    with pytest.raises(ScenarioError, match=message):
-        read_buildings(tmp_path / name, lambda: FRAME)
 
 
 def test_the_corners_of_all_parts_of_a_multipolygon_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -173,47 +173,8 @@ def test_a_csv_file_of_other_bytes_is_refused(tmp_path: Path, text: str | bytes,
     assert named in refusal(write(tmp_path, "t.csv", text))
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        (("<fcd-export", "<routes"), "line 2: element 'routes'"),
-        (('time="1.00"', 'time="-1"'), "line 7: a: time_s = -1 after 0"),
-        (('time="1.00"', 'time="0"'), "line 7: a has two positions"),
-        (('time="1.00"', 'time="soon"'), "line 6: time = 'soon'"),
-        (('x="10.0"', 'x="nan"'), "line 7: x_m = nan"),
-        ((' x="10.0"', ""), "line 7: no x"),
-        ((' id="b"', ""), "line 8: a vehicle without id"),
-        (("</fcd-export>", ""), "not an XML file: no element found"),
-        (("</timestep>", "</timestop>"), "mismatched tag: line 5"),
-        (("<fcd-export", '<!DOCTYPE fcd-export [<!ENTITY a "b">]>\n<fcd-export'), "line 2: a document type"),
-        ((FCD, "<fcd-export/>"), "no samples"),
-        ((FCD, ""), "no element found"),
-    ],
-)
-def test_a_wrong_fcd_file_is_refused_with_its_line(tmp_path: Path, change: tuple[str, str], named: str) -> None:
-    assert named in refusal(write(tmp_path, "fcd.xml", FCD.replace(*change)))
-
-
-def test_a_wrong_matrix_is_refused_with_its_array(tmp_path: Path) -> None:
+def test_a_matrix_of_objects_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.npz"
-    good = {"x_m": np.zeros((2, 3)), "y_m": np.ones((2, 3)), "rate_hz": 10}
-    for change, named in (
-        ({"x_m": None}, "no array 'lat_deg'"),
-        ({"rate_hz": None}, "no array 'rate_hz'"),
-        ({"rate_hz": 0}, "rate_hz = 0"),
-        ({"y_m": np.ones((2, 4))}, "matrices of one shape"),
-        ({"x_m": np.zeros(3), "y_m": np.zeros(3)}, "matrices of one shape"),
-        ({"x_m": np.array([["a"]])}, "numbers are needed"),
-        ({"x_m": np.array([[0, np.nan, 1], [0, 0, 0]])}, "row 1: x_m = nan"),
-        ({"heading_rad": np.zeros((2, 2))}, "heading_rad is (2, 2)"),
-        ({"id": np.array(["a"])}, "1 ids for 2 rows"),
-        ({"id": np.array(["a", "a"])}, "appears twice"),
-        ({"id": np.array(["a", "b\x07"])}, "row 2: id = 'b\\x07'"),
-        ({"x_m": np.full((2, 3), np.nan), "y_m": np.full((2, 3), np.nan)}, "no samples"),
-    ):
-        arrays: dict[str, Any] = {name: value for name, value in {**good, **change}.items() if value is not None}
-        np.savez(path, **arrays)
-        assert named in refusal(path), change
     pickled = np.array([[{"a": 1}]], dtype=object)
     np.savez(path, x_m=pickled, y_m=pickled, rate_hz=1)
     assert "not an NPZ file" in refusal(path)
