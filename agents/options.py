@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
@@ -19,13 +20,19 @@ def parse(options: Mapping[str, Any], kind: type[S], renamed: Mapping[str, str] 
     `renamed` has the new names of keys that had another. Raises ProgramError, in one line, with the key, its value
     and what is allowed.
     """
-    fields = {field.name: field for field in msgspec.structs.fields(kind)}
+    fields = _fields_of(kind)
     values = {}
     for key, value in options.items():
         if key not in fields:
             raise ProgramError(f"program.options.{key}: {_unknown(key, fields, renamed or {})}")
         values[key] = _convert(key, value, fields[key].type)
     return kind(**values)
+
+
+@cache  # asked for each vehicle, and a millisecond each time
+def _fields_of(kind: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
+    """Return the fields of a class by name."""
+    return {field.name: field for field in msgspec.structs.fields(kind)}
 
 
 def refuse(key: str, value: object, expected: str) -> ProgramError:

@@ -30,11 +30,12 @@ evaluations may be rare: in each step of 0.1 s the map is evaluated for half the
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Protocol
 
 import numpy as np
+import scipy  # its parts are imported when they are first used: `special` takes a third of a second
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr
 
 from agents.cooperative.cmm.common_error import CommonErrorParticles
 from agents.cooperative.cmm.tracks import SAME_TIME_S, Rows, Tracks
@@ -78,31 +79,30 @@ def log_on_lane(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
     result = np.log(inside, out=inside)
     if far.any():
         # log(Φ(a) − Φ(b)) = log Φ(a) + log(1 − Φ(b)/Φ(a)), a > b.
-        upper = log_ndtr(near[far])
-        result[far] = upper + np.log1p(-np.exp(log_ndtr(beyond[far]) - upper))
+        upper = scipy.special.log_ndtr(near[far])
+        result[far] = upper + np.log1p(-np.exp(scipy.special.log_ndtr(beyond[far]) - upper))
     return np.asarray(result)
 
 
+@cache
 def _parabolas() -> tuple[Array, Array, Array]:
     """Return the parabolas through Φ at the start, the middle and the end of each step of the table, by powers."""
-    value = ndtr(np.arange(-2 * STEPS * REACH, 2 * STEPS * REACH + 1) / (2 * STEPS))
+    value = scipy.special.ndtr(np.arange(-2 * STEPS * REACH, 2 * STEPS * REACH + 1) / (2 * STEPS))
     start, middle, end = value[:-1:2], value[1::2], value[2::2]
     slope, bend = 4 * middle - 3 * start - end, 2 * (start - 2 * middle + end)
     slope[[0, -1]] = bend[[0, -1]] = 0.0  # what is beyond the table gets its first or last step, and is constant
     return start.copy(), slope, bend
 
 
-_START, _SLOPE, _BEND = _parabolas()
-
-
 def normal_cdf(x: Array) -> Array:
     """Return Φ(x) by table, off by less than 2·10⁻⁹, and for x ≥ −FAR_SIGMAS by less than 5·10⁻⁷ of its value."""
+    start, slope, bend = _parabolas()
     fraction = x + REACH
     fraction *= STEPS
     step = fraction.astype(np.intp)
     fraction -= step
-    value = _BEND.take(step, mode="clip")
-    for coefficient in (_SLOPE, _START):
+    value = bend.take(step, mode="clip")
+    for coefficient in (slope, start):
         value *= fraction
         value += coefficient.take(step, mode="clip")
     return np.asarray(value)
@@ -110,7 +110,7 @@ def normal_cdf(x: Array) -> Array:
 
 def log_left_of_edge(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
     """Return log P(not beyond the right-hand edge): the paper's lane is the half-plane n·(p − p_lane) < h."""
-    return np.asarray(log_ndtr((half_width_m - offset_m) / sigma_m))
+    return np.asarray(scipy.special.log_ndtr((half_width_m - offset_m) / sigma_m))
 
 
 def candidate_lanes(

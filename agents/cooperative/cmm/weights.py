@@ -9,15 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-import osqp
-import scipy.sparse as sp
+import scipy  # its parts are imported when they are first used: with OSQP they take a third of a second
 from numpy.typing import NDArray
 
 from agents.cooperative.cmm.information import inverted
 from vnet.errors import VnetError
 from vnet.types import Array
+
+if TYPE_CHECKING:
+    import osqp
 
 RIDGE_FLOOR_M2 = 0.01
 """Least ridge (m²): an estimate that claims to be exact does not take all the weight."""
@@ -94,10 +97,12 @@ class OptimizedWeights:
             if len(self._solvers) >= MAX_SOLVERS:
                 self._solvers.clear()
             rows, columns = _upper_triangle(count)
-            hessian = sp.csc_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-            constraints = sp.vstack([np.ones((1, count)), sp.eye(count)], format="csc")
+            hessian = scipy.sparse.csc_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+            constraints = scipy.sparse.vstack([np.ones((1, count)), scipy.sparse.eye(count)], format="csc")
             lower = np.zeros(count + 1)
             lower[0], lower[1] = 1.0, self._self_floor
+            import osqp  # slow to import, and few runs need it
+
             solver = osqp.OSQP()
             solver.setup(hessian, np.zeros(count), constraints, lower, np.ones(count + 1), **_SETTINGS)
             self._solvers[count] = solver
