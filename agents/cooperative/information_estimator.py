@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from types import MappingProxyType
 
 import numpy as np
@@ -243,7 +243,7 @@ class InformationEstimator:
         self, weights: Sequence[float], priors: Sequence[Five], now: Sequence[Five], before: Sequence[Five]
     ) -> None:
         """Replace what is known of c by pooled `priors`, and increments of this period and the one before."""
-        about_c = [increment for increment in (*now, *before) if not is_of_lane(increment)]
+        about_c = [increment for increment in (*now, *before) if increment[2] >= 0]
         if not (self._lanes and self._lanes.has_joined):
             if self.imported:
                 self.own.absorb(_pooled(weights, priors, about_c))
@@ -319,7 +319,7 @@ class InformationEstimator:
         """
         if not priors:
             return False
-        far = sum(share < 1 for share in self._prior_shares)
+        far = len(self._prior_shares) - self._prior_shares.count(1.0)
         contradicted = len(priors) >= LOST_NEIGHBOURS and 2 * far > len(priors)
         self._contradicted = self._contradicted + 1 if contradicted else 0
         if self._contradicted < LOST_PERIODS:
@@ -417,12 +417,18 @@ class InformationEstimator:
         self._reject("forged", forged)
         origins, increments, has_joined = [], [], self._lanes is not None and self._lanes.has_joined
         for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):
-            if share < 1:
-                of_lane = is_of_lane(increment)
-                if has_joined and not of_lane:
-                    continue  # c has moved since, which precise receivers see
-                origins.append(code)
-                increments.append(scaled_by(increment, (1.0 if of_lane else PASSED_SHARE) * (1 - share)))
+            if share >= 1:
+                continue
+            a, b, d, x, y = increment
+            if d < 0:
+                increment = scaled_by(increment, 1 - share)
+            elif has_joined:
+                continue  # c has moved since, which precise receivers see
+            else:
+                factor = PASSED_SHARE * (1 - share)
+                increment = factor * a, factor * b, factor * d, factor * x, factor * y
+            origins.append(code)
+            increments.append(increment)
         if not origins or not self._options.defence:
             return increments
         x, y, p, q, r = self.own.plain_moments
@@ -492,18 +498,18 @@ class Passing:
         That is the sum of the `weights` of the senders that list it. With `defence` what forged frames list is not
         counted; the second value is their number.
         """
-        shares = _shares(set(self._used), listed, weights)
-        names = {record[:NAME_BYTES] for record in shares}
-        if len(names) == len(shares) and names.isdisjoint([record[:NAME_BYTES] for record in self._used]):
+        shares = _shares(frozenset(self._used), listed, weights)
+        records = [*shares, *self._used]
+        if len({record[:NAME_BYTES] for record in records}) == len(records):
             return shares, 0
         forged = _forged(self._used, listed) if defence else set()
         new, listed = _one_an_origin(self._used, listed, forged)
-        return {record: share for record, share in _shares(set(), listed, weights).items() if record in new}, len(
-            forged
-        )
+        return {
+            record: share for record, share in _shares(frozenset(), listed, weights).items() if record in new
+        }, len(forged)
 
 
-def _shares(known: set[bytes], listed: Sequence[Records], weights: Sequence[float]) -> dict[bytes, float]:
+def _shares(known: Set[bytes], listed: Sequence[Records], weights: Sequence[float]) -> dict[bytes, float]:
     """Return the sum of the weights of the frames that list a record, for those that are not known."""
     shares: dict[bytes, float] = {}
     for weight, records in zip(weights, listed, strict=True):

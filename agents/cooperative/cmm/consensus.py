@@ -138,9 +138,9 @@ class Peers:
             for peer in [peer for peer, received in self._received.items() if received < oldest]:
                 self.drop(peer)
         received, hears_us, node, now = self._received, self._hears_us, self._node, self._round
-        for peer, share in shares.items():
+        for peer, (_, _, _, heard) in shares.items():
             received[peer] = now
-            hears = node in share.heard
+            hears = node in heard
             if hears_us.get(peer) is not hears:
                 hears_us[peer] = hears
                 self._heard = self._mutual = None
@@ -155,6 +155,7 @@ class RatioConsensus:
         """Begin outside of any epoch. `rejected` counts shares by reason: `implausible_mass`, `banned`."""
         self._node = node
         self._config = config or ConsensusConfig()
+        self._gate_m = self._config.gate_m
         self._rejected = Counter() if rejected is None else rejected
         self._penalties: dict[str, tuple[float, int]] = {}  # penalty, and the epoch up to which it accounts
         self.epoch = 0
@@ -188,9 +189,9 @@ class RatioConsensus:
         shares, added = self._believed(x, y, shares)
         self._peers.listen(shares)
         self._highest = max(self._highest, _newest_epoch(shares))
-        if self._follow(x, y):
-            each = ((peer, self._added(peer, share)) for peer, share in shares.items())
-            added = {peer: mass for peer, mass in each if mass is not None}
+        if self._follow(x, y):  # nothing has been seen of the new epoch
+            each = ((peer, share) for peer, share in shares.items() if share.epoch == self.epoch)
+            added = {peer: share.running_sum for peer, share in each if self._node in share.out_neighbours}
         s_x, s_y, w = self._mass
         for peer in sorted(added):
             more_x, more_y, more_w = added[peer]
@@ -217,21 +218,22 @@ class RatioConsensus:
                 p: (penalty - leak, epoch) for p, (penalty, epoch) in self._penalties.items() if penalty > leak
             }
         self._penalize_new_epochs(shares)
-        gate_m, penalties = self._config.gate_m, self._penalties
+        gate_m, penalties, present, node, seen = self._gate_m, self._penalties, self.epoch, self._node, self._seen
         believed: dict[str, Share] = {}
         added: dict[str, Triple] = {}
         for peer, share in shares.items():
             if penalties and self._penalty(peer) > self._config.ban_penalty:
                 self._rejected["banned"] += 1
                 continue
-            mass = self._added(peer, share)
-            if mass is not None:
-                s_x, s_y, w = mass
+            epoch, (s_x, s_y, w), out_neighbours, _ = share
+            if epoch == present and node in out_neighbours:
+                seen_x, seen_y, seen_w = seen.get(peer, _NO_MASS)
+                s_x, s_y, w = s_x - seen_x, s_y - seen_y, w - seen_w
                 if w < 0 or not math.hypot(s_x - w * x, s_y - w * y) <= gate_m * (w + MIN_MASS):
                     self._rejected["implausible_mass"] += 1
-                    self._penalize(peer, self._config.ban_penalty, share.epoch)
+                    self._penalize(peer, self._config.ban_penalty, epoch)
                     continue
-                added[peer] = mass
+                added[peer] = s_x, s_y, w
             believed[peer] = share
         return believed, added
 
@@ -256,14 +258,6 @@ class RatioConsensus:
             self._penalties[peer] = penalty, epoch
         if penalty > self._config.ban_penalty:
             self._peers.drop(peer)
-
-    def _added(self, peer: str, share: Share) -> Triple | None:
-        """Return the mass that a peer has given this node since its last sum, None if it gives it nothing."""
-        if share.epoch != self.epoch or self._node not in share.out_neighbours:
-            return None
-        s_x, s_y, w = share.running_sum
-        seen_x, seen_y, seen_w = self._seen.get(peer, _NO_MASS)
-        return s_x - seen_x, s_y - seen_y, w - seen_w
 
     def _follow(self, x: float, y: float) -> bool:
         """Start a new epoch where one is due, otherwise add the change of the input (x, y); tells which."""

@@ -48,11 +48,11 @@ MAX_ORIGINS = 1024
 Belief = tuple[Sequence[float], Three]
 """Mean (x, y) in m and covariance (xx, xy, yy) in m² of what is believed about c."""
 
-Ten = tuple[float, float, float, float, float, float, float, float, float, float]
-"""Sums of an origin's increments: Λ C (xx, xy, yx, yy) with P = C Cᵀ, r = η − Λ x, Λ (xx, xy, yy), their number."""
+Sums = tuple[float, float, float, float, float, float, float, float, float, float, float]
+"""A time, and the sums of an origin's increments then: Λ C (xx, xy, yx, yy) with P = C Cᵀ, r = η − Λ x, Λ (xx, xy,
+yy), their number."""
 _TINY = 1e-300
 """Least squared deviation: that of an increment which says nothing is 0."""
-_NO_SUMS: Ten = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 # An increment may be that of a lane (`lane_memory`), with a negative third number.
 # For the few dozens of a period plain numbers take less time than arrays, and are the same on each processor.
@@ -60,9 +60,12 @@ _NO_SUMS: Ten = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 def scaled_down(information: Sequence[Five], largest_trace: float) -> list[Five]:
     """Return pieces of information with traces of at most `largest_trace`; means stay."""
+    traces = traces_of(information)
+    if max(traces, default=0.0) <= largest_trace:
+        return [*information]
     return [
         numbers if trace <= largest_trace else scaled_by(numbers, largest_trace / trace)
-        for numbers, trace in zip(information, traces_of(information), strict=True)
+        for numbers, trace in zip(information, traces, strict=True)
     ]
 
 
@@ -181,7 +184,7 @@ class Origins:
     """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
 
     def __init__(self) -> None:
-        self._sums: dict[int, tuple[float, Ten]] = {}  # their time, and what they were then
+        self._sums: dict[int, Sums] = {}
         self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
 
     def __len__(self) -> int:
@@ -203,21 +206,35 @@ class Origins:
         (mean_x, mean_y), covariance_m2 = belief
         c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
         then_s, keep, keep_2 = now_s, 1.0, 1.0
+        nothing: Sums = (now_s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         shares = []
         for code, (a, b, d, x, y) in zip(codes, increments, strict=True):
             # The terms of the deviation, which may be summed up; Λ is the covariance of r given c.
             m_xx, m_xy, m_yx, m_yy = a * c_xx + b * c_yx, b * c_yy, b * c_xx + d * c_yx, d * c_yy
             x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
-            since_s, (n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count) = sums.get(code, (now_s, _NO_SUMS))
+            since_s, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count = sums.get(code, nothing)
             if since_s != then_s:  # for most the same
                 then_s, keep = since_s, math.exp((since_s - now_s) / MEMORY_S)
                 keep_2 = keep * keep  # covariances of sums whose parts have decayed
             n_xx, n_xy, n_yx, n_yy = m_xx + keep * n_xx, m_xy + keep * n_xy, m_yx + keep * n_yx, m_yy + keep * n_yy
             n_x, n_y, count = x + keep * n_x, y + keep * n_y, 1.0 + keep * count
             n_a, n_b, n_d = a + keep_2 * n_a, b + keep_2 * n_b, d + keep_2 * n_d
-            sums[code] = now_s, (n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count)
-            in_sum = _squared(n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d)
-            alone = _squared(m_xx, m_xy, m_yx, m_yy, x, y, a, b, d)
+            sums[code] = now_s, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count
+            # `_squared` of the sum and of the increment, written out: it would be called most of all functions.
+            n_a += n_xx * n_xx + n_xy * n_xy
+            n_b += n_xx * n_yx + n_xy * n_yy
+            n_d += n_yx * n_yx + n_yy * n_yy
+            more = 1e-4 * (n_a + n_d) + 1e-9
+            n_a += more
+            n_d += more
+            in_sum = (n_d * n_x * n_x - 2 * n_b * n_x * n_y + n_a * n_y * n_y) / (n_a * n_d - n_b * n_b)
+            a += m_xx * m_xx + m_xy * m_xy
+            b += m_xx * m_yx + m_xy * m_yy
+            d += m_yx * m_yx + m_yy * m_yy
+            more = 1e-4 * (a + d) + 1e-9
+            a += more
+            d += more
+            alone = (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
             share = 1.0
             if not (alone < INCREMENT_GATE and (in_sum < SUM_GATE or in_sum < _sum_gate(count))):
                 share = min(INCREMENT_GATE / max(alone, _TINY), _sum_gate(count) / max(in_sum, _TINY))
@@ -237,20 +254,22 @@ class Origins:
             self._leans = _newest(self._leans, now_s)
         off_m: list[tuple[float, float]] = []
         leans: list[bool] = []
-        then_s, keep = now_s, 1.0
+        _, _, own_xx, own_xy, own_yy = own
+        middle_x, middle_y = middle_m
+        leans_of, unknown, then_s, keep = self._leans, (now_s, 0.0, 0.0), now_s, 1.0
         for code, (mean_x, mean_y, xx, xy, yy) in zip(codes, priors, strict=True):
             # The deviation in terms of what is claimed: C⁻¹ off with C Cᵀ the sum of both covariances.
-            root_xx = math.sqrt(xx + own[2])
-            root_yx = (xy + own[3]) / root_xx
-            root_yy = math.sqrt(yy + own[4] - root_yx * root_yx)
-            off_x, off_y = mean_x - middle_m[0], mean_y - middle_m[1]
+            root_xx = math.sqrt(xx + own_xx)
+            root_yx = (xy + own_xy) / root_xx
+            root_yy = math.sqrt(yy + own_yy - root_yx * root_yx)
+            off_x, off_y = mean_x - middle_x, mean_y - middle_y
             x = off_x / root_xx
             y = (off_y - root_yx * x) / root_yy
-            since_s, lean_x, lean_y = self._leans.get(code, (now_s, 0.0, 0.0))
+            since_s, lean_x, lean_y = leans_of.get(code, unknown)
             if since_s != then_s:  # for most the same
                 then_s, keep = since_s, math.exp((since_s - now_s) / MEMORY_S)
             lean_x, lean_y = x + keep * (lean_x - x), y + keep * (lean_y - y)
-            self._leans[code] = now_s, lean_x, lean_y
+            leans_of[code] = now_s, lean_x, lean_y
             squared = lean_x * lean_x + lean_y * lean_y
             is_leaning = squared > LEAN_LIMIT**2
             if is_leaning:
