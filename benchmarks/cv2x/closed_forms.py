@@ -9,8 +9,11 @@ resource while neither has announced its selection. A selection is announced by 
 the middle of the interval on average. So a second vehicle selects unannounced after a first one with probability
 1/2, and as often before it: once in L² periods for two vehicles. Each takes one of the A resources that are free to
 it, the same with probability 1 / A, and they collide until one of them selects again: after E[min(life, life)]
-periods. So a frame meets no other with probability (1 - E[min] / (L² A))^(V - 1). Like the model of Cao et al.
-(arXiv 2309.16680) it counts events of selection; it is derived here, because their formulas were not at hand.
+periods. So a frame meets no other with probability (1 - E[min] / (L² A))^(V - 1).
+
+**The model of Cao et al.** (arXiv 2309.16680, equations 8 and 12, as a public program that uses them restates them;
+the paper itself was not at hand) counts each selection of another vehicle in the interval before and after one's own,
+and the whole life of a resource as lost. So it has about twice as many collisions, until saturation.
 
 With one subchannel all collisions are between vehicles in one slot, which hear nothing of each other.
 """
@@ -81,6 +84,22 @@ def meets(case: Case) -> float:
     return float(1 - (1 - both / (mean**2 * free)) ** (case.vehicles - 1))
 
 
+def meets_by_cao(case: Case) -> float | None:
+    """Return the probability that a frame meets another by Cao et al.; None if dynamic, or if resources are kept.
+
+    With n others, π = 1 / (1 + E[C]) and A = M - n + P n / 2 free resources (two frames share one that collides) it
+    is the fixed point P = 1 - (1 - 2 π / A)^n.
+    """
+    if case.keep != 0:
+        return None
+    others, selects = case.vehicles - 1, 1 / (1 + float(COUNTERS.mean()))
+    meets_another = 0.0
+    for _ in range(100):
+        free = case.resources - others + meets_another * others / 2
+        meets_another = 1 - (1 - 2 * selects / free) ** others
+    return meets_another
+
+
 def measured(case: Case, seconds: float, seed: int = 1) -> float:
     """Return the share of frames that meet another on their resource in a run of the engine."""
     mac: dict[str, Any] = {
@@ -122,7 +141,9 @@ CASES = [
     Case(20, keep=0.4),
     Case(20, keep=0.8),
     Case(20, re_evaluation=True),
+    Case(20, subchannels=2),
     Case(40, subchannels=2),
+    Case(80, subchannels=2),
     Case(20, keep=None),
     Case(40, keep=None),
     Case(40, subchannels=2, keep=None),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.cv2x import closed_forms, dot11p
-from benchmarks.cv2x.closed_forms import COUNTERS, Case, lives, measured, meets
+from benchmarks.cv2x.closed_forms import COUNTERS, Case, lives, measured, meets, meets_by_cao
 from benchmarks.cv2x.highway import Setting, deviations, drive, mode4_radio, published, together
 
 CURVES = {
@@ -72,6 +72,13 @@ def test_closed_forms_grow_with_the_load_and_fall_with_the_resources() -> None:
     assert meets(Case(10)) < meets(Case(20)) < meets(Case(40))
     assert meets(Case(20, subchannels=2)) < meets(Case(20)) < meets(Case(20, keep=None))
     assert len({case.name for case in closed_forms.CASES}) == len(closed_forms.CASES)
+
+
+@pytest.mark.parametrize("vehicles", [2, 20, 40])
+def test_the_model_of_cao_is_twice_the_closed_form_while_resources_are_free(vehicles: int) -> None:
+    theirs = meets_by_cao(Case(vehicles, subchannels=2))
+    assert theirs is not None and 1.5 <= theirs / meets(Case(vehicles, subchannels=2)) <= 2.5
+    assert meets_by_cao(Case(vehicles, keep=None)) is None
 
 
 def test_published_files_are_read(tmp_path: Path) -> None:
