@@ -12,8 +12,8 @@ it, the same with probability 1 / A, and they collide until one of them selects 
 periods. So a frame meets no other with probability (1 - E[min] / (L² A))^(V - 1).
 
 **The model of Cao et al.** (arXiv 2309.16680, equations 8 and 12, as a public program that uses them restates them;
-the paper itself was not at hand) counts each selection of another vehicle in the interval before and after one's own,
-and the whole life of a resource as lost. So it has about twice as many collisions, until saturation.
+the paper itself was not at hand) counts each selection of another vehicle in the interval before and after one's
+own, and the whole life of a resource as lost. So it has about twice as many collisions, until saturation.
 
 With one subchannel all collisions are between vehicles in one slot, which hear nothing of each other.
 """
