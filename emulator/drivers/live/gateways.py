@@ -122,8 +122,6 @@ class Gateways:
         self._closing: dict[str, asyncio.Task[None]] = {}
         """Gateways that are being closed, whose endpoints the next of their vehicles needs."""
         self._tasks: set[asyncio.Task[None]] = set()
-        self._vehicle_of: dict[str, str] = {}
-        """Vehicle of each process of a command."""
         self.on_state: Callable[[str], None] = lambda text: None
         """Told which endpoints wait for programs."""
         self.endpoints: dict[str, str] = {}
@@ -216,25 +214,23 @@ class Gateways:
 
     def signal(self, name: str, number: signal.Signals) -> None:
         """Send a signal to the commands of a vehicle."""
-        for process in self._names_of(name):
-            self._launcher.signal_group(process, number)
         if (vehicle := self._vehicles.get(name)) is not None:
+            for process in vehicle.names:
+                self._launcher.signal_group(process, number)
             vehicle.is_paused = number == signal.SIGSTOP
             self._flush_soon(vehicle)
 
     def kill(self, name: str) -> None:
         """End a vehicle's commands and its gateway at once."""
-        for process in self._forget_commands(name):
+        for process in self._close(name):
             self._launcher.kill(process)
-        self._close(name)
 
     def detach(self, name: str) -> Callable[[float], None]:
         """Have a vehicle's commands end; returns what waits so many seconds for it, and kills them then."""
-        processes = self._forget_commands(name)
+        processes = self._close(name)
         for process in processes:
             self._launcher.signal_group(process, signal.SIGTERM)
         waits = [self._launcher.detach(process) for process in processes]
-        self._close(name)
 
         def wait_or_kill(patience_s: float) -> None:
             for wait in waits:
@@ -251,10 +247,10 @@ class Gateways:
 
     def takes_end(self, name: str, how: Exit) -> bool:
         """Take the end of a command; it is the end of its vehicle if its status says that it has failed."""
-        node = self._vehicle_of.pop(name, None)
-        vehicle = None if node is None else self._vehicles.get(node)
-        if node is None or vehicle is None or name not in vehicle.names:
-            return node is not None
+        vehicle = next((each for each in self._vehicles.values() if name in each.names), None)
+        if vehicle is None:
+            return False
+        node = vehicle.gateway.node_id
         vehicle.names.remove(name)
         if how.status != 0:
             self._spawn(self._end(node))
@@ -269,21 +265,14 @@ class Gateways:
     async def _end(self, node: str) -> None:
         await asyncio.to_thread(self.detach(node), SHUT_DOWN_S)
 
-    def _names_of(self, node: str) -> list[str]:
-        vehicle = self._vehicles.get(node)
-        return [] if vehicle is None else list(vehicle.names)
-
-    def _forget_commands(self, node: str) -> list[str]:
-        names = self._names_of(node)
-        for name in names:
-            self._vehicle_of.pop(name, None)
-        return names
-
-    def _close(self, node: str) -> None:
+    def _close(self, node: str) -> list[str]:
+        """Close a vehicle's gateway; return the names of the processes of its commands, which are its no more."""
         vehicle = self._vehicles.pop(node, None)
-        if vehicle is not None:
-            vehicle.on_air = False
-            self._closing[node] = asyncio.ensure_future(vehicle.gateway.close())
+        if vehicle is None:
+            return []
+        vehicle.on_air = False
+        self._closing[node] = asyncio.ensure_future(vehicle.gateway.close())
+        return vehicle.names
 
     def restart_endpoints(self, down_s: float) -> None:
         """Close the routers of all vehicles, and open them again at their endpoints after so long."""
@@ -352,7 +341,6 @@ class Gateways:
                 words = filled_in(_located(words), node, endpoint)
                 self._launcher.start_command(name, words, environment, vehicle.nice)
                 vehicle.names.append(name)
-                self._vehicle_of[name] = node
         except VnetError as error:
             self._say_hello(vehicle, failure=str(error))
 
@@ -385,9 +373,16 @@ class Gateways:
     def _take_turn(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
             self._send_early(vehicle, time.monotonic_ns())
-            self._acknowledge(vehicle)
-            self._renew_tokens(vehicle)
-            self._tell_clock(vehicle)
+            self._repeat(vehicle, 1.0, self._flush)
+            self._repeat(vehicle, self._settings.liveliness_s, self._renew_tokens)
+            if self._ros2 is not None:
+                self._repeat(vehicle, 1 / self._ros2.clock_hz, self._tell_clock)
+
+    def _repeat(self, vehicle: _Vehicle, period_s: float, act: Callable[[_Vehicle], None]) -> None:
+        """Do something now and once a period, while a vehicle is there."""
+        if self._is_there(vehicle):
+            act(vehicle)
+            self._loop.call_later(period_s, self._repeat, vehicle, period_s, act)
 
     def _send_early(self, vehicle: _Vehicle, arrived_ns: int) -> None:
         early, vehicle.early = vehicle.early, {}
@@ -396,21 +391,12 @@ class Gateways:
                 self._transmit(vehicle, message, arrived_ns)
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:
-        if self._ros2 is not None and self._is_there(vehicle):
-            vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end
-            self._loop.call_later(1 / self._ros2.clock_hz, self._tell_clock, vehicle)
-
-    def _acknowledge(self, vehicle: _Vehicle) -> None:
-        if self._is_there(vehicle):
-            self._flush(vehicle)
-            self._loop.call_later(1.0, self._acknowledge, vehicle)
+        vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end
 
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
-        if self._is_there(vehicle):
-            vehicle.gateway.forget_tokens(self._now_ns())
-            if (tokens := vehicle.gateway.tokens()) is not None and not vehicle.is_paused:
-                self._transmit(vehicle, tokens, time.monotonic_ns())
-            self._loop.call_later(self._settings.liveliness_s, self._renew_tokens, vehicle)
+        vehicle.gateway.forget_tokens(self._now_ns())
+        if (tokens := vehicle.gateway.tokens()) is not None and not vehicle.is_paused:
+            self._transmit(vehicle, tokens, time.monotonic_ns())
 
     def _is_there(self, vehicle: _Vehicle) -> bool:
         return self._vehicles.get(vehicle.gateway.node_id) is vehicle and vehicle.on_air

@@ -19,8 +19,9 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from functools import cache, partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
@@ -73,7 +74,7 @@ _ABSENT = ("_asyncio", "_queue")
 _SHARED = ("vnet", "agents", "emulator", "greenlet")
 
 
-_shared_code = cache(SourceFileLoader.get_code)
+_shared_code: Callable[[SourceFileLoader, str], Any] = cache(SourceFileLoader.get_code)
 _present: ContextVar[ProgramModules | None] = ContextVar("vnet_zenoh_program", default=None)
 
 
@@ -86,8 +87,17 @@ class OwnModules(dict[str, ModuleType]):
 
     def __setitem__(self, name: str, module: ModuleType) -> None:
         super().__setitem__(name, module)
+        parent, _, child = name.rpartition(".")
+        if parent in self:  # at once: Python would find those that are being loaded in its own `sys.modules`
+            setattr(self[parent], child, module)
         if not _is_own_copy(name) and name not in self._shown and show(name, _present_module):
             self._shown.add(name)
+
+    def __delitem__(self, name: str) -> None:
+        super().__delitem__(name)
+        parent, _, child = name.rpartition(".")
+        if parent in self:
+            vars(self[parent]).pop(child, None)
 
     def close(self) -> None:
         """Have none of them found any more."""
@@ -112,12 +122,11 @@ class ProgramModules:
         if "ros2" in node.options:
             self.environ["ROS_DOMAIN_ID"] = str(node.options["ros2"]["domain"])
         self.modules = OwnModules()
-        self._builtins = {**vars(builtins), "__import__": self._import, "input": _no_input}
         self._facades: dict[str, Callable[[], ModuleType]] = {
             "_thread": self.threads.module,
             "atexit": self._atexit,
             "datetime": self._datetime,
-            "importlib": lambda: Facade(importlib, import_module=self._import_module, __import__=self._import),
+            "importlib": self._importlib,
             "os": self._os,
             "select": lambda: Facade(select, select=_select),
             "signal": lambda: Facade(signal, **self.process.signal_functions()),
@@ -132,6 +141,8 @@ class ProgramModules:
             "threading": self._prepare_threading,
             "uuid": _prepare_uuid,
         }
+        own_import = _import_on(self.load("sys"), self.load)
+        self._builtins = {**vars(builtins), "__import__": own_import, "input": _no_input}
 
     # Running.
 
@@ -210,10 +221,7 @@ class ProgramModules:
             self.load(parent)
             if name in self.modules:
                 return self.modules[name]
-        module = self._load_new(name)
-        if parent and (package := self.modules.get(parent)) is not None:
-            setattr(package, name.rpartition(".")[2], module)
-        return module
+        return self._load_new(name)
 
     def _load_new(self, name: str) -> ModuleType:
         top = name.partition(".")[0]
@@ -238,11 +246,7 @@ class ProgramModules:
     def _find(self, name: str) -> ModuleSpec | None:
         parent = name.rpartition(".")[0]
         path = list(self.load(parent).__path__) if parent else self.path
-        for finder in sys.meta_path:
-            spec = finder.find_spec(name, path)
-            if spec is not None:
-                return spec
-        return None
+        return next(filter(None, (finder.find_spec(name, path) for finder in sys.meta_path)), None)
 
     def _is_compiled(self, top: str) -> bool:
         spec = self._find(top)
@@ -255,48 +259,22 @@ class ProgramModules:
         vars(module)["__builtins__"] = self._builtins
         try:
             if isinstance(spec.loader, SourceFileLoader):  # else a folder without code
-                code: Any = _shared_code(spec.loader, name) if _is_own_copy(name) else spec.loader.get_code(name)
-                exec(code, vars(module))
+                get_code: Any = _shared_code if _is_own_copy(name) else SourceFileLoader.get_code
+                exec(get_code(spec.loader, name), vars(module))
         except BaseException:
-            self.modules.pop(name, None)
+            del self.modules[name]
             raise
         if (prepare := self._preparations.get(name)) is not None:
             prepare(module)
         return self.modules.get(name, module)
 
-    def _import(
-        self,
-        name: str,
-        globals: dict[str, Any] | None = None,
-        locals: object = None,
-        fromlist: Iterable[str] | None = (),
-        level: int = 0,
-    ) -> ModuleType:
-        """Do as `__import__`."""
-        if level:
-            package = (globals or {}).get("__package__") or ""
-            if not package:
-                raise ImportError("attempted relative import with no known parent package")
-            name = importlib.util.resolve_name("." * level + name, package)
-        module = self.load(name)
-        if not fromlist:
-            return module if level else self.load(name.partition(".")[0])
-        if hasattr(module, "__path__"):
-            wanted = list(fromlist)
-            for each in wanted + (list(getattr(module, "__all__", ())) if "*" in wanted else []):
-                if each != "*" and not hasattr(module, each):
-                    try:
-                        # Python would find those that are being loaded in its own `sys.modules`.
-                        setattr(module, each, self.load(f"{name}.{each}"))
-                    except ModuleNotFoundError as error:
-                        if error.name != f"{name}.{each}":
-                            raise
-        return module
-
-    def _import_module(self, name: str, package: str | None = None) -> ModuleType:
-        return self.load(importlib.util.resolve_name(name, package))
-
     # Modules of which the program has others.
+
+    def _importlib(self) -> ModuleType:
+        def import_module(name: str, package: str | None = None) -> ModuleType:
+            return self.load(importlib.util.resolve_name(name, package))
+
+        return Facade(importlib, import_module=import_module, __import__=self._builtins["__import__"])
 
     def _sys(self) -> ModuleType:
         own: dict[str, Any] = {
@@ -375,13 +353,7 @@ class ProgramModules:
                 at = datetime.datetime.fromtimestamp((EPOCH_NS + node.now_ns) / NS_PER_S, zone)
                 return at if tz else at.replace(tzinfo=None)
 
-            @classmethod
-            def utcnow(cls) -> Any:
-                return cls.now()
-
-            @classmethod
-            def today(cls) -> Any:
-                return cls.now()
+            utcnow = today = now
 
         class Day(datetime.date, metaclass=Alike):
             @classmethod
@@ -439,6 +411,15 @@ class ProgramModules:
 
         module.ProcessPoolExecutor = ProcessPoolExecutor
         module._base.LOGGER.addFilter(lambda _: not isinstance(sys.exception(), GreenletExit))
+
+
+def _import_on(sys: ModuleType, load: Callable[[str], ModuleType]) -> Callable[..., ModuleType]:
+    """Return Python's own `__import__`, run again for the modules of a program: those of its `sys`."""
+    system: Any = ModuleType("importlib._bootstrap")
+    loader = SourceFileLoader(system.__name__, str(Path(importlib.__file__).with_name("_bootstrap.py")))
+    exec(_shared_code(loader, system.__name__), vars(system))
+    vars(system).update(sys=sys, _warnings=warnings, _find_and_load=lambda name, import_: load(name))
+    return system.__import__  # type: ignore[no-any-return]
 
 
 def _present_module(name: str) -> ModuleType | None:

@@ -14,6 +14,7 @@ import zenoh.shm
 
 from vnet.errors import ProgramError
 from vnet.gateway.emulated import advanced, queries, sessions, values
+from vnet.gateway.emulated.facade import Facade
 from vnet.gateway.emulated.modules import ProgramModules
 from vnet.gateway.emulated.values import Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
@@ -31,19 +32,17 @@ _EMULATED = (values, queries, sessions, advanced)
 
 def _own_names(real: ModuleType) -> dict[str, Any]:
     """Return what stands here for names of one of Zenoh's modules."""
-    found = {}
-    for name in vars(real):
-        for module in _EMULATED:
-            own = vars(module).get(name)
-            if getattr(own, "__module__", "") == module.__name__:
-                found[name] = own
-    return found
+    return {
+        name: own
+        for module in _EMULATED
+        for name, own in vars(module).items()
+        if name in vars(real) and getattr(own, "__module__", "") == module.__name__
+    }
 
 
 def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, ModuleType]:
     """Return the package `zenoh` of a program, by the names of its modules."""
     outlet = Outlet(vehicle.due, program.threads)
-    config = type("Config", (values.Config,), {"environ": program.environ})
 
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
         if timestamp_callback is not None:
@@ -53,20 +52,16 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
     def scout(handler: Any = None, what: Any = None, config: zenoh.Config | None = None) -> sessions.Scout:
         return sessions.Scout(vehicle, outlet, handler, what)
 
-    handlers, ext, package = (ModuleType(name) for name in ("zenoh.handlers", "zenoh.ext", "zenoh"))
-    vars(handlers).update(_own_names(zenoh.handlers), Callback=zenoh.handlers.Callback)
-    vars(ext).update({name: value for name, value in vars(zenoh.ext).items() if not name.startswith("_")})
-    vars(ext).update(_own_names(zenoh.ext))
     # Values that Python can construct are Zenoh's own.
-    vars(package).update({name: value for name, value in vars(zenoh).items() if not name.startswith("_")})
-    vars(package).update(_own_names(zenoh))
-    vars(package).update({name: refused(name, reason) for name, reason in REFUSED.items()})
-    vars(package).update(
+    handlers, ext = (Facade(real, **_own_names(real)) for real in (zenoh.handlers, zenoh.ext))
+    own = _own_names(zenoh) | {name: refused(name, reason) for name, reason in REFUSED.items()}
+    own["Config"] = type("Config", (values.Config,), {"environ": program.environ})
+    package = Facade(
+        zenoh,
+        **own,
         __path__=[],
         ext=ext,
         handlers=handlers,
-        shm=zenoh.shm,
-        Config=config,
         open=open_session,
         scout=scout,
         try_init_log_from_env=lambda: None,
