@@ -20,8 +20,9 @@ from vnet.gateway.frames import (
     Reassembly,
     crossing_query,
 )
-from vnet.gateway.keys import OWN_KEYS
-from vnet.gateway.ros2 import MOST_KEYS, Ros2
+from vnet.gateway.keys import FIX_KEY, OWN_KEYS, RADIO_KEYS, fix_content
+from vnet.gateway.ros2 import MOST_KEYS, ROS2_KEYS, Ros2
+from vnet.node import Fix
 from vnet.units import NS_PER_S
 
 TOKEN_PERIODS = 3
@@ -31,13 +32,17 @@ Q = TypeVar("Q")
 
 
 class RadioSide(ABC, Generic[Q]):
-    """Common part of a gateway and of emulated sessions; `Q` are their queries."""
+    """Common part of a gateway and of emulated sessions; `Q` are their queries.
+
+    `keys` cross the radio; None stands for those that do if a scenario says nothing.
+    """
 
     def __init__(
-        self, node_id: str, keys: Sequence[str], query_s: float, liveliness_s: float, ros2: Ros2 | None
+        self, node_id: str, keys: Sequence[str] | None, query_s: float, liveliness_s: float, ros2: Ros2 | None
     ) -> None:
-        self.node_id, self._keys, self._query_s, self._ros2 = node_id, keys, query_s, ros2
-        self._expressions = [zenoh.KeyExpr(key) for key in keys]
+        self.node_id, self._query_s, self._ros2 = node_id, query_s, ros2
+        self._keys = keys or (RADIO_KEYS if ros2 is None else ROS2_KEYS)
+        self._expressions = [zenoh.KeyExpr(key) for key in self._keys]
         self._reassembly = Reassembly()
         self._queries: dict[int, Q] = {}
         """Queries of this vehicle to which replies are awaited."""
@@ -52,6 +57,17 @@ class RadioSide(ABC, Generic[Q]):
         if key.startswith(OWN_KEYS) or (self._ros2 is not None and not self._ros2.crosses(key)):
             return False
         return any(each.intersects(key) for each in self._expressions)
+
+    def show_fix(self, fix: Fix) -> None:
+        """Put a fix of the vehicle's receiver at its programs."""
+        self._publish(FIX_KEY, fix_content(fix))
+        if self._ros2 is not None:
+            self._publish(*self._ros2.fix(fix))
+
+    def show_clock(self, time_ns: int) -> None:
+        """Tell the programs emulated time, as ROS 2 does."""
+        if self._ros2 is not None:
+            self._publish(*self._ros2.clock(time_ns))
 
     def keep(self, query: Q) -> CrossingQuery:
         """Keep a query for as long as replies are awaited; return what crosses the radio."""
@@ -99,6 +115,10 @@ class RadioSide(ABC, Generic[Q]):
         for key in [*before, *after]:
             if (key in before) != (key in after):
                 self._show_token(key, is_there=key in after)
+
+    @abstractmethod
+    def _publish(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Put a sample of vnet's own at the programs."""
 
     @abstractmethod
     def _conclude(self, query: Q) -> object:

@@ -33,11 +33,10 @@ from vnet.gateway.frames import (
     crossing_sample,
     sample_options,
 )
-from vnet.gateway.keys import FIX_KEY, REPORT_KEY, fix_content
+from vnet.gateway.keys import REPORT_KEY
 from vnet.gateway.radio_side import RadioSide
-from vnet.gateway.ros2 import Published, Ros2
+from vnet.gateway.ros2 import Ros2
 from vnet.transport.session import open_local_router, router_endpoint
-from vnet.transport.wire import WireFix
 
 MOST_SOURCES = 100_000
 """Instances of `SourceInfo` that are kept for samples on their way."""
@@ -60,7 +59,7 @@ class Gateway(RadioSide[zenoh.Query]):
     """
 
     def __init__(
-        self, node: str, keys: Sequence[str], settings: ZenohSessions, hear: Hear, ros2: Ros2 | None = None
+        self, node: str, keys: Sequence[str] | None, settings: ZenohSessions, hear: Hear, ros2: Ros2 | None = None
     ) -> None:
         super().__init__(node, keys, settings.query_s, settings.liveliness_s, ros2)
         self._settings, self._tell_run = settings, hear
@@ -201,22 +200,9 @@ class Gateway(RadioSide[zenoh.Query]):
         if self._session is not None:
             super().hear_tokens(sender, tokens, time_ns)
 
-    def show_fix(self, fix: WireFix) -> None:
-        """Put a fix of the vehicle's receiver at its programs."""
+    def _publish(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
         if self._session is not None:
-            self._session.put(FIX_KEY, fix_content(fix.fix()), allowed_destination=REMOTE)
-            if self._ros2 is not None:
-                self._publish(self._ros2.fix(fix.fix()))
-
-    def show_clock(self, time_ns: int) -> None:
-        """Tell the programs emulated time, as ROS 2 does."""
-        if self._session is not None and self._ros2 is not None:
-            self._publish(self._ros2.clock(time_ns))
-
-    def _publish(self, sample: Published) -> None:
-        assert self._session is not None
-        key, payload, attachment = sample
-        self._session.put(key, payload, attachment=attachment, allowed_destination=REMOTE)
+            self._session.put(key, payload, attachment=attachment, allowed_destination=REMOTE)
 
     def _show(self, sample: CrossingSample) -> None:
         assert self._session is not None

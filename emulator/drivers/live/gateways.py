@@ -34,8 +34,8 @@ from emulator.scenario.program import PYTHON
 from vnet.errors import ProgramError, VnetError, first_names, shown
 from vnet.gateway import filled_in
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
-from vnet.gateway.keys import RADIO_KEYS, REPORT_KEY
-from vnet.gateway.ros2 import ROS2_KEYS, Ros2
+from vnet.gateway.keys import REPORT_KEY
+from vnet.gateway.ros2 import Ros2
 from vnet.radio import SentFrame
 from vnet.reports import Report, Reporter
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
@@ -112,7 +112,6 @@ class Gateways:
         self._emulation, self._launcher, self._starts = emulation, launcher, starts
         self._program, self._settings = scenario.program, scenario.program.sessions
         self._ros2 = scenario.radio.ros2
-        self._keys = scenario.radio.keys or (RADIO_KEYS if self._ros2 is None else ROS2_KEYS)
         self._hear, self._tell, self._time_ns, self._changes = hear, tell, time_ns, changes
         self._loop = asyncio.get_running_loop()
         self._check(emulation.world.node_ids)
@@ -165,7 +164,7 @@ class Gateways:
         """Open the gateways of these vehicles, and start their commands."""
         for (node,) in groups:
             rules = None if self._ros2 is None else Ros2(node, self._ros2.inside, self._ros2.domain)
-            gateway = Gateway(node, self._keys, self._settings, self._hear, rules)
+            gateway = Gateway(node, self._emulation.scenario.radio.keys, self._settings, self._hear, rules)
             vehicle = self._vehicles[node] = _Vehicle(next(self._numbers), gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 
@@ -358,7 +357,7 @@ class Gateways:
         if max(late_ns, default=0) >= wire.LATENESS_LIMIT_NS:
             vehicle.late.append((batch.seq, now_ns))
         for fix in batch.fixes:
-            vehicle.gateway.show_fix(fix)
+            vehicle.gateway.show_fix(fix.fix())
         for packet in batch.packets:
             try:
                 vehicle.gateway.hear(packet.sender, packet.payload, now_ns)

@@ -16,8 +16,7 @@ from vnet.gateway import filled_in
 from vnet.gateway.emulated.modules import ENDPOINT
 from vnet.gateway.emulated.programs import run_program
 from vnet.gateway.emulated.vehicle import Vehicle
-from vnet.gateway.keys import RADIO_KEYS
-from vnet.gateway.ros2 import ROS2_KEYS, Ros2
+from vnet.gateway.ros2 import Ros2
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -35,9 +34,9 @@ async def main(node: Node) -> None:
     commands: Sequence[Sequence[str]] = node.options["command"]
     topics: Mapping[str, Any] | None = node.options.get("ros2")
     ros2 = None if topics is None else Ros2(node.id, topics["inside"], topics["domain"])
-    keys = node.options.get("keys", RADIO_KEYS if ros2 is None else ROS2_KEYS)
-    vehicle = Vehicle(node, keys, node.options.get("query_s", 1.0), node.options.get("liveliness_s", 1.0), ros2)
-    clock = [] if ros2 is None or topics is None else [vehicle.tell_clock(ros2, topics["clock_hz"])]
+    query_s, liveliness_s = (node.options.get(name, 1.0) for name in ("query_s", "liveliness_s"))
+    vehicle = Vehicle(node, node.options.get("keys"), query_s, liveliness_s, ros2)
+    clock = [] if topics is None else [vehicle.tell_clock(topics["clock_hz"])]
     background = [Task(each, loop=loop) for each in [*vehicle.tasks(), *clock]]
     try:
         async with asyncio.TaskGroup() as tasks:

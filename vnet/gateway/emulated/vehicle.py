@@ -45,7 +45,7 @@ from vnet.gateway.frames import (
     crossing_reply,
     crossing_sample,
 )
-from vnet.gateway.keys import FIX_KEY, REPORT_KEY, fix_content
+from vnet.gateway.keys import FIX_KEY, REPORT_KEY
 from vnet.gateway.radio_side import RadioSide
 from vnet.gateway.ros2 import MOST_KEYS, Ros2
 from vnet.node import Node
@@ -57,7 +57,7 @@ class Vehicle(RadioSide[Asking]):
     """The sessions of one vehicle, and its radio."""
 
     def __init__(
-        self, node: Node, keys: Sequence[str], query_s: float, liveliness_s: float, ros2: Ros2 | None = None
+        self, node: Node, keys: Sequence[str] | None, query_s: float, liveliness_s: float, ros2: Ros2 | None = None
     ) -> None:
         super().__init__(node.id, keys, query_s, liveliness_s, ros2)
         self.node = node
@@ -323,18 +323,15 @@ class Vehicle(RadioSide[Asking]):
         await self._locates.wait()
         self.node.gnss.drain()
         async for fix in self.node.gnss:
-            self._publish(FIX_KEY, fix_content(fix))
-            if self._ros2 is not None:
-                self._publish(*self._ros2.fix(fix))
+            self.show_fix(fix)
 
-    async def tell_clock(self, ros2: Ros2, clock_hz: float) -> None:
+    async def tell_clock(self, clock_hz: float) -> None:
         """Tell the sessions emulated time, as ROS 2 does."""
         while True:
-            self._publish(*ros2.clock(self.node.now_ns))
+            self.show_clock(self.node.now_ns)
             await asyncio.sleep(1 / clock_hz)
 
     def _publish(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
-        """Take a sample of vnet's own to the sessions."""
         sample = Sample(
             key_of(key),
             zenoh.ZBytes(payload),

@@ -23,6 +23,8 @@ pytestmark = pytest.mark.slow
 PATIENCE_S = 60.0
 QUIET = ZenohSessions()
 
+FIX = WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None, 3.0).fix()
+
 
 class Vehicle:
     """A gateway and its radio: frames reach all of `others`, unless `is_lost` says so of their number."""
@@ -303,7 +305,7 @@ def test_bytes_that_a_fault_has_changed_harm_nobody() -> None:
 def test_a_program_hears_its_fixes_and_reports_by_keys_of_vnet() -> None:
     async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
         fixes = listen(sessions[0], FIX_KEY)
-        vehicles[0].gateway.show_fix(WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None, 3.0))
+        vehicles[0].gateway.show_fix(FIX)
         fix = msgspec.msgpack.decode((await fixes.get()).payload.to_bytes())
         assert (fix["position_m"], fix["covariance_m2"], fix["speed_m_s"]) == ([1, 2], [[1, 0], [0, 1]], 3)
         content = msgspec.msgpack.encode({"speed": 3.0})
@@ -350,7 +352,7 @@ def test_topics_services_and_tokens_of_ros_2_cross_or_stay_inside_with_each_othe
             answers = await asyncio.to_thread(lambda: list(sessions[0].get(key(name), target=target)))  # noqa: B023
             assert len(answers) == count
         vehicles[0].gateway.show_clock(5)
-        vehicles[0].gateway.show_fix(WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None, 3.0))
+        vehicles[0].gateway.show_fix(FIX)
         assert str((await own.get()).key_expr).startswith("0/vnet/fix/")
         assert seen.empty() and heard.empty()
         assert len(vehicles[0].frames) == 3  # message, token, query
