@@ -154,15 +154,16 @@ class _Town:
     Vehicles move within their district. The cost is the L1 distance between the sorted degrees and the target, plus
     `SPLIT_COST` if a district is not connected.
 
-    Positions are numbers of Python, and a vehicle's links are the bits of one: a call of numpy would take longer
-    than the few that a move changes.
+    A vehicle's links are the bits of one number. The distance follows from how many more vehicles than targets have
+    at most each degree: it is the sum of these numbers without their signs, of which a move changes a few.
     """
 
     SPLIT_COST = 8.0
 
     def __init__(self, rng: np.random.Generator, vehicles: int) -> None:
         self._rng = rng
-        self._target: list[int] = _target_degrees(vehicles).tolist()
+        target = _target_degrees(vehicles)
+        self._least_cost = int(target.sum()) % 2  # the sum of all degrees is even
         self._components = _COMPONENTS.get(vehicles, (vehicles,))
         district = np.repeat(np.arange(len(self._components)), self._components)
         side_m = TOWN_SIDE_M * np.sqrt(np.array(self._components) / 50)
@@ -175,17 +176,19 @@ class _Town:
         offset = position_m[:, None] - position_m[None]
         linked = np.hypot(offset[..., 0], offset[..., 1]) <= REFERENCE_RANGE_M
         np.fill_diagonal(linked, False)
-        self._position_m: list[tuple[float, float]] = [(x_m, y_m) for x_m, y_m in position_m.tolist()]
+        self._x_m, self._y_m = position_m.T.copy()
         self._bounds_m: list[list[float]] = np.column_stack([low_m, high_m]).tolist()
         self._links = [sum(1 << other for other in np.flatnonzero(row).tolist()) for row in linked]
-        self._degree = [links.bit_count() for links in self._links]
+        self._degree: list[int] = linked.sum(axis=1).tolist()
+        more = np.bincount(self._degree, minlength=vehicles) - np.bincount(target, minlength=vehicles)
+        self._excess: list[int] = np.cumsum(more).tolist()
+        self._distance: int = sum(map(abs, self._excess))
         self.cost = self._cost()
 
     def _cost(self) -> float:
-        cost = sum(abs(degree - target) for degree, target in zip(sorted(self._degree), self._target, strict=True))
-        if cost <= self.SPLIT_COST and self._is_split():
-            return cost + self.SPLIT_COST
-        return cost
+        if self._distance <= self.SPLIT_COST and self._is_split():
+            return self._distance + self.SPLIT_COST
+        return self._distance
 
     def _is_split(self) -> bool:
         """Return true if a district is not connected; districts lie too far apart to merge."""
@@ -204,28 +207,27 @@ class _Town:
 
     def anneal(self) -> Array:
         """Move single vehicles by the Metropolis rule until the cost is least; return the best positions (N, 2)."""
-        best_m, best_cost = self._position_m.copy(), self.cost
-        least_cost = sum(self._target) % 2  # the sum of all degrees is even
+        best_m, best_cost = np.column_stack([self._x_m, self._y_m]), self.cost
         for move in range(_ANNEALING_MOVES):
-            if best_cost == least_cost:
+            if best_cost == self._least_cost:
                 break
             temperature = 1.5 * (1 - move / _ANNEALING_MOVES) ** 2
             self._try_move(temperature)
             if self.cost < best_cost:
-                best_m, best_cost = self._position_m.copy(), self.cost
-        return np.array(best_m)
+                best_m, best_cost = np.column_stack([self._x_m, self._y_m]), self.cost
+        return best_m
 
     def _try_move(self, temperature: float) -> None:
         rng = self._rng
-        vehicle = int(rng.integers(len(self._position_m)))
+        vehicle = int(rng.integers(len(self._links)))
         step_m = REFERENCE_RANGE_M * (0.1, 0.4, 1.2)[int(rng.integers(3))]
-        (x_m, y_m), (east, north) = self._position_m[vehicle], rng.normal(size=2).tolist()
+        east, north = rng.normal(size=2).tolist()
         random_draw = rng.random()
-        new_m = x_m + step_m * east, y_m + step_m * north
+        x_m, y_m = float(self._x_m[vehicle]) + step_m * east, float(self._y_m[vehicle]) + step_m * north
         low_x_m, low_y_m, high_x_m, high_y_m = self._bounds_m[vehicle]
-        if not (low_x_m <= new_m[0] <= high_x_m and low_y_m <= new_m[1] <= high_y_m):
+        if not (low_x_m <= x_m <= high_x_m and low_y_m <= y_m <= high_y_m):
             return
-        old_links, links = self._links[vehicle], self._links_at(vehicle, *new_m)
+        old_links, links = self._links[vehicle], self._links_at(vehicle, x_m, y_m)
         if links != old_links:
             self._link(vehicle, links)
             cost = self._cost()
@@ -233,24 +235,30 @@ class _Town:
                 self._link(vehicle, old_links)
                 return
             self.cost = cost
-        self._position_m[vehicle] = new_m
+        self._x_m[vehicle], self._y_m[vehicle] = x_m, y_m
 
     def _links_at(self, vehicle: int, x_m: float, y_m: float) -> int:
         """Return the links that a vehicle has at a position."""
-        links, bit, most_m2 = 0, 1, REFERENCE_RANGE_M**2
-        for other_x_m, other_y_m in self._position_m:
-            east_m, north_m = other_x_m - x_m, other_y_m - y_m
-            if east_m * east_m + north_m * north_m <= most_m2:
-                links |= bit
-            bit <<= 1
-        return links & ~(1 << vehicle)
+        east_m, north_m = self._x_m - x_m, self._y_m - y_m
+        in_range = east_m * east_m + north_m * north_m <= REFERENCE_RANGE_M**2
+        in_range[vehicle] = False
+        return int.from_bytes(np.packbits(in_range, bitorder="little").tobytes(), "little")
 
     def _link(self, vehicle: int, links: int) -> None:
         """Give a vehicle these links, and no others."""
-        changed = self._links[vehicle] ^ links
-        self._links[vehicle], self._degree[vehicle] = links, links.bit_count()
+        all_links, degree, excess = self._links, self._degree, self._excess
+        changed, all_links[vehicle] = all_links[vehicle] ^ links, links
         while changed:
             other = changed.bit_length() - 1
             changed ^= 1 << other
-            self._links[other] ^= 1 << vehicle
-            self._degree[other] = self._links[other].bit_count()
+            all_links[other] ^= 1 << vehicle
+            for each in (vehicle, other):
+                had = degree[each]
+                if links >> other & 1:
+                    degree[each] = had + 1
+                    excess[had] -= 1
+                    self._distance += 1 if excess[had] < 0 else -1
+                else:
+                    degree[each] = had - 1
+                    excess[had - 1] += 1
+                    self._distance += 1 if excess[had - 1] > 0 else -1
