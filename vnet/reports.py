@@ -24,6 +24,7 @@ COVARIANCE_TOLERANCE = 1e-6
 """Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
 LARGEST_EXACT = 2**53
 """Integers below it are numbers of double precision."""
+_FLOAT = np.dtype(float)
 NoteDetail = bool | int | float | str
 """Value of a detail of an event."""
 
@@ -53,7 +54,10 @@ def checked_detail(name: str, value: object) -> NoteDetail:
 
 def checked_numbers(name: str, value: ArrayLike, size: int | None = None) -> list[float]:
     try:
-        flat: list[float] = np.asarray(value, dtype=float).ravel().tolist()
+        if type(value) is np.ndarray and value.dtype == _FLOAT:
+            flat: list[float] = value.ravel().tolist()
+        else:
+            flat = np.asarray(value, dtype=float).ravel().tolist()
     except OverflowError:
         raise ValueError(
             f"report({name}={shown(value)}): a number within ±{sys.float_info.max:.2g} is expected"
@@ -94,16 +98,18 @@ def check_name(name: str) -> None:
 def checked_value(name: str, value: ArrayLike) -> Value:
     if name.endswith("covariance_m2"):
         return checked_covariance(name, value)
+    if type(value) is float:
+        return value
+    if type(value) is int and abs(value) < LARGEST_EXACT:
+        return float(value)
+    if type(value) is np.ndarray and value.ndim:
+        return checked_numbers(name, value)
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     if isinstance(value, str):
         if len(value) > LONGEST_TEXT:
             raise ValueError(f"report({name}=…): text of {len(value)} characters, at most {LONGEST_TEXT} allowed")
         return str(value)
-    if type(value) is float:
-        return value
-    if type(value) is int and abs(value) < LARGEST_EXACT:
-        return float(value)
     flat = checked_numbers(name, value)
     return flat[0] if np.ndim(value) == 0 else flat
 
@@ -126,8 +132,10 @@ class Reporter:
         estimate = None if estimate_m is None else checked_numbers("estimate_m", estimate_m, 2)
         covariance = None if covariance_m2 is None else checked_covariance("covariance_m2", covariance_m2)
         named = {name: checked_value(name, value) for name, value in values.items()}
+        is_text = self._is_text
         for name, kept in named.items():
-            self._check_kind(name, kept)
+            if is_text.get(name) is not isinstance(kept, str):
+                self._check_kind(name, kept)
         return Report(
             time_ns=time_ns,
             node=self._node,
