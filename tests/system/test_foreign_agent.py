@@ -212,10 +212,6 @@ def test_what_is_no_message_is_judged(vnet: Vnet, mistake: str, pacing: str, che
     ("options", "told"),
     [
         (each_wrong("KnowsNoWindows"), "speaks version 1 of the messages"),
-        (("--agent", "./agent {endpoint} {run} {node}"), "the command has no {credentials}"),
-        (("--agent", f"./no-such-agent {' '.join(GIVEN)}"), "'./no-such-agent': no such command"),
-        ((*EACH_FOREIGN, "--hosts", "1"), "--agent excludes"),
-        ((*EACH_FOREIGN, "--set", "run.nodes_per_process=2"), "needs a process for each vehicle"),
         (("--agent", f"{sys.executable} -c 'print(1); exit(4)' {' '.join(GIVEN)}"), "(exit status 4): 1"),
     ],
 )

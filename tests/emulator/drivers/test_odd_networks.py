@@ -30,8 +30,15 @@ def run(folder: Path, data: dict[str, Any]) -> list[Any]:
 
 
 @pytest.mark.parametrize("odd", ODD)
-@pytest.mark.parametrize("program", ["cooperative", "centralized"])
-@pytest.mark.parametrize("options", [{}, {"relay": False, "exchange": "particles"}, {"particles": 1}])
+@pytest.mark.parametrize(
+    ("program", "options"),
+    [
+        ("centralized", {}),
+        ("cooperative", {}),
+        ("cooperative", {"relay": False, "exchange": "particles"}),
+        ("cooperative", {"particles": 1}),
+    ],
+)
 def test_odd_networks_are_run(tmp_path: Path, odd: str, program: str, options: dict[str, Any]) -> None:
     entry = {"entry": f"agents.{program}:main", "options": options}
     rows = run(tmp_path / "run", {**ODD[odd], "program": entry})

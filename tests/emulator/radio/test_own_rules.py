@@ -59,7 +59,7 @@ def test_a_dropped_frame_is_a_fault_by_the_rule_s_name_while_it_acts() -> None:
     ],
     ids=["block", "delay", "range", "duplicate", "nothing"],
 )
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 2**40), loss=st.sampled_from([0.0, 0.3]), peers=st.sampled_from([2, 100]))
 def test_a_rule_that_answers_as_a_built_in_fault_does_gives_the_same_receptions(
     own: dict[str, Any], built_in: dict[str, Any], seed: int, loss: float, peers: int
