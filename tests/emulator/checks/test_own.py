@@ -21,6 +21,7 @@ from emulator.records.verdicts import CheckResult, NotExercised, Verdict
 from emulator.report.write import write_report
 from emulator.scenario.program import Program
 from tests.emulator.checks.test_judge import run as simulate_in
+from tests.support.answers import answers
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
@@ -179,33 +180,14 @@ def test_what_goes_wrong_is_unknown(recorded: RecordedRun, function: str, name: 
     assert found.text.startswith(text)
 
 
-@pytest.mark.parametrize(
-    ("answer", "text"),
-    [
-        (None, "answers None: results are needed, as (name, verdict, text)"),
-        ({"a": 1}, "answers {'a': 1}: results are needed"),
-        ([], "yields no result"),
-        ([True], "yields True: a result is (name, verdict, text)"),
-        ([("a", "valid")], "yields ('a', 'valid'): a result is"),
-        ([("a b", "valid", "")], "yields the name 'a b': letters, digits and _, at most 64"),
-        ([("a", "good", "")], "a: yields verdict = 'good': must be one of"),
-        ([("a", "valid", 5)], "a: yields text = 5: must be a text"),
-        ([("a", "valid", "", 5)], "a: yields figures = 5: a table is needed"),
-        ([("a", "valid", "", {"x": float("nan")})], "a: figures['x'] = nan: must be finite, or None"),
-        ([("a", "valid", "", {"x": object})], "a: figures['x'] = <class 'object'>: must be a number, a boolean"),
-        ([("a", "valid", "", {"x": "y" * 10**6})], "a: yields 1,000,"),
-        ([("a", "invalid", "", {"rows": [1]})], "a: figures['rows'] holds what is no table"),
-        ([("a", "valid", ""), ("a", "valid", "")], "yields 'a' twice"),
-        ([(f"n{i}", "valid", "") for i in range(1001)], "yields more than 1000 results"),
-    ],
-)
+@answers("check")
 def test_nonsense_is_unknown_and_says_what_is_allowed(
-    recorded: RecordedRun, module: Any, answer: object, text: str, monkeypatch: pytest.MonkeyPatch
+    recorded: RecordedRun, module: Any, kind: str, answer: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "given", lambda run: answer, raising=False)
+    monkeypatch.setattr(module, "given", lambda run: eval(answer, {"np": np}), raising=False)
     found = findings(recorded, "given")["own:own_checks.given"]
     assert isinstance(found, CheckResult)
-    assert (found.verdict, found.text[: len(text)]) == (Verdict.UNKNOWN, text)
+    assert (found.verdict, found.text[: len(said)]) == (Verdict.UNKNOWN, said)
 
 
 def test_a_result_that_is_nonsense_hides_no_other(

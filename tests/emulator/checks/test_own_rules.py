@@ -150,7 +150,7 @@ def test_a_running_emulator_accepts_no_rule() -> None:
 
 @pytest.mark.parametrize("name", ["raises", "nonsense"])
 def test_a_rule_that_fails_makes_the_run_invalid_and_is_named(tmp_path: Path, name: str) -> None:
-    recorded = run_scenario(tmp_path / "run", ruled(name, options={"answer": "negative"}))
+    recorded = run_scenario(tmp_path / "run", ruled(name, options={"answer": "Answer(delay_s=-0.001)"}))
     (check,) = [check for check in judge(recorded).checks if check.name == "own_rules"]
     said = {"raises": r"raises ValueError: no idea of v01 (rules.py:", "nonsense": "answers delay_s = -0.001: "}
     assert check.verdict is Verdict.INVALID

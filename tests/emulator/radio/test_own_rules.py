@@ -18,6 +18,7 @@ from emulator.scenario import rule_watch
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from tests.support import rules
+from tests.support.answers import answers
 from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, Row, S, digest, fault
 from vnet.errors import ScenarioError
 from vnet.radio import SentFrame
@@ -211,36 +212,7 @@ def test_a_dropped_frame_takes_no_time_of_its_sender_s_queue_and_no_other_rule_i
     assert arrivals == [row["arrival_ns"] for row in free.rows(10 * S)], "as if nothing had been sent before"
 
 
-NONSENSE = {
-    "text": "answers 'drop': Answer(…) is needed, or None to let the frame pass",
-    "mask": "answers drop of shape (5,): one value is needed, or 4, one a receiver",
-    "number": "answers drop = array([0., 0., 0., 0.]): True or False is needed, or 4 of them",
-    "ragged": "answers drop = [[True], [True, False]]: True or False is needed, or 4 of them",
-    "nan": "answers delay_s = nan: a number from 0 to 60 is needed",
-    "negative": "answers delay_s = -0.001: a number from 0 to 60 is needed",
-    "long": "answers delay_s = 61: a number from 0 to 60 is needed",
-    "words": "answers delay_s = 'soon': a number from 0 to 60 is needed, or 4 of them",
-    "flips": "answers corrupt = 1.5: a whole number from 0 to 65000 is needed, or 4 of them",
-    "copies": "answers copies = 21: a whole number from 0 to 20 is needed",
-    "copy_delay": "answers copy_delay_s = 0: a number over 0 and up to 60 is needed",
-    "short": "answers payload['v1'] = b'x': 20 bytes are needed",
-    "stranger": "answers payload['nobody']: is none of the frame's receivers",
-    "list": "answers payload = [",
-}
-NONSENSE_OF_SENDERS = {
-    "text": "answers 'drop': a list of payloads is needed, or None to change nothing",
-    "dict": "answers {}: a list of payloads is needed, or None to change nothing",
-    "many": "answers 201 payloads: 200 at most",
-    "str": "answers the payload 'x': bytes are needed",
-    "large": "answers a payload of 100000 bytes: radio.max_payload_bytes = ",
-}
-
-
-@pytest.mark.parametrize(
-    ("kind", "answer", "said"),
-    [("custom", *item) for item in NONSENSE.items()]
-    + [("custom_sender", *item) for item in NONSENSE_OF_SENDERS.items()],
-)
+@answers("custom", "custom_sender")
 def test_nonsense_is_told_once_and_then_everything_passes(kind: str, answer: str, said: str) -> None:
     air, free = chatted(rule("nonsense", kind=kind, options={"answer": answer}), periods=3), chatted(periods=3)
     assert without_cause(air.rows()) == free.rows()

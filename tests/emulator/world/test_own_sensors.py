@@ -14,12 +14,12 @@ from emulator.scenario.loading import load_scenario
 from emulator.scenario.program import Program
 from emulator.scenario.world import OwnSensor
 from emulator.world.own_sensors import OwnSensors
+from tests.support.answers import answers
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
 from vnet.errors import ScenarioError
 from vnet.node import NOTHING_SENSED, Fix
 from vnet.transport import wire
 
-ODD: dict[str, Any] = {"digits": "1.5", "bytes": b"2", "truth value": True, "mixed": [1.0, True]}
 HERE = "tests.emulator.world.test_own_sensors"
 
 
@@ -52,11 +52,9 @@ def ones(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
     return dict.fromkeys(truth.node_ids, 1) | {truth.node_ids[1]: (1, 2), truth.node_ids[2]: None}
 
 
-def answers(truth: SensedTruth, state: dict[str, Any]) -> Any:
+def given(truth: SensedTruth, state: dict[str, Any]) -> Any:
     """Return what the options say."""
-    return {"nothing": None, "unknown": {"x99": 1.0}, "text": {"v01": "far"}, "many": {"v01": range(65)}}.get(
-        truth.options["kind"], {"v01": ODD.get(str(truth.options["kind"]), float("nan"))}
-    )
+    return eval(truth.options["answer"], {"np": np})
 
 
 def scenario(*functions: str, faults: Sequence[dict[str, Any]] = (), **sections: Any) -> Any:
@@ -102,28 +100,14 @@ def test_a_function_cannot_change_the_truth() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("function", "options", "said"),
-    [
-        ("stumbles", {}, "raises ZeroDivisionError: float division by zero (test_own_sensors.py:"),
-        ("answers", {"kind": "nothing"}, "answers None: a dict from vehicles to readings is needed"),
-        ("answers", {"kind": "unknown"}, "answers 'x99': no vehicle that is present"),
-        ("answers", {"kind": "text"}, "answers 'far' for v01: a finite number, or at most 64 of them, is needed"),
-        ("answers", {"kind": "many"}, "for v01: a finite number, or at most 64 of them, is needed"),
-        ("answers", {"kind": "digits"}, "answers '1.5' for v01: a finite number"),
-        ("answers", {"kind": "bytes"}, "answers b'2' for v01: a finite number"),
-        ("answers", {"kind": "truth value"}, "answers True for v01: a finite number"),
-        ("answers", {"kind": "mixed"}, "answers [1.0, True] for v01: a finite number"),
-        ("answers", {"kind": "none"}, "answers nan for v01: a finite number"),
-    ],
-)
-def test_a_sensor_that_fails_is_named_once(function: str, options: dict[str, Any], said: str) -> None:
-    sensor = {"radar": {"model": f"{HERE}:{function}", "options": options}, "other": {"model": f"{HERE}:counts"}}
+@answers("sensor")
+def test_a_sensor_that_fails_is_named_once(kind: str, answer: str, said: str) -> None:
+    sensor = {"radar": {"model": f"{HERE}:given", "options": {"answer": answer}}}
+    sensor["other"] = {"model": f"{HERE}:counts"}
     emulation = run_together(scenario(world={"gnss": {"rate_hz": 10}, "sensor": sensor}))
     (failed,) = [event for event in emulation.folder.events if event.kind == "rule_failed"]
-    assert failed.time_ns == (500_000_000 if function == "stumbles" else 0)
-    assert failed.details["fault"] == "world.sensor.radar"
-    assert said in failed.details["error"]
+    assert (failed.time_ns, failed.details["fault"]) == (0, "world.sensor.radar")
+    assert failed.details["error"].startswith(said)
     assert len([1 for _, _, name, _ in readings(emulation) if name == "other"]) == 30, "others go on"
 
 
@@ -138,6 +122,10 @@ def test_the_failure_of_a_sensor_comes_in_the_order_of_time_wherever_programs_ru
     times_ns = [time_ns for time_ns, *_ in apart]
     assert together == apart and times_ns == sorted(times_ns)
     assert (500_000_000, "rule_failed", None) in apart
+    (failed,) = [e for e in run_together(plan).folder.events if e.kind == "rule_failed"]
+    assert failed.details["error"].startswith(
+        "raises ZeroDivisionError: float division by zero (test_own_sensors.py:"
+    )
 
 
 @pytest.mark.slow
