@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -159,9 +160,9 @@ class _Cache:
 
     def answer(self, query: Query) -> None:
         """Reply with the samples that a query asks for."""
-        first, last = _range_of(query.parameters.get("_sn"))
+        numbers = _numbers_of(query.parameters.get("_sn"))
         since_ns = _start_of(query.parameters.get("_time"), EPOCH_NS + self._node.now_ns)
-        found = [each for each in self.samples if _is_in(each, first, last) and _is_since(each, since_ns)]
+        found = [each for each in self.samples if _is_in(each, numbers) and _is_since(each, since_ns)]
         most = query.parameters.get("_max")
         if most is not None and most.isdigit():
             found = found[max(len(found) - int(most), 0) :]
@@ -177,18 +178,19 @@ class _Cache:
         query.drop()
 
 
-def _range_of(text: str | None) -> tuple[int | None, int | None]:
-    """Return the first and the last number of `_sn`; None is no bound."""
-    first, dots, last = (text or "..").partition("..")
-    least = int(first) if first.isdigit() else None
-    return least, (int(last) if last.isdigit() else None) if dots else least
+def _numbers_of(text: str | None) -> range | None:
+    """Return the numbers of samples for which `_sn` asks; None is all samples, also those without a number."""
+    first, dots, last = (text or "").partition("..")
+    if not (first.isdigit() or last.isdigit()):
+        return None
+    start = int(first) if first.isdigit() else 0
+    if not dots:
+        return range(start, start + 1)
+    return range(start, int(last) + 1 if last.isdigit() else sys.maxsize)
 
 
-def _is_in(sample: Sample, first: int | None, last: int | None) -> bool:
-    if first is None and last is None:
-        return True
-    number = None if sample.source_info is None else sample.source_info.source_sn
-    return number is not None and (first or 0) <= number and (last is None or number <= last)
+def _is_in(sample: Sample, numbers: range | None) -> bool:
+    return numbers is None or (sample.source_info is not None and sample.source_info.source_sn in numbers)
 
 
 def _start_of(text: str | None, unix_ns: int) -> int | None:

@@ -93,8 +93,9 @@ class OwnModules(dict[str, ModuleType]):
         if not _is_own_copy(name) and name not in self._shown and show(name, _present_module):
             self._shown.add(name)
 
-    def __delitem__(self, name: str) -> None:
-        super().__delitem__(name)
+    def take_back(self, name: str) -> None:
+        """Remove a module that could not be loaded."""
+        self.pop(name, None)
         parent, _, child = name.rpartition(".")
         if parent in self:
             vars(self[parent]).pop(child, None)
@@ -262,7 +263,7 @@ class ProgramModules:
                 get_code: Any = _shared_code if _is_own_copy(name) else SourceFileLoader.get_code
                 exec(get_code(spec.loader, name), vars(module))
         except BaseException:
-            del self.modules[name]
+            self.modules.take_back(name)
             raise
         if (prepare := self._preparations.get(name)) is not None:
             prepare(module)

@@ -19,7 +19,6 @@ from vnet.gateway.emulated.values import (
     PUT,
     CallbackSink,
     EntityGlobalId,
-    Handler,
     Hello,
     MatchingStatus,
     Outlet,
@@ -91,7 +90,8 @@ class Listening(Declared):
     """An entity that takes items, with the end of the channel that the program reads."""
 
     def __init__(self, handler: Any, outlet: Outlet) -> None:
-        self._sink, self.handler, self._is_background = sink_of(handler, outlet)
+        self._sink, self.handler = sink_of(handler, outlet)
+        self._is_background = callable(handler)
         self._ends = [self._sink.close]
 
     handler: Any
@@ -177,29 +177,26 @@ class CancellationToken:
 
     def __init__(self) -> None:
         self._is_cancelled = False
-        self._askings: list[Asking] = []
-        self._sinks: list[Handler | CallbackSink] = []
+        self._queries: list[tuple[Asking | None, Sink]] = []
 
     def cancel(self) -> None:
         """End the queries that have it, and block until their callbacks have ended."""
         self._is_cancelled = True
-        askings, self._askings = self._askings, []
-        for asking in askings:
-            asking.cancel()
-        sinks, self._sinks = self._sinks, []
-        for sink in sinks:
+        queries, self._queries = self._queries, []
+        for asking, _ in queries:
+            if asking is not None:
+                asking.cancel()
+        for _, sink in queries:
             if isinstance(sink, CallbackSink):
                 sink.wait()
 
     is_cancelled = property(lambda self: self._is_cancelled)
 
-    def add(self, sink: Handler | CallbackSink, asking: Asking | None = None) -> None:
+    def add(self, sink: Sink, asking: Asking | None = None) -> None:
         """Have it end a query. Raises ZError if it is cancelled."""
         if self._is_cancelled:
             raise zenoh.ZError("Query was cancelled")
-        self._sinks.append(sink)
-        if asking is not None:
-            self._askings.append(asking)
+        self._queries.append((asking, sink))
 
 
 class Liveliness:
@@ -226,7 +223,7 @@ class Liveliness:
     ) -> Any:
         """Get the tokens that are there: those of other vehicles as far as they have been heard."""
         self._session.check_open()
-        sink, seen, _ = sink_of(handler, self._session.outlet)
+        sink, seen = sink_of(handler, self._session.outlet)
         if cancellation_token is not None:
             cancellation_token.add(sink)
         for token in self._session.vehicle.tokens(key_of(key_expr)):
@@ -513,7 +510,7 @@ class Session:
         """Ask for replies."""
         _refuse(timestamp_instrumentation=timestamp_instrumentation)
         self.check_open()
-        sink, seen, _ = sink_of(handler, self.outlet)
+        sink, seen = sink_of(handler, self.outlet)
         selector = selector if isinstance(selector, zenoh.Selector) else zenoh.Selector(selector)
         if accept_replies == zenoh.ReplyKeyExpr.ANY and ANY_KEY not in selector.parameters:
             rest = str(selector.parameters)

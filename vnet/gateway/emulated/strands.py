@@ -419,16 +419,19 @@ class Threads:
 
     def start(self, function: Callable[..., Any], args: Any = (), kwargs: Any = None) -> int:
         """Start a thread, and return its number."""
-        strand = Strand(partial(self._run, function, args, kwargs or {}), self.new_number(), self.folder)
+        return self._begin(partial(function, *args, **(kwargs or {}))).number
+
+    def _begin(self, function: Callable[[], Any]) -> Strand:
+        strand = Strand(partial(self._run, function), self.new_number(), self.folder)
         self._alive += 1
         Task(run_strand(strand), loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
-        return strand.number
+        return strand
 
-    def _run(self, function: Callable[..., Any], args: Any, kwargs: Any) -> None:
+    def _run(self, function: Callable[[], Any]) -> None:
         strand = current_strand()
         assert strand is not None
         try:
-            function(*args, **kwargs)
+            function()
         except SystemExit:
             pass
         except Exception as error:
@@ -447,15 +450,9 @@ class Threads:
     def _start_joinable(
         self, function: Callable[[], Any], handle: ThreadHandle | None = None, daemon: bool = True
     ) -> ThreadHandle:
-        handle = handle or ThreadHandle()
-
-        def run() -> None:
-            try:
-                function()
-            finally:
-                handle._set_done()
-
-        handle.ident = self.start(run)
+        handle, strand = handle or ThreadHandle(), self._begin(function)
+        strand.at_end.append(handle._set_done)
+        handle.ident = strand.number
         if not daemon:
             self._handles.append(handle)
         return handle

@@ -411,22 +411,16 @@ class Outlet(NamedTuple):
     threads: Threads
 
 
-def sink_of(handler: Any, outlet: Outlet) -> tuple[Handler | CallbackSink, Any, bool]:
-    """Return where items go, the handler that the program sees, and whether they go to a callback alone.
-
-    Raises ValueError for what is no handler.
-    """
-    if handler is None:
-        handler = DefaultHandler()
-    if isinstance(handler, DefaultHandler):
+def sink_of(handler: Any, outlet: Outlet) -> tuple[Handler | CallbackSink, Any]:
+    """Return where items go, and the handler that the program sees. Raises ValueError for what is no handler."""
+    if handler is None or isinstance(handler, DefaultHandler):
         channel = Handler(handler.capacity if isinstance(handler, RingChannel) else None)
-        return channel, channel, False
+        return channel, channel
     seen = None
-    alone = callable(handler)
-    if not alone:
-        if not (isinstance(handler, tuple) and len(handler) == 2 and callable(handler[0])):
-            raise ValueError(f"Invalid handler type {type(handler).__name__}")
+    if isinstance(handler, tuple) and len(handler) == 2:
         handler, seen = handler
+    if not callable(handler):
+        raise ValueError(f"Invalid handler type {type(handler).__name__}")
     if isinstance(handler, Callback):
-        return CallbackSink(handler.callback, handler.drop, outlet), seen, alone
-    return CallbackSink(handler, None, outlet), seen, alone
+        return CallbackSink(handler.callback, handler.drop, outlet), seen
+    return CallbackSink(handler, None, outlet), seen
