@@ -232,8 +232,8 @@ class Gateway(RadioSide[zenoh.Query]):
 
     def _reply(self, query: zenoh.Query, answer: CrossingReply) -> None:
         if answer.sample is None:
-            assert answer.error is not None
-            query.reply_err(answer.error[0], encoding=answer.error[1])
+            content, encoding = answer.error or (b"", "")
+            query.reply_err(content, encoding=encoding)
             return
         sample, options = answer.sample, sample_options(answer.sample)
         if _known_source(sample) is not None:  # which Python cannot give a reply, and advanced subscribers need

@@ -12,7 +12,7 @@ import zenoh
 from emulator.drivers.live.gateway import Gateway
 from emulator.scenario.program import ZenohSessions
 from vnet.errors import ProgramError
-from vnet.gateway.frames import CrossingTokens, Fragments
+from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments
 from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY, check_keys
 from vnet.gateway.ros2 import ROS2_KEYS, Ros2
 from vnet.transport.wire import WireFix
@@ -298,6 +298,21 @@ def test_bytes_that_a_fault_has_changed_harm_nobody() -> None:
         sessions[0].put("last", b"x")
         assert str((await heard.get()).key_expr) == "last"
         assert len(vehicles[1].unread) > len(frame)
+
+    two(test)
+
+
+def test_a_reply_without_content_is_an_error_without_content() -> None:
+    """As a fault may make one of the bytes of another."""
+
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        replies = sessions[0].get("asked")
+        while not vehicles[0].frames:
+            await asyncio.sleep(0)
+        for payload in Fragments(2000).of(CrossingReply("v01", 0, None)):
+            vehicles[1].broadcast(payload)
+        error = (await asyncio.to_thread(replies.recv)).err
+        assert error is not None and error.payload.to_bytes() == b""
 
     two(test)
 
