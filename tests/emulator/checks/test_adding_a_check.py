@@ -11,14 +11,10 @@ from docs.generate import checks as check_page
 from emulator.checks import registry
 from emulator.checks.judge import RecordedRun, Verdict, check_run, judge
 from emulator.checks.registry import CHECKS, Check, Subject, WithoutPositions
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.records.verdicts import CheckResult, Finding, invalid, not_exercised, result, unknown
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import count_verdicts
-from emulator.world.world import build_world
+from tests.support.recorded import recorded as record_run
 
 LIMIT_BYTES = 100
 
@@ -62,8 +58,7 @@ def simulated(folder: Path, entry: str = "agents.beacon:main", duration_s: float
             "program": {"entry": entry},
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    conclude(emulation, simulate(emulation)[0], "simulate")
+    record_run(scenario, folder)
     return folder
 
 

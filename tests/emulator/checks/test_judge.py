@@ -10,15 +10,11 @@ import pyarrow.compute as pc
 import pytest
 
 from emulator.checks.judge import CheckResult, NotExercised, Verdict, check_run, judge
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
 from emulator.records.distributions import binomial_interval
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import recorded as record_run
 from vnet.errors import VnetError
 from vnet.node import Node
 
@@ -39,9 +35,7 @@ def run(
 
 
 def run_scenario(folder: Path, scenario: Scenario) -> RecordedRun:
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    wall_s, _ = simulate(emulation)
-    conclude(emulation, wall_s, "simulate")
+    record_run(scenario, folder)
     run = RecordedRun.open(folder)
     return RecordedRun(scenario, run.trace, run.states, run.metrics, run.events, world=run.world)
 

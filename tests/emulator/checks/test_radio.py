@@ -13,15 +13,14 @@ import pytest
 
 from emulator.checks.judge import NotExercised, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.radio.csma import Csma
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import RunFolder
 from emulator.records.tables import BUSY
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
 from tests.emulator.checks.test_judge import checked, result, verdict
+from tests.support.recorded import prepared
+from tests.support.recorded import recorded as record_run
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
@@ -42,9 +41,7 @@ def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) 
             "fault": faults or [],
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    wall_s, _ = simulate(emulation)
-    conclude(emulation, wall_s, "simulate")
+    record_run(scenario, folder)
     done = RecordedRun.open(folder)
     return RecordedRun(scenario, done.trace, done.states, done.metrics, done.events, more={BUSY: done.table(BUSY)})
 
@@ -88,7 +85,7 @@ def test_what_really_happened_is_valid(shared: RecordedRun, faded: RecordedRun) 
 
 def test_on_a_disc_neither_is_exercised(tmp_path: Path) -> None:
     scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "program": {"entry": "agents.beacon:main"}})
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     simulate(emulation)
     judgement, _ = conclude(emulation, 1.0, "simulate")
     left = {check.name: check.reason for check in judgement.not_exercised}

@@ -10,16 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from emulator.checks.judge import NotExercised, Verdict, judge
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
 from emulator.radio.trace import sha256_of_table
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
+from tests.support.recorded import recorded as record_run
 
 COOPERATIVE = Program(entry="agents.cooperative:main")
 
@@ -29,9 +25,7 @@ def beacons(folder: Path, **radio: float) -> RecordedRun:
     scenario = Scenario.model_validate(
         {"run": {"duration_s": 2.0}, "network": {"vehicles": 6, "layout": "dense"}, "radio": radio}
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-    wall_s, _ = simulate(emulation)
-    conclude(emulation, wall_s, "simulate")
+    record_run(scenario, folder)
     return RecordedRun(
         scenario,
         pq.read_table(folder / "trace.parquet"),
