@@ -12,7 +12,7 @@ import pytest
 from agents.cooperative.hears_all import lanes_of, reflected_deviation_m, why_no_bound
 from emulator.api import simulate_into
 from emulator.cells.cells import compute
-from emulator.records.recorded_run import RecordedRun
+from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import reference_series
 from emulator.report.source import Source
 from emulator.report.write import report_page
@@ -48,7 +48,7 @@ def scenario(**sections: Any) -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> OpenedRun:
     return RecordedRun.open(simulate_into(scenario(), tmp_path_factory.mktemp("bound") / "run"))
 
 
@@ -70,8 +70,8 @@ def test_the_bound_knows_the_common_error_and_its_own_error(recorded: RecordedRu
 
 
 @pytest.mark.slow
-def test_a_report_has_the_bound_as_a_line(recorded: RecordedRun, tmp_path: Path) -> None:
-    page = report_page(Source(simulate_into(scenario(), tmp_path / "run")))
+def test_a_report_has_the_bound_as_a_line(recorded: OpenedRun) -> None:
+    page = report_page(Source(recorded.folder))
     assert "Bound: a Kalman filter that hears every fix of its component" in page
     assert "times the bound" in page
 

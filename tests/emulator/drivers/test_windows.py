@@ -89,7 +89,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     return scenario.model_copy(update={"fault": drawn})
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(scenarios())
 def test_random_runs_are_the_same_with_and_without_windows(scenario: Scenario) -> None:
     reference = fingerprint(simulated(scenario, False))

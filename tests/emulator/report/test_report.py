@@ -72,6 +72,12 @@ def cooperative(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def page(cooperative: Path) -> Page:
+    """Its report."""
+    return page_of(cooperative)
+
+
+@pytest.fixture(scope="module")
 def beacon_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("beacon") / "runs" / "beacon-1"
     return simulate(folder, "--duration", "2", "--no-report", scenario="beacon.toml")
@@ -94,8 +100,7 @@ def page_of(folder: Path) -> Page:
     return Page(write_report(folder).read_text())
 
 
-def test_figures_have_axes_with_units_and_are_those_of_the_verdict(cooperative: Path) -> None:
-    page = page_of(cooperative)
+def test_figures_have_axes_with_units_and_are_those_of_the_verdict(cooperative: Path, page: Page) -> None:
     for label in ("common error (m)", "RMSE of position (m)", "emulated time (s)", "latency (ms)", "distance (km)"):
         assert label in page.text
     record = RecordedRun.open(cooperative).record
@@ -106,8 +111,7 @@ def test_figures_have_axes_with_units_and_are_those_of_the_verdict(cooperative: 
     assert "common-error" in page.ids and len(page.ids) == len(set(page.ids))
 
 
-def test_a_report_needs_nothing_from_elsewhere(cooperative: Path) -> None:
-    page = page_of(cooperative)
+def test_a_report_needs_nothing_from_elsewhere(cooperative: Path, page: Page) -> None:
     assert page.references and all(reference.startswith("#") for reference in page.references)
     assert page.tags.count("script") == 1 and "timeline" in page.ids
     assert "url(http" not in (cooperative / "report.html").read_text()
@@ -172,6 +176,7 @@ def test_what_others_wrote_is_text(beacon: Path) -> None:
     assert "the first offending rows" in page.text
 
 
+@pytest.mark.usefixtures("no_charts")
 @pytest.mark.parametrize(
     "lost", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json", "events.jsonl"]
 )
