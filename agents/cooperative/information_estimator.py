@@ -49,6 +49,7 @@ from agents.cooperative.information_frame import (
     INCREMENT_LIMIT,
     MAX_HEARD,
     PASSED,
+    HeardFrames,
     InformationFrame,
     decode,
     encode,
@@ -215,15 +216,15 @@ class InformationEstimator:
         """Do a round of consensus, and fuse, with the frames of this period."""
         own = plain_moments(*self._prior)
         frames = self._current_frames()
+        heard = HeardFrames.of(frames.values())
         if self._lanes:
-            self._lanes.join([frame.increment for frame in frames.values()])
-        self._compare(list(frames.values()), own)
-        if self._begins_again([frame.prior for frame in frames.values()]):
-            own, frames = plain_moments(*self._prior), {}  # the new belief is what they know
-        heard = list(frames.values())
+            self._lanes.join(heard.increments)
+        self._compare(heard, own)
+        if self._begins_again(heard.priors):
+            own, frames, heard = plain_moments(*self._prior), {}, HeardFrames()  # the new belief is what they know
         # Of all that follows what this vehicle says itself is the first.
         priors, means_m, leaning = self._moderated(heard, own)
-        shares = {sender: frame.share for sender, frame in frames.items()}
+        shares = dict(zip(frames, heard.shares, strict=True))
         self._share = self.consensus.round(np.array(means_m[0]), shares)
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
@@ -231,11 +232,11 @@ class InformationEstimator:
             middle_m = math.fsum([x for x, _ in means_m]) / count, math.fsum([y for _, y in means_m]) / count
             self.mean_m = tracked_mean(middle_m, self.mean_m, self.limit_m / SPREAD_GATE)
         limited, increments = self._limited(heard, priors)
-        variances_m2 = [xx + yy for _, _, xx, _, yy in (own, *[frame.moments for frame in heard])]
-        weights = self._weigh(frames, means_m, variances_m2, leaning)
+        self._weighed = list(frames)
+        weights = self._weights = self._weigh(heard, means_m, own[2] + own[4], leaning)
         passed = self._passed_on(heard, weights[1:])
-        self.imported = len(heard) + len(passed)
-        self._passing.use([passed_record(self._code, self._increment), *[frame.record for frame in heard]])
+        self.imported = len(frames) + len(passed)
+        self._passing.use([passed_record(self._code, self._increment), *heard.records])
         self._absorb(weights, limited, increments, passed)
         self.fused_m = self.own.estimate_m
 
@@ -289,19 +290,18 @@ class InformationEstimator:
         self._frames = {}
         return frames
 
-    def _compare(self, heard: Sequence[InformationFrame], own: Five) -> None:
+    def _compare(self, heard: HeardFrames, own: Five) -> None:
         """Find the shares (n,) of their priors and of their increments that are used.
 
         `own` is the mean and the covariance of the vehicle's own prior.
         """
-        self._prior_shares = self._used_shares = [1.0] * len(heard)
-        if not self._options.defence or not heard:
+        self._prior_shares = self._used_shares = [1.0] * len(heard.codes)
+        if not self._options.defence or not heard.codes:
             return
         x, y, *covariance_m2 = own
-        self._prior_shares = prior_shares([frame.moments for frame in heard], own)
-        codes, increments = [frame.code for frame in heard], [frame.increment for frame in heard]
+        self._prior_shares = prior_shares(heard.moments, own)
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
-        used = self._shares_used(codes, increments, belief, False)
+        used = self._shares_used(heard.codes, heard.increments, belief, False)
         self._used_shares = unless_most_disagree(used)
         if min(self._prior_shares) < 1 or min(self._used_shares) < 1:
             self._reject("prior", sum(share < COUNTED_SHARE for share in self._prior_shares))
@@ -338,23 +338,22 @@ class InformationEstimator:
             self._lanes.restart()
 
     def _moderated(
-        self, frames: Sequence[InformationFrame], own: Five
+        self, heard: HeardFrames, own: Five
     ) -> tuple[list[Five], list[tuple[float, float]], list[bool] | None]:
-        """Return the priors (1 + n,) of the vehicle and of `frames`, and their means, none far from their median.
+        """Return the priors (1 + n,) of the vehicle and those heard, and their means, none far from their median.
 
         No vehicle is dropped: where a few hear what the others cannot know, they are always off, and right. The
         last value (n,) tells which always are, None if nobody is.
         """
-        priors, moments = [self._prior, *[frame.prior for frame in frames]], [frame.moments for frame in frames]
-        means_m = [own[:2], *[each[:2] for each in moments]]
-        if not self._options.defence or not frames:
+        priors, means_m = [self._prior, *heard.priors], [own[:2], *heard.means_m]
+        if not self._options.defence or not heard.codes:
             self.limit_m = math.inf
             return priors, means_m, None
-        middle_m, self.limit_m = spread_limit_m([own, *moments])
+        middle_m, self.limit_m = spread_limit_m([own, *heard.moments])
         if self.limit_m == math.inf:
             middle_m = own[:2]
-        codes = [frame.code for frame in frames]
-        off_m, leaning = self._origins.without_lean(codes, moments, own, middle_m, self._now_ns / NS_PER_S)
+        now_s = self._now_ns / NS_PER_S
+        off_m, leaning = self._origins.without_lean(heard.codes, heard.moments, own, middle_m, now_s)
         less_m = cut_to(off_m, self.limit_m)
         if less_m is off_m and leaning is None:
             return priors, means_m, None
@@ -365,11 +364,9 @@ class InformationEstimator:
             priors[row] = moved(priors[row], means_m[row][0] - mean_x, means_m[row][1] - mean_y)
         return priors, means_m, leaning
 
-    def _limited(
-        self, frames: Sequence[InformationFrame], priors: list[Five]
-    ) -> tuple[Sequence[Five], Sequence[Five]]:
+    def _limited(self, heard: HeardFrames, priors: list[Five]) -> tuple[Sequence[Five], Sequence[Five]]:
         """Return priors and increments (1 + n,) of all, none much more certain than one's own."""
-        increments = [self._increment, *[frame.increment for frame in frames]]
+        increments = [self._increment, *heard.increments]
         if not self._options.defence:
             return priors, increments
         own, largest = traces_of([self._increment, self._prior])
@@ -379,41 +376,38 @@ class InformationEstimator:
         if traces[-1] > self._largest_increment:
             increments = scaled_down(increments, self._largest_increment)
         # Shares are of what is left: who claims more is not to weigh as the honest do.
-        if frames and min(self._used_shares) < 1:
+        if heard.codes and min(self._used_shares) < 1:
             each = zip(increments[1:], self._used_shares, strict=True)
             increments[1:] = [scaled_by(increment, share) for increment, share in each]
         return scaled_down(priors, PRIOR_FACTOR * largest), increments
 
     def _weigh(
         self,
-        frames: Mapping[str, InformationFrame],
+        heard: HeardFrames,
         means_m: Sequence[tuple[float, float]],
-        variances_m2: Sequence[float],
+        own_variance_m2: float,
         leaning: list[bool] | None,
     ) -> list[float]:
         """Return the weights (1 + n,) of the priors.
 
-        They have means (1 + n,) and covariances with traces (1 + n,). The weight of who is always to one side,
+        They have means (1 + n,), and the own a covariance with this trace. The weight of who is always to one side,
         `leaning` (n,), goes to the vehicle itself, and of who is far off in part.
         """
-        self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
-        degrees = [len(frame.heard) for frame in frames.values()]
-        weights = self._rule.weights(means_m, variances_m2, self.mean_m, degrees)
+        self._rule.notice(heard.largest_degrees, len(self._share.heard))
+        variances_m2 = [own_variance_m2, *heard.variances_m2]
+        weights = self._rule.weights(means_m, variances_m2, self.mean_m, heard.degrees)
         if self._options.defence:
-            leaning = leaning or [False] * len(frames)
+            leaning = leaning or [False] * len(heard.codes)
             each = zip(weights[1:], self._prior_shares, leaning, strict=True)
             others = [0.0 if leans else (1 - SELF_SHARE) * share * weight for weight, share, leans in each]
             weights = [1 - math.fsum(others), *others]
-        self._weights = weights
-        self._weighed = list(frames)
         return weights
 
     # What is passed on.
 
-    def _passed_on(self, frames: Sequence[InformationFrame], weights: Sequence[float]) -> list[Five]:
+    def _passed_on(self, heard: HeardFrames, weights: Sequence[float]) -> list[Five]:
         """Return the increments of the last period from out of range, less what the pooled priors hold."""
-        listed = [frame.passed_records for frame in frames]
-        shares, forged = self._passing.shares(listed, weights, self._options.defence)
+        shares, forged = self._passing.shares(heard.passed, weights, self._options.defence)
         self._reject("forged", forged)
         origins, increments, has_joined = [], [], self._lanes is not None and self._lanes.has_joined
         for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):

@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,29 +87,10 @@ class InformationFrame:
         return frozenset(self.heard)
 
     @cached_property
-    def share(self) -> Share:
-        """The state of the consensus."""
-        return Share(self.epoch, self.running_sum, self.out_neighbours, self.names_heard)
-
-    @cached_property
-    def code(self) -> int:
-        """The sender's code; `name_of_code` is the inverse."""
-        return int(self.name, 16)
-
-    @cached_property
-    def moments(self) -> Five:
-        """The prior's mean (x, y) in m and its covariance (xx, xy, yy) in m²."""
-        return plain_moments(*self.prior)
-
-    @cached_property
-    def record(self) -> bytes:
-        """The increment as a record of `PASSED`."""
-        return passed_record(self.code, self.increment)
-
-    @cached_property
-    def passed_records(self) -> tuple[bytes, ...]:
-        """The records that are passed on, as bytes, each once."""
-        return tuple(dict.fromkeys(chain.from_iterable(_AS_BYTES.iter_unpack(self.passed.tobytes()))))
+    def row(self) -> Row:
+        """Its row of `HeardFrames`."""
+        share = Share(self.epoch, self.running_sum, self.out_neighbours, self.names_heard)
+        return _row(self, int(self.name, 16), share, _records(self.passed.tobytes()))
 
     @property
     def passed_numbers(self) -> Array:
@@ -119,6 +101,50 @@ class InformationFrame:
     def fingerprint(self) -> bytes:
         """Bytes that no two senders share at one time: they come from the noise of a receiver."""
         return _fingerprint(self.name, self.increment)
+
+
+Row = tuple[int, Five, Five, tuple[float, float], Five, float, bytes, Share, tuple[bytes, ...], int, int]
+"""The fields of `HeardFrames` of one frame."""
+
+
+class HeardFrames(NamedTuple):
+    """The frames of a period as columns (n,), in the order of their senders: one operation for each, and not n.
+
+    codes: the senders' codes; `name_of_code` is the inverse.
+    means_m: the priors' means; moments: these (x, y), and the covariances (xx, xy, yy) in m²; variances_m2: their
+    traces.
+    records: the increments as records of `PASSED`; passed: the records that each passes on, each once.
+    degrees: the numbers of vehicles that each has heard.
+    """
+
+    codes: Sequence[int] = ()
+    priors: Sequence[Five] = ()
+    increments: Sequence[Five] = ()
+    means_m: Sequence[tuple[float, float]] = ()
+    moments: Sequence[Five] = ()
+    variances_m2: Sequence[float] = ()
+    records: Sequence[bytes] = ()
+    shares: Sequence[Share] = ()
+    passed: Sequence[tuple[bytes, ...]] = ()
+    degrees: Sequence[int] = ()
+    largest_degrees: Sequence[int] = ()
+
+    @classmethod
+    def of(cls, frames: Iterable[InformationFrame]) -> HeardFrames:
+        """Return the columns of frames."""
+        return cls(*zip(*[frame.row for frame in frames], strict=True))
+
+
+def _row(frame: InformationFrame, code: int, share: Share, passed: tuple[bytes, ...]) -> Row:
+    moments = x, y, xx, _, yy = plain_moments(*frame.prior)
+    record = passed_record(code, frame.increment)
+    degrees = len(frame.heard), frame.largest_degree
+    return code, frame.prior, frame.increment, (x, y), moments, xx + yy, record, share, passed, *degrees
+
+
+def _records(passed: bytes) -> tuple[bytes, ...]:
+    """Return the records among the bytes of a frame, each once."""
+    return tuple(dict.fromkeys(chain.from_iterable(_AS_BYTES.iter_unpack(passed))))
 
 
 def _fingerprint(name: str, increment: Five) -> bytes:
@@ -204,7 +230,7 @@ def decode(payload: bytes) -> InformationFrame:
     prior, running_sum = (a, b, d, x, y), (s_x, s_y, weight)
     _check(prior, increment, running_sum)
     heard, out_neighbours, names_heard = _heard(payload[_HEADER.size : flags_end], heard_count)
-    records = tuple(dict.fromkeys(chain.from_iterable(_AS_BYTES.iter_unpack(payload[flags_end:end]))))
+    records = _records(payload[flags_end:end])
     for record in records:
         passed_increment.cached(record)
     frame = InformationFrame(
@@ -218,14 +244,11 @@ def decode(payload: bytes) -> InformationFrame:
         passed=np.frombuffer(payload, dtype=PASSED, count=passed_count, offset=flags_end),
         largest_degree=degree,
     )
+    share = Share(epoch, running_sum, out_neighbours, names_heard)
     frame.__dict__.update(  # each receiver reads these, and a property takes longer when it is first read
-        code=name,
-        moments=plain_moments(*prior),
         out_neighbours=out_neighbours,
         names_heard=names_heard,
-        share=Share(epoch, running_sum, out_neighbours, names_heard),
-        record=passed_record(name, frame.increment),
-        passed_records=records,
+        row=_row(frame, name, share, records),
         fingerprint=_fingerprint(frame.name, frame.increment),
     )
     return frame

@@ -208,18 +208,16 @@ class NumberedTimer(asyncio.TimerHandle):
     orders are tried, `setter` has the name of what has set the timer, and its callback. `node` is whose it is.
     """
 
-    __slots__ = ("_place", "node", "setter")
+    __slots__ = ("_due", "node", "setter")
     node: object
     setter: tuple[str, object]
 
     def __init__(self, place: Any, *rest: Any) -> None:
         super().__init__(*rest)
-        self._place = place
+        self._due = self.when(), place
 
     def __lt__(self, other: asyncio.TimerHandle) -> bool:
-        assert isinstance(other, NumberedTimer)
-        when, others = self.when(), other.when()
-        return when < others or (when == others and self._place < other._place)
+        return self._due < other._due  # type: ignore[attr-defined,no-any-return]  # all of a loop's are numbered
 
 
 def _private(owner: object) -> Any:

@@ -20,6 +20,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
@@ -122,7 +123,8 @@ class Peers:
 
     def longest_silence(self, peers: Set[str]) -> int:
         """Number of rounds since the most silent of `peers` was received."""
-        return max([self._round - self._received.get(peer, self._round) for peer in peers], default=0)
+        received, now = self._received, self._round
+        return now - min([received.get(peer, now) for peer in peers], default=now)
 
     def drop(self, peer: str) -> None:
         """Forget a peer at once."""
@@ -312,8 +314,11 @@ class RatioConsensus:
             self._mass = x - x_given * given, y - y_given * given, w - w_given * given
 
 
+_epoch = itemgetter(0)
+
+
 def _newest_epoch(shares: Mapping[str, Share]) -> int:
-    return max([share.epoch for share in shares.values()], default=0)
+    return max(map(_epoch, shares.values()), default=0)
 
 
 class DirectMean:

@@ -68,6 +68,8 @@ class OwnKalman:
         (ll, ls, lv), (_, ss, sv), (_, _, vv) = (covariance[row][2:] for row in (2, 3, 4))
         self._o = ll, ls, lv, ss, sv, vv
         self._keep_some_variance()
+        self._moments: tuple[Three, Five] | None = None
+        self._belief: tuple[Three, Information] | None = None
 
     @classmethod
     def start(cls, point_m: Array, heading_rad: float, model: LaneModel, belief: tuple[Array, Array]) -> OwnKalman:
@@ -111,25 +113,32 @@ class OwnKalman:
     @property
     def estimate_m(self) -> Array:
         """Estimate (2,) of the common error."""
-        return np.array(self._out_of_lane(*self._common))
+        return np.array(self.plain_moments[:2])
 
     @property
     def estimate_covariance_m2(self) -> Array:
         """Covariance (2, 2) of the common error."""
-        xx, xy, yy = self._turned_out_of_lane(*self._p)
+        _, _, xx, xy, yy = self.plain_moments
         return np.array([[xx, xy], [xy, yy]])
+
+    # What changes a moment of c makes another tuple of its variances: as long as that is the same, so are these.
 
     @property
     def plain_moments(self) -> Five:
         """Mean (x, y) and covariance (xx, xy, yy) of c."""
-        return *self._out_of_lane(*self._common), *self._turned_out_of_lane(*self._p)
+        if self._moments is None or self._moments[0] is not self._p:
+            moments = *self._out_of_lane(*self._common), *self._turned_out_of_lane(*self._p)
+            self._moments = self._p, moments
+        return self._moments[1]
 
     @property
     def belief(self) -> Information:
         """The belief about c."""
-        x, y, p, q, r = self.plain_moments
-        a, b, d = inverted(p, q, r)
-        return Information((a, b, d, a * x + b * y, b * x + d * y))
+        if self._belief is None or self._belief[0] is not self._p:
+            x, y, p, q, r = self.plain_moments
+            a, b, d = inverted(p, q, r)
+            self._belief = self._p, Information((a, b, d, a * x + b * y, b * x + d * y))
+        return self._belief[1]
 
     def position_m(self) -> tuple[Array, Array]:
         """Return the position (2,) of the vehicle and its covariance (2, 2)."""
@@ -144,8 +153,8 @@ class OwnKalman:
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Draw `count` hypotheses (count, 2) of c."""
-        x, y = self._out_of_lane(*self._common)
-        a, b, d = rooted(*self._turned_out_of_lane(*self._p))
+        x, y, *covariance_m2 = self.plain_moments
+        a, b, d = rooted(*covariance_m2)
         first, second = rng.standard_normal((2, count))
         return np.stack([x + a * first + b * second, y + b * first + d * second], axis=1)
 
