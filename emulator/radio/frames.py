@@ -77,6 +77,19 @@ def allowed_period_ms(periods_ms: tuple[int, ...], asked: SentFrame) -> int:
     return int(asked.period_ms) if asked.period_ms in periods_ms else 0
 
 
+class InSlot(NamedTuple):
+    """A sidelink's transmission in a slot, on `length` subchannels: (N,) each over the receivers.
+
+    `power_mw` is its power, `others_mw` that of all other signals on its resource; `deaf` marks the vehicles that
+    transmitted in the slot, and heard nothing.
+    """
+
+    power_mw: NDArray[np.float64]
+    others_mw: NDArray[np.float64]
+    deaf: NDArray[np.bool_]
+    length: int
+
+
 class Signal(Struct, eq=False):
     """A frame's signal at the receivers, (N,) each; the entry of its own sender holds the transmit power.
 
@@ -87,8 +100,7 @@ class Signal(Struct, eq=False):
     are tuples (time, total power): until this time in ns the sum of all powers on air was this (N,), in mW. They
     are empty for a frame that was alone on air.
 
-    On a sidelink `slots` has instead, for each slot in which it was transmitted, the power of all other signals on
-    its resource (N,) in mW, and the mask (N,) of the vehicles that transmitted, and heard nothing.
+    On a sidelink `slots` has instead what became of it in each slot in which it was transmitted.
     """
 
     random_draws: NDArray[np.uint64]
@@ -96,7 +108,7 @@ class Signal(Struct, eq=False):
     sender_draws: int
     locked: NDArray[np.bool_] | None = None
     pieces: list[tuple[int, NDArray[np.float64]]] = []
-    slots: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = []
+    slots: list[InSlot] = []
 
 
 @dataclass(frozen=True)

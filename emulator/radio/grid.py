@@ -83,10 +83,10 @@ class Candidates(NamedTuple):
         mask[index] = True
         return self._replace(mask=mask.reshape(self.mask.shape))
 
-    def within(self, first: int, last: int) -> Candidates:
-        """Return the candidates in some slots."""
-        slots = self.first + np.arange(len(self.mask))
-        return self._replace(mask=self.mask & ((slots >= first) & (slots <= last))[:, None])
+    def around(self, slot: int, most: int) -> Candidates:
+        """Return the candidates in the slots that are at most so many before or after one, without it."""
+        away = np.abs(self.first + np.arange(len(self.mask)) - slot)
+        return self._replace(mask=self.mask & ((away > 0) & (away <= most))[:, None])
 
 
 class Places(NamedTuple):

@@ -61,18 +61,22 @@ class Signals:
     def of(self, frame: Frame) -> Signal:
         """Return the signal of a frame."""
         random_draws = self._draws.words(frame.sender, frame.seq, self.count, frame.draw)
+        return Signal(random_draws, self.power_mw(frame, random_draws), random_draws.item(frame.sender))
+
+    def power_mw(self, frame: Frame, fading_draws: Words) -> Array:
+        """Return the received powers (N,) in mW of a frame whose fading is drawn by the lowest 16 bits of words."""
         topology, sender = frame.topology, frame.sender
         assert topology.power_mw is not None
         assert topology.fading is not None
         mean_mw = topology.power_mw[sender]
         power_mw = mean_mw.copy()
         if self.nakagami.fades:
-            steps = (random_draws & _LAST).view(np.int64)  # of the type of an index, which numpy need not convert
+            steps = (fading_draws & _LAST).view(np.int64)  # of the type of an index, which numpy need not convert
             power_mw *= self.nakagami.factor(topology.fading[sender], steps)
             power_mw[sender] = mean_mw[sender]
         if frame.gain_db:
             power_mw *= 10 ** (frame.gain_db / 10)
-        return Signal(random_draws, power_mw, random_draws.item(sender))
+        return np.asarray(power_mw)
 
 
 def milliwatts(dbm: float) -> float:

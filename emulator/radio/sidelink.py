@@ -20,12 +20,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 from heapq import heappop, heappush
 
 import numpy as np
 
-from emulator.radio.frames import Frame, Receptions, Signal, Transmission
+from emulator.radio.frames import Frame, InSlot, Receptions, Signal, Transmission
 from emulator.radio.grid import BusyMeter, Candidates, Heard, Places, SensedGrid, Wanted
 from emulator.radio.mac import Mac, ThrottledQueue
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
@@ -56,8 +55,9 @@ CHANNEL_KHZ = 9000
 """Width of the 50 resource blocks of 10 MHz, over which `radio.receiver.noise_dbm` is given."""
 _CHOICE, _COUNTER, _KEEP, _REPEAT, _SHOT, _AGAIN, _TIES = range(7)
 """Indices of a frame's draws."""
-_SECOND = np.uint64(0x9E3779B97F4A7C15)
-"""Odd factor that makes the draws of a second transmission out of those of the first."""
+_SECOND, _SECOND_FADING = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1B54A32D192ED03)
+"""Odd factors that make the draws of a second transmission, and those of its fading, out of those of the first."""
+_HIGH = np.uint64(48)
 
 DECISION, READY, CHECK = range(3)
 """Kinds of events, in the order in which those of one time are processed."""
@@ -83,20 +83,42 @@ class _Grant:
 
 @dataclass(slots=True, eq=False)
 class _Station:
-    """A sender: its waiting frames with the slots in which they became ready, its grant, and what it has booked.
+    """A sender: its flows by the period that their frames tell (0 for none), and the slots that it has booked.
 
-    `coming` counts the frames that will be ready, `ready_ns` is when the last of them is. `sent_ns` are the last
-    times at which frames came, `used` the last slots and lengths of its transmissions.
+    `coming` counts the frames that will be ready, `ready_ns` is when the last of them is. `used` are the last slots
+    and lengths of its transmissions.
     """
 
     node: int
-    queue: deque[tuple[int, Transmission]] = field(default_factory=deque)
+    flows: dict[float, _Flow] = field(default_factory=dict)
     coming: int = 0
     ready_ns: int = 0
-    grant: _Grant | None = None
     booked: set[int] = field(default_factory=set)
-    sent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS + 1))
     used: deque[tuple[int, int]] = field(default_factory=deque)
+
+    def flow(self, period_ms: float) -> _Flow:
+        """Return the flow of the frames that tell a period."""
+        if period_ms not in self.flows:
+            self.flows[period_ms] = _Flow(self)
+        return self.flows[period_ms]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that have not been sent."""
+        return self.coming + sum(len(flow.queue) for flow in self.flows.values())
+
+
+@dataclass(slots=True, eq=False)
+class _Flow:
+    """Frames of one period of a sender: those that wait with the slots in which they became ready, and their grant.
+
+    `sent_ns` are the last times at which frames came.
+    """
+
+    station: _Station
+    queue: deque[tuple[int, Transmission]] = field(default_factory=deque)
+    grant: _Grant | None = None
+    sent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS + 1))
     until_shot: int = 0
 
 
@@ -108,7 +130,7 @@ class _Booking:
     that was allowed. `is_repeat` marks a second transmission.
     """
 
-    station: _Station
+    flow: _Flow
     slot: int
     subchannel: int
     length: int
@@ -118,6 +140,11 @@ class _Booking:
     period: int = 0
     last: int = 0
     is_repeat: bool = False
+
+    @property
+    def station(self) -> _Station:
+        """The sender."""
+        return self.flow.station
 
 
 _Event = tuple[int, int, int, int, Transmission | _Booking | None]
@@ -179,7 +206,7 @@ class Sidelink(Mac):
         slow_ns: int | None = ready_ns
         if self._throttle.slows(frame.sender):
             slow_ns = self._throttle.put(frame, ready_ns, self._limit)
-        if slow_ns is None or station.coming + len(station.queue) >= self._limit:
+        if slow_ns is None or station.frames >= self._limit:
             self._leave(sent, Outcome.queue_full, frame.sent_ns)
             return
         station.ready_ns = max(slow_ns, station.ready_ns)
@@ -229,71 +256,71 @@ class Sidelink(Mac):
         """Give a frame a place in its sender's grant, or a resource of its own."""
         frame, slot = sent.frame, self._now_ns // self._slot_ns
         station.coming -= 1
-        station.sent_ns.append(frame.sent_ns)
+        flow = station.flow(frame.period_ms)
+        flow.sent_ns.append(frame.sent_ns)
         length = self._link.length(frame.size_bytes)
-        told = frame.period_ms * NS_PER_MS // self._slot_ns
-        grant = station.grant
-        if grant is not None and (grant.length < length or (told and told != grant.period)):
-            station.grant = grant = None
+        grant = flow.grant
+        if grant is not None and grant.length < length:
+            flow.grant = grant = None
         if self._is_dynamic:
-            self._send_alone(station, sent, slot, length)
+            self._send_alone(flow, sent, slot, length)
         elif grant is None:
-            station.queue.append((slot, sent))
-            self._reserve(station, slot)
-        elif self._is_one_shot(station, frame):
+            flow.queue.append((slot, sent))
+            self._reserve(flow, slot)
+        elif self._is_one_shot(flow, frame):
             grant.skips += 1
-            self._send_alone(station, sent, slot, length)
+            self._send_alone(flow, sent, slot, length)
         else:
             late = max(0, -(-(slot + self._mac.t1_slots - grant.slot) // grant.period))
-            turn = grant.slot + grant.period * max(late, len(station.queue) + grant.skips)
-            if turn > slot + max(self._t2_slots, grant.period):
-                self._send_alone(station, sent, slot, length)
+            turn = grant.slot + grant.period * max(late, len(flow.queue) + grant.skips)
+            if turn > slot + self._t2_slots:
+                self._send_alone(flow, sent, slot, length)
             else:
-                station.queue.append((slot, sent))
+                flow.queue.append((slot, sent))
 
-    def _is_one_shot(self, station: _Station, frame: Frame) -> bool:
+    def _is_one_shot(self, flow: _Flow, frame: Frame) -> bool:
         """Return true if it is time to send one frame elsewhere, which a persistent collision cannot reach."""
         if not self._one_shot:
             return False
-        station.until_shot -= 1
-        if station.until_shot > 0:
+        flow.until_shot -= 1
+        if flow.until_shot > 0:
             return False
         least, most = ONE_SHOT
-        is_first = station.until_shot < 0
-        station.until_shot = least + int(self._draw(frame, _SHOT) * (most - least + 1))
+        is_first = flow.until_shot < 0
+        flow.until_shot = least + int(self._draw(frame, _SHOT) * (most - least + 1))
         return not is_first
 
-    def _period(self, station: _Station, frame: Frame) -> int:
+    def _period(self, flow: _Flow, frame: Frame) -> int:
         """Return the reservation interval in slots: what a program says, or what its frames' intervals are."""
         period_ms = frame.period_ms or self._mac.reservation_ms
-        times_ns = station.sent_ns
+        times_ns = flow.sent_ns
         if not frame.period_ms and len(times_ns) > 1 and times_ns[-1] > times_ns[0]:
             mean_ms = (times_ns[-1] - times_ns[0]) / (len(times_ns) - 1) / NS_PER_MS
             period_ms = min(self._mac.periods_ms, key=lambda each: (abs(each - mean_ms), each))
         return period_ms * NS_PER_MS // self._slot_ns
 
-    def _reserve(self, station: _Station, slot: int) -> None:
+    def _reserve(self, flow: _Flow, slot: int) -> None:
         """Select a resource in `slot` for the frames that wait, and for those to come."""
-        frame = station.queue[0][1].frame
-        length = self._link.length(max(sent.frame.size_bytes for _, sent in station.queue))
-        period = self._period(station, frame)
+        frame = flow.queue[0][1].frame
+        length = self._link.length(max(sent.frame.size_bytes for _, sent in flow.queue))
+        period = self._period(flow, frame)
         counter = self._counter(frame, period)
         last = slot + max(self._mac.t1_slots, min(self._t2_slots, period))
-        wanted = Wanted(station.node, slot + self._mac.t1_slots, last, length, period, 10 * counter)
-        first, subchannel, repeat = self._select(station, frame, wanted, _CHOICE)
-        station.grant = _Grant(first, subchannel, length, period, counter, repeat)
-        self._book(self._use_of(station, last), checks=True)
+        wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, period, 10 * counter)
+        first, subchannel, repeat = self._select(flow.station, frame, wanted, _CHOICE)
+        flow.grant = _Grant(first, subchannel, length, period, counter, repeat)
+        self._book(self._use_of(flow, last), checks=True)
 
     def _counter(self, frame: Frame, period: int) -> int:
         least, most = self._mac.counters(period * self._slot_ns // NS_PER_MS)
         return least + int(self._draw(frame, _COUNTER) * (most - least + 1))
 
-    def _use_of(self, station: _Station, last: int = 0) -> _Booking:
-        """Return the next use of a station's grant."""
-        grant = station.grant
+    def _use_of(self, flow: _Flow, last: int = 0) -> _Booking:
+        """Return the next use of a flow's grant."""
+        grant = flow.grant
         assert grant is not None
         return _Booking(
-            station=station,
+            flow=flow,
             slot=grant.slot,
             subchannel=grant.subchannel,
             length=grant.length,
@@ -303,32 +330,37 @@ class Sidelink(Mac):
             last=last,
         )
 
-    def _send_alone(self, station: _Station, sent: Transmission, slot: int, length: int) -> None:
+    def _send_alone(self, flow: _Flow, sent: Transmission, slot: int, length: int) -> None:
         """Select a resource for one frame."""
         last = slot + self._t2_slots
-        wanted = Wanted(station.node, slot + self._mac.t1_slots, last, length, 0, 1)
-        first, subchannel, repeat = self._select(station, sent.frame, wanted, _CHOICE)
-        self._book(_Booking(station, first, subchannel, length, sent, repeat=repeat, last=last), checks=True)
+        wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, 0, 1)
+        first, subchannel, repeat = self._select(flow.station, sent.frame, wanted, _CHOICE)
+        self._book(_Booking(flow, first, subchannel, length, sent, repeat=repeat, last=last), checks=True)
 
     def _select(
         self, station: _Station, frame: Frame, wanted: Wanted, which: int
     ) -> tuple[int, int, tuple[int, int] | None]:
         """Return the slot and the subchannel of a resource, and (slots later, subchannel) of a second one."""
-        found = self._candidates(station, frame, wanted)
-        slot, subchannel = found.chosen(self._draw(frame, which))
-        repeat = None
-        if self._mac.retransmit:
-            later = found.within(slot + 1, slot + REPEAT_SLOTS)
-            if later.mask.any():
-                second = later.chosen(self._draw(frame, _REPEAT))
-                repeat = second[0] - slot, second[1]
-        return slot, subchannel, repeat
+        return self._pair(self._candidates(station, frame, wanted), frame, which)
+
+    def _pair(self, found: Candidates, frame: Frame, which: int) -> tuple[int, int, tuple[int, int] | None]:
+        """Choose among candidates; the earlier one of two that are chosen is used first."""
+        first = found.chosen(self._draw(frame, which))
+        near = found.around(first[0], REPEAT_SLOTS)
+        if not self._mac.retransmit or not near.mask.any():
+            return *first, None
+        first, second = sorted([first, near.chosen(self._draw(frame, _REPEAT))])
+        return *first, (second[0] - first[0], second[1])
 
     def _candidates(self, station: _Station, frame: Frame, wanted: Wanted) -> Candidates:
         booked = set(station.booked)
-        if (grant := station.grant) is not None:
-            for slot in range(grant.slot, wanted.last + 1, grant.period):
-                booked |= {slot, slot + grant.repeat[0]} if grant.repeat else {slot}
+        horizon = wanted.last + wanted.period * (wanted.times // 10 - 1) if wanted.period else wanted.last
+        for grant in [flow.grant for flow in station.flows.values() if flow.grant is not None]:
+            uses = {*range(grant.slot, horizon + 1, grant.period)}
+            uses |= {slot + grant.repeat[0] for slot in uses} if grant.repeat else set()
+            if wanted.period:  # its later uses must not meet them either
+                uses = {wanted.first + (slot - wanted.first) % wanted.period for slot in uses}
+            booked |= uses
         now = self._now_ns // self._slot_ns
         self._sense(now)
         found = self._grid.candidates(now, wanted._replace(booked=frozenset(booked)))
@@ -351,25 +383,25 @@ class Sidelink(Mac):
 
     def _check_again(self, booking: _Booking) -> None:
         """Select another resource if the one that was selected has been reserved meanwhile (re-evaluation)."""
-        station, grant = booking.station, booking.grant
-        if grant is not None and (station.grant is not grant or not station.queue):
+        flow, station, grant = booking.flow, booking.station, booking.grant
+        if grant is not None and (flow.grant is not grant or not flow.queue):
             return
-        sent = booking.sent or station.queue[0][1]
+        sent = booking.sent or flow.queue[0][1]
         times = 10 * grant.counter if grant is not None else 1
         wanted = Wanted(station.node, booking.slot, booking.last, booking.length, booking.period, times)
         station.booked.discard(booking.slot)
         if grant is not None:
-            station.grant = None  # whose own slots are free to it
+            flow.grant = None  # whose own slots are free to it
         found = self._candidates(station, sent.frame, wanted)
         if grant is not None:
-            station.grant = grant
+            flow.grant = grant
         if found.has(booking.slot, booking.subchannel) or not found.mask.any():
             station.booked.add(booking.slot)
             return
         self._booked[booking.slot].remove(booking)
-        booking.slot, booking.subchannel = found.chosen(self._draw(sent.frame, _AGAIN))
+        booking.slot, booking.subchannel, booking.repeat = self._pair(found, sent.frame, _AGAIN)
         if grant is not None:
-            grant.slot, grant.subchannel = booking.slot, booking.subchannel
+            grant.slot, grant.subchannel, grant.repeat = booking.slot, booking.subchannel, booking.repeat
         self._book(booking)
 
     # Slots.
@@ -394,15 +426,15 @@ class Sidelink(Mac):
 
     def _use_grant(self, booking: _Booking, is_free: bool) -> None:
         """Take the frame that is sent on a grant's next resource, if any waits, and book the one after it."""
-        station, grant = booking.station, booking.grant
-        if grant is None or station.grant is not grant or grant.slot != booking.slot:
+        flow, grant = booking.flow, booking.grant
+        if grant is None or flow.grant is not grant or grant.slot != booking.slot:
             return
         latest = booking.slot - self._mac.t1_slots
         if grant.skips:
             grant.skips, grant.unused = grant.skips - 1, 0
             grant.counter -= 1
-        elif is_free and station.queue and station.queue[0][0] <= latest:
-            booking.sent = station.queue.popleft()[1]
+        elif is_free and flow.queue and flow.queue[0][0] <= latest:
+            booking.sent = flow.queue.popleft()[1]
             grant.unused = 0
             grant.counter -= 1
             if grant.counter <= 0 and self._draw(booking.sent.frame, _KEEP) < self._mac.keep_probability:
@@ -413,11 +445,11 @@ class Sidelink(Mac):
             grant.unused += 1
         grant.slot += grant.period
         if grant.counter > 0 and grant.unused < UNUSED:
-            self._book(self._use_of(station))
+            self._book(self._use_of(flow))
             return
-        station.grant, booking.period = None, 0
-        if station.queue:
-            self._reserve(station, self._now_ns // self._slot_ns)
+        flow.grant, booking.period = None, 0
+        if flow.queue:
+            self._reserve(flow, self._now_ns // self._slot_ns)
 
     def _give_up(self, booking: _Booking) -> None:
         """Drop a frame that may not be sent; one that was sent before is complete without the second time."""
@@ -467,7 +499,7 @@ class Sidelink(Mac):
         del self._on_air[:count]
         on_air = [booking for some in bookings for booking in some]
         nodes = [booking.station.node for booking in on_air]
-        power_mw = np.array([_signal(booking.sent).power_mw for booking in on_air])
+        power_mw = np.array([self._power_mw(booking) for booking in on_air])
         places = Places(
             slot=np.repeat(np.arange(count), [len(some) for some in bookings]),
             first=np.array([booking.subchannel for booking in on_air]),
@@ -486,12 +518,19 @@ class Sidelink(Mac):
         is_busy = (sensed_mw >= self._link.busy_mw).view(np.uint8)
         busy = np.add.reduce(is_busy, axis=1, dtype=np.uint8).astype(np.int64)
         busy[places.slot, nodes] = places.length
-        for booking, each_mw, index in zip(on_air, others_mw, places.slot.tolist(), strict=True):
-            _signal(booking.sent).slots.append((each_mw, deaf[index]))
+        for booking, own_mw, each_mw, index in zip(on_air, power_mw, others_mw, places.slot.tolist(), strict=True):
+            _signal(booking.sent).slots.append(InSlot(own_mw, each_mw, deaf[index], booking.length))
         periods = np.array([booking.period for booking in on_air])
         self._grid.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods))
         for slot, each in zip(slots, busy, strict=True):
             self._meter.add(slot, each)
+
+    def _power_mw(self, booking: _Booking) -> Array:
+        """Return the powers (N,) of a transmission: a second one has fading of its own."""
+        signal = _signal(booking.sent)
+        if booking.sent is not None and booking.is_repeat:
+            return self._signals.power_mw(booking.sent.frame, signal.random_draws * _SECOND_FADING >> _HIGH)
+        return signal.power_mw
 
     def _follow(self, booking: _Booking) -> None:
         """Book the second transmission of a frame, or leave it to be judged."""
@@ -502,7 +541,7 @@ class Sidelink(Mac):
         gap, subchannel = booking.repeat
         self._book(
             _Booking(
-                station=booking.station,
+                flow=booking.flow,
                 slot=booking.slot + gap,
                 subchannel=subchannel,
                 length=booking.length,
@@ -596,24 +635,27 @@ class SidelinkReception:
         if not sent:
             return
         signals = [_signal(transmissions[index]) for index in sent]
-        sizes = [self._link.length(transmissions[index].frame.size_bytes) for index in sent]
-        noise_mw = np.array([self._link.noise_mw(length) for length in sizes])
-        power_mw = np.array([signal.power_mw for signal in signals])
         words = np.array([signal.random_draws for signal in signals])
-        detected = power_mw >= self._link.sensing_mw
-        undecided = detected & (receptions.outcome[sent] == PENDING)
-        deaf, alone, received = np.ones((3, *power_mw.shape), bool)
-        alone[:], received[:] = False, False
+        undecided = receptions.outcome[sent] == PENDING
+        deaf, detected, alone, received = np.zeros((4, *words.shape), bool)
+        deaf[:] = True
         for nth in range(max(len(signal.slots) for signal in signals)):
-            slots = [signal.slots[nth] if nth < len(signal.slots) else None for signal in signals]
-            silent = np.array([np.ones(self._count, bool) if slot is None else slot[1] for slot in slots])
-            others_mw = np.array([np.zeros(self._count) if slot is None else slot[0] for slot in slots])
-            deaf &= silent
-            able = np.flatnonzero(undecided & ~silent)
-            own_mw, noise, drawn = power_mw.ravel()[able], noise_mw[able // self._count], words.ravel()[able]
+            frames = np.array([index for index, signal in enumerate(signals) if nth < len(signal.slots)])
+            slots = [signals[index].slots[nth] for index in frames]
+            silent = np.array([slot.deaf for slot in slots])
+            power_mw = np.array([slot.power_mw for slot in slots])
+            others_mw = np.array([slot.others_mw for slot in slots])
+            noise_mw = np.array([self._link.noise_mw(slot.length) for slot in slots])
+            deaf[frames] &= silent
+            hears = (power_mw >= self._link.sensing_mw) & ~silent
+            detected[frames] |= hears
+            able = np.flatnonzero(hears & undecided[frames])
+            own_mw, noise = power_mw.ravel()[able], noise_mw[able // self._count]
+            place = frames[able // self._count] * self._count + able % self._count
+            drawn = words.ravel()[place]
             draws = reception_draws(drawn * _SECOND if nth else drawn)
-            alone.ravel()[able] |= draws >= self._link.error_rate(own_mw / noise)
-            received.ravel()[able] |= draws >= self._link.error_rate(own_mw / (noise + others_mw.ravel()[able]))
+            alone.ravel()[place] |= draws >= self._link.error_rate(own_mw / noise)
+            received.ravel()[place] |= draws >= self._link.error_rate(own_mw / (noise + others_mw.ravel()[able]))
         for mask, outcome in (
             (deaf, Outcome.half_duplex),
             (~detected, Outcome.below_sensing),
@@ -630,17 +672,19 @@ class SidelinkReception:
         `frame_index` and `receiver` (n,) name the receptions. Of two transmissions the ratio is the better one.
         Both are NaN for a frame that was not sent, and out of range.
         """
-        own_mw, others_mw = np.full((2, len(transmissions), self._count), np.nan)
+        own_mw, ratio = np.full((2, len(transmissions), self._count), np.nan)
         for index, sent in enumerate(transmissions):
             if sent.sender_outcome == Outcome.pending:
-                signal = _signal(sent)
-                own_mw[index] = signal.power_mw
-                others_mw[index] = self._link.noise_mw(self._link.length(sent.frame.size_bytes))
-                others_mw[index] += reduce(np.minimum, [others for others, _ in signal.slots])
+                for slot in _signal(sent).slots:
+                    each = slot.power_mw / (self._link.noise_mw(slot.length) + slot.others_mw)
+                    better = ~(each <= ratio[index])
+                    own_mw[index], ratio[index] = np.where(
+                        better, [slot.power_mw, each], [own_mw[index], ratio[index]]
+                    )
         place = frame_index * self._count + receiver  # a look-up with one index is much faster than with two
-        power_mw = own_mw.ravel()[place]
-        power_mw[power_mw == 0] = np.nan
-        return np.asarray(10 * np.log10([power_mw, power_mw / others_mw.ravel()[place]]))
+        found = np.array([own_mw.ravel()[place], ratio.ravel()[place]])
+        found[:, found[0] == 0] = np.nan
+        return np.asarray(10 * np.log10(found))
 
 
 def _signal(sent: Transmission | None) -> Signal:

@@ -6,14 +6,13 @@ Each section adds a stage to the channel: without any of them the radio is the d
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from emulator.scenario.network import OriginDeg
-from emulator.scenario.sections import Section, Switch
+from emulator.scenario.sections import Section, Switch, must_grow
 from emulator.scenario.sidelink import CrLimit, LteMode4, NrMode2
 
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
@@ -135,8 +134,7 @@ class Fading(Section):
     def _a_shape_for_each_stretch(self) -> Fading:
         if len(self.m) != len(self.until_m) + 1:
             raise ValueError(f"{len(self.m)} shapes m need {len(self.m) - 1} distances until_m between them")
-        if any(far <= near for near, far in pairwise(self.until_m)):
-            raise ValueError("the distances until_m must grow")
+        must_grow("until_m", self.until_m)
         return self
 
 
@@ -187,8 +185,7 @@ class EtsiReactive(Section):
     def _a_pause_for_each_state(self) -> EtsiReactive:
         if len(self.pause_ms) != len(self.busy) + 1:
             raise ValueError(f"{len(self.pause_ms)} pauses need {len(self.pause_ms) - 1} busy ratios between them")
-        if any(more <= less for less, more in pairwise(self.busy)):
-            raise ValueError("the busy ratios must grow")
+        must_grow("busy", self.busy)
         return self
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -137,3 +138,10 @@ def _sections_in(annotation: Any) -> Iterator[type[BaseModel]]:
             yield from annotation.kinds.values()
     for part in get_args(annotation):
         yield from _sections_in(part)
+
+
+def must_grow(name: str, values: Sequence[float]) -> None:
+    """Require each value to be greater than the one before. Raises ValueError that names the first that is not."""
+    for index, (before, value) in enumerate(pairwise(values), 1):
+        if value <= before:
+            raise ValueError(f"{name}.{index} = {value:g}: must be greater than the value before it, {before:g}")

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from emulator.scenario.sections import Section, Switch
+from emulator.scenario.sections import Section, Switch, must_grow
 from vnet.units import NS_PER_MS
 
 QPSK_07_SINR_DB = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 20.0, 20.001)
@@ -53,7 +53,7 @@ class Sidelink(Section):
     t2_ms: int = Field(100, ge=10, le=100)
     """End of the selection window, and the delay beyond which a frame gets a resource of its own."""
     retransmit: Switch = False
-    """True if each frame is transmitted twice, the second time within 15 slots."""
+    """True if each frame is transmitted twice within 16 slots, wherever candidates for that are left."""
     in_band_emission_db: float = Field(30.0, ge=0, le=300)
     """Attenuation of a signal in the subchannels that it does not use."""
     busy_dbm: float = Field(-94.0, ge=-300, le=100)
@@ -98,12 +98,12 @@ class Sidelink(Section):
             raise ValueError(f"t2_ms = {self.t2_ms}: must be later than t1_slots = {self.t1_slots}")
         if len(self.bler) != len(self.bler_sinr_db) or not self.bler:
             raise ValueError(
-                f"bler has {len(self.bler)} entries, and bler_sinr_db {len(self.bler_sinr_db)}: they need as many"
+                f"bler has {len(self.bler)} values, bler_sinr_db {len(self.bler_sinr_db)}: need as many, at least 1"
             )
-        if any(more <= less for less, more in pairwise(self.bler_sinr_db)):
-            raise ValueError("bler_sinr_db must grow")
-        if any(more > less for less, more in pairwise(self.bler)):
-            raise ValueError("bler must not grow with the ratio")
+        must_grow("bler_sinr_db", self.bler_sinr_db)
+        for index, (before, rate) in enumerate(pairwise(self.bler), 1):
+            if rate > before:
+                raise ValueError(f"bler.{index} = {rate:g}: must be at most the value before it, {before:g}")
         return self
 
 
@@ -176,8 +176,7 @@ class CrLimit(Section):
     def _a_limit_for_each_busy_ratio(self) -> CrLimit:
         if len(self.busy) != len(self.most):
             raise ValueError(f"{len(self.busy)} busy ratios need as many limits most, not {len(self.most)}")
-        if any(more <= less for less, more in pairwise(self.busy)):
-            raise ValueError("the busy ratios must grow")
+        must_grow("busy", self.busy)
         return self
 
 

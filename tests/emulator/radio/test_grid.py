@@ -163,9 +163,9 @@ def test_nr_takes_any_of_the_candidates() -> None:
     assert [found.chosen(u / 80) for u in range(80)] == [(1 + n // 2, n % 2) for n in range(80)]
 
 
-def test_candidates_within_slots() -> None:
-    found = Candidates(10, np.ones((5, 2), bool), None).within(12, 13)
-    assert found.mask.sum() == 4 and found.has(12, 0) and not found.has(14, 0) and not found.has(9, 0)
+def test_candidates_around_a_slot() -> None:
+    found = Candidates(10, np.ones((5, 2), bool), None).around(12, 1)
+    assert found.mask.sum() == 4 and found.has(11, 0) and found.has(13, 1) and not found.has(12, 0)
 
 
 @pytest.mark.parametrize("scs_khz", [15, 30, 60])

@@ -151,6 +151,34 @@ def test_a_period_is_learned_from_frames_where_a_program_does_not_say_it() -> No
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("radio", [LTE, NR])
+def test_flows_of_two_periods_have_a_reservation_each(radio: dict[str, Any]) -> None:
+    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, keep_probability=0.8))
+    for n in range(100):
+        for period_ms, size in ((100, 100), (200, 120))[: 2 - n % 2]:
+            subject.transmit(n * 100 * MS, 0, [SentFrame("", bytes(size), period_ms=period_ms)])
+        subject.advance(n * 100 * MS)
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()
+    for size, period_ms in ((100, 100), (120, 200)):
+        on_air_ns = [row["on_air_ns"] for row in rows if row["size_bytes"] == size]
+        kept = sum(after - before == period_ms * MS for before, after in pairwise(on_air_ns))
+        assert kept >= 0.8 * len(on_air_ns)
+    assert len({row["on_air_ns"] for row in rows}) == len(rows)
+
+
+@pytest.mark.parametrize("radio", [LTE, NR])
+def test_a_frame_that_would_wait_longer_than_t2_has_a_resource_of_its_own(radio: dict[str, Any]) -> None:
+    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, t2_ms=20))
+    for time_ms in (0, 500, 1000, 1200):
+        subject.transmit(time_ms * MS, 0, [SentFrame("", b"x", period_ms=500)])
+        subject.advance(time_ms * MS)
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()
+    assert max(row["left_ns"] - row["sent_ns"] for row in rows) <= 22 * MS
+
+
+@pytest.mark.slow
 def test_one_shots_leave_the_reservation_now_and_then() -> None:
     rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True, keep_probability=0.8)), 1, 20.0)
     phases = Counter(row["on_air_ns"] % (100 * MS) for row in rows)
@@ -199,8 +227,34 @@ def test_a_second_transmission_saves_frames_and_arrives_after_it() -> None:
     )
     share = [sum(row["outcome"] == "delivered" for row in rows) / len(rows) for rows in (once, twice)]
     assert share[1] > share[0]
-    assert {(row["left_ns"] - row["on_air_ns"]) // MS for row in twice} <= set(range(1, 17))
+    assert {(row["left_ns"] - row["on_air_ns"]) // MS for row in twice} <= set(range(2, 17))
     assert {(row["left_ns"] - row["on_air_ns"]) // MS for row in once} == {1}
+
+
+@pytest.mark.slow
+def test_a_second_transmission_has_fading_of_its_own() -> None:
+    fading = {"fading": {"m": [1.0], "until_m": []}, "receiver": {"noise_figure_db": 30.0}}
+    lost = []
+    for again in (False, True):
+        rows = beacons(engine(line(0, 200), **with_mac(LTE | fading, retransmit=again)), 1, 150.0)
+        lost.append(sum(row["outcome"] != "delivered" for row in rows))
+    assert lost[0] > 150 and chance(lost[1], 1500, (lost[0] / 1500) ** 2)
+
+
+@pytest.mark.slow
+def test_noise_is_that_of_the_subchannels_on_which_a_frame_went_out() -> None:
+    """A short frame on the reservation of a long one is as weak as that one."""
+    faded = Counter[int]()
+    for sizes in ((380,), (380, 190)):
+        noisy = LTE | {"receiver": {"noise_figure_db": 23.0}}
+        subject = engine(line(0, 320), access_jitter_ms=0.0, **with_mac(noisy, keep_probability=0.8))
+        for n in range(1000):
+            subject.transmit(n * 100 * MS, 0, [SentFrame("", bytes(sizes[n % len(sizes)]), period_ms=100)])
+            subject.advance(n * 100 * MS)
+        subject.drain()
+        for row in subject.trace.to_table().to_pylist():
+            faded[len(sizes)] += row["outcome"] == "faded"
+    assert faded[1] > 100 and chance(faded[2], 1000, faded[1] / 1000)
 
 
 @pytest.mark.slow
