@@ -98,6 +98,8 @@ def radio_for(
     from emulator.learning.radio_environment import RadioEnvironment
 
     _check("env", env, isinstance(env, ParallelEnv), "a ParallelEnv of pettingzoo is needed", "radio_for")
+    has_agents = bool(getattr(env, "possible_agents", None))
+    _check("env", env, has_agents, "its possible_agents are needed", "radio_for")
     for name, given in {"position_m": position_m, "send": send, "receive": receive}.items():
         _check(name, given, callable(given), "a function is needed", "radio_for")
     is_space = (

@@ -19,7 +19,7 @@ from emulator.learning.vehicle_environment import Spaces, whole_seed
 from emulator.radio.engine import Engine
 from emulator.scenario.scenario import Scenario
 from emulator.world.radio_inputs import RadioInputs, load_buildings, load_links
-from vnet.errors import VnetError, shown
+from vnet.errors import PayloadTooLargeError, VnetError, shown
 from vnet.radio import Packet
 from vnet.types import Array
 
@@ -95,6 +95,8 @@ class RadioEnvironment(BaseParallelWrapper):
             payload = self._send(agent, self._observed[agent], actions[agent])
             if payload is not None and not isinstance(payload, bytes):
                 raise VnetError(f"send({agent!r}) = {shown(payload)}: bytes are needed, or None")
+            if payload is not None and len(payload) > (most := self._scenario.radio.max_payload_bytes):
+                raise PayloadTooLargeError(len(payload), most)
             if payload is not None:
                 self._engine.transmit(self._time_ns, number, [payload])
         observations, *rest = self.env.step(actions)
@@ -110,6 +112,8 @@ class RadioEnvironment(BaseParallelWrapper):
     def _place(self, engine: Engine, agents: Sequence[str]) -> None:
         """Have living agents where they are now; the others neither send nor receive."""
         position_m = self._position_m.copy()
+        if foreign := {*agents} - {*self._node_ids}:
+            raise VnetError(f"step: {shown(min(foreign))} is an agent, but not one of env.possible_agents")
         for number, agent in enumerate(self._node_ids):
             engine.set_up(number, agent in agents)
             if agent in agents:

@@ -145,3 +145,10 @@ def must_grow(name: str, values: Sequence[float]) -> None:
     for index, (before, value) in enumerate(pairwise(values), 1):
         if value <= before:
             raise ValueError(f"{name}.{index} = {value:g}: must be greater than the value before it, {before:g}")
+
+
+def must_not_grow(name: str, values: Sequence[float]) -> None:
+    """Require each value to be at most the one before. Raises ValueError that names the first that is not."""
+    for index, (before, value) in enumerate(pairwise(values), 1):
+        if value > before:
+            raise ValueError(f"{name}.{index} = {value:g}: must be at most the value before it, {before:g}")

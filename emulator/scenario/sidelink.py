@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from emulator.scenario.sections import Section, Switch, must_grow
+from emulator.scenario.sections import Section, Switch, must_grow, must_not_grow
 from vnet.units import NS_PER_MS
 
 QPSK_07_SINR_DB = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 20.0, 20.001)
@@ -30,6 +29,8 @@ class Sidelink(Section):
     ranks_power: ClassVar[bool] = True
     """True if the quietest of the candidates are taken, and not any of them."""
     most_t1: ClassVar[int] = 4
+    most_blocks: ClassVar[int] = 100
+    """Resource blocks of the widest carrier (TS 36.101, TS 38.101)."""
 
     subchannels: int = Field(4, ge=1, le=MOST_SUBCHANNELS)
     """Subchannels, side by side in frequency."""
@@ -101,9 +102,9 @@ class Sidelink(Section):
                 f"bler has {len(self.bler)} values, bler_sinr_db {len(self.bler_sinr_db)}: need as many, at least 1"
             )
         must_grow("bler_sinr_db", self.bler_sinr_db)
-        for index, (before, rate) in enumerate(pairwise(self.bler), 1):
-            if rate > before:
-                raise ValueError(f"bler.{index} = {rate:g}: must be at most the value before it, {before:g}")
+        must_not_grow("bler", self.bler)
+        if (blocks := self.subchannels * self.data_blocks) > self.most_blocks:
+            raise ValueError(f"subchannels × data_blocks = {blocks}: must be at most {self.most_blocks}")
         return self
 
 
@@ -124,6 +125,7 @@ class NrMode2(Sidelink):
     periods_ms: ClassVar[tuple[int, ...]] = (*range(1, 100), *LONG_PERIODS_MS)
     ranks_power: ClassVar[bool] = False
     most_t1: ClassVar[int] = 9
+    most_blocks: ClassVar[int] = 275
 
     kind: Literal["nr-mode2"]
     """This MAC."""
@@ -167,7 +169,7 @@ class CrLimit(Section):
 
     kind: Literal["cr_limit"]
     """This control."""
-    busy: tuple[Annotated[float, Field(ge=0, lt=1)], ...]
+    busy: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(min_length=1)
     """Channel busy ratios from which the limits hold, increasing."""
     most: tuple[Annotated[float, Field(gt=0, le=1)], ...]
     """Largest channel occupancy ratio of a sender over 1000 ms; a frame beyond it is dropped (`no_grant`)."""
@@ -177,6 +179,7 @@ class CrLimit(Section):
         if len(self.busy) != len(self.most):
             raise ValueError(f"{len(self.busy)} busy ratios need as many limits most, not {len(self.most)}")
         must_grow("busy", self.busy)
+        must_not_grow("most", self.most)
         return self
 
 

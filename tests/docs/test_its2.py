@@ -157,6 +157,24 @@ def test_a_bsm_is_read_by_a_second_codec_and_written_with_the_same_bytes(tmp_pat
     assert frame.to_uper() == payload
 
 
+def test_what_a_cpm_cannot_say_is_left_out() -> None:
+    near = Seen((10.0, 0.0), (1.0, 0.0))
+    unsayable = (
+        Seen((2000.0, 0.0), (0, 0)),
+        Seen((0, -1311.0), (0, 0)),
+        Seen((0, 0), (-170.0, 0)),
+        Seen((0, 0), (0, 0), 2.1),
+    )
+    decoded = decode_cpm(encode_cpm(Message(1, 0, (0.0, 0.0), objects=(*unsayable, near)), schema()), schema())
+    assert decoded is not None and [seen.position_m[0] for seen in decoded.objects] == [pytest.approx(10, abs=0.03)]
+
+
+def test_a_vam_of_a_clock_that_is_ahead_has_its_time() -> None:
+    message = Message(1, 10_000_000_000, (0.0, 0.0))
+    decoded = decode_vam(encode_vam(message, schema()), schema(), message.time_ns - 10_000_000)
+    assert decoded is not None and decoded.time_ns == message.time_ns
+
+
 @given(st.binary(max_size=200))
 def test_other_bytes_are_no_message(data: bytes) -> None:
     for payload in (data, b"\x02\x0e" + data, b"\x03\x10" + data):

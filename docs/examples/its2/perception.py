@@ -116,7 +116,7 @@ def sensed(fix: Fix) -> tuple[Seen, ...]:
 
 async def main(node: Node) -> None:
     """Send a CPM at every other fix, and report where others are."""
-    types = schema(node.options.get("asn1", PROFILE))
+    types = schema(node.options.get("asn1", PROFILE), "CollectivePerceptionMessage")
     station, apart_s = int(node.id[1:]), float(node.rng.uniform(0.0, APART_S))
     heard: dict[int, tuple[Message, Xy]] = {}
     async for fix in node.gnss:

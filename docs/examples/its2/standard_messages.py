@@ -26,6 +26,8 @@ START_MS = 694_310_405_000
 CPM_HEADER, VAM_HEADER = {"protocolVersion": 2, "messageId": 14}, {"protocolVersion": 3, "messageId": 16}
 VEHICLE_CONTAINER, OBJECT_CONTAINER = 1, 5
 """Numbers of a CPM's containers."""
+MOST_OBJECTS = 255
+"""Most objects of a CPM."""
 CYCLIST = 2
 """Station type of a VAM."""
 BSM = 20
@@ -36,16 +38,22 @@ Xy = tuple[float, float]
 
 
 @cache
-def schema(path: str | Path = PROFILE) -> Any:
-    """Return the compiled types of a file of ASN.1, or of all `*.asn` in a folder. Raises VnetError in one line."""
+def schema(path: str | Path = PROFILE, *needed: str) -> Any:
+    """Return the compiled types of a file of ASN.1, or of all `*.asn` in a folder.
+
+    Raises VnetError in one line, also if one of the types `needed` is not there.
+    """
     path = Path(path)
     files = sorted(path.rglob("*.asn")) if path.is_dir() else [path]
     if not files or not all(file.is_file() for file in files):
         raise VnetError(f"program.options.asn1 = '{path}': a file of ASN.1, or a folder with *.asn, is needed")
     try:
-        return asn1tools.compile_files([str(file) for file in files], "uper", encoding="latin-1")
+        types = asn1tools.compile_files([str(file) for file in files], "uper", encoding="latin-1")
     except (asn1tools.ParseError, asn1tools.CompileError) as error:
         raise VnetError(f"program.options.asn1 = '{path}': {str(error).splitlines()[0]}") from None
+    if missing := [name for name in needed if name not in types.types]:
+        raise VnetError(f"program.options.asn1 = '{path}': has no type {', '.join(missing)}")
+    return types
 
 
 @dataclass(frozen=True)
@@ -70,8 +78,13 @@ class Message:
 
 
 def encode_cpm(message: Message, types: Any) -> bytes:
-    """Return a CPM with the containers of a vehicle and of objects, in m east and north of the vehicle."""
-    objects = [_object(number, message, seen) for number, seen in enumerate(message.objects)]
+    """Return a CPM with the containers of a vehicle and of objects, in m east and north of the vehicle.
+
+    Objects that a CPM cannot say are left out: further than 1.3 km, faster than 163 m/s, older than 2 s, or more
+    than 255.
+    """
+    sayable = [seen for seen in message.objects if _is_sayable(message, seen)][:MOST_OBJECTS]
+    objects = [_object(number, message, seen) for number, seen in enumerate(sayable)]
     vehicle = {"orientationAngle": {"value": _to_north(message.heading_rad), "confidence": NOT_KNOWN}}
     perceived = {"numberOfPerceivedObjects": len(objects), "perceivedObjects": objects}
     containers = {
@@ -87,6 +100,12 @@ def encode_cpm(message: Message, types: Any) -> bytes:
     payload = {"managementContainer": management, "cpmContainers": wrapped}
     value = {"header": CPM_HEADER | {"stationId": message.station}, "payload": payload}
     return bytes(types.encode("CollectivePerceptionMessage", value))
+
+
+def _is_sayable(message: Message, seen: Seen) -> bool:
+    """Return whether an object is within the ranges of its fields, which asn1tools does not check."""
+    away_m = max(abs(there_m - here_m) for there_m, here_m in zip(seen.position_m, message.position_m, strict=True))
+    return away_m <= 1310.71 and max(map(abs, seen.velocity_m_s)) <= 163.81 and -2.047 <= seen.age_s <= 2.047
 
 
 def _object(number: int, message: Message, seen: Seen) -> dict[str, Any]:
@@ -155,7 +174,7 @@ def encode_vam(message: Message, types: Any) -> bytes:
 
 
 def decode_vam(payload: bytes, types: Any, now_ns: int) -> Message | None:
-    """Return a VAM of the last minute; None for bytes that are none."""
+    """Return a VAM of the last minute, or of 5 s to come by a slow clock; None for bytes that are none."""
     if payload[:2] != bytes(VAM_HEADER.values()):
         return None
     try:
@@ -163,7 +182,7 @@ def decode_vam(payload: bytes, types: Any, now_ns: int) -> Message | None:
     except Exception:
         return None
     now_ms = START_MS + now_ns // 1_000_000
-    age_ms = (now_ms - value["vam"]["generationDeltaTime"]) % 65536
+    age_ms = (now_ms - value["vam"]["generationDeltaTime"] + 5000) % 65536 - 5000
     parameters = value["vam"]["vamParameters"]
     moves = parameters["vruHighFrequencyContainer"]
     return Message(

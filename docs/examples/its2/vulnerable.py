@@ -41,7 +41,7 @@ def braking_m_s2(fix: Fix, cyclist: Message) -> float:
 
 async def main(node: Node) -> None:
     """Send VAMs if one is the cyclist; else heed them."""
-    types = schema(node.options.get("asn1", PROFILE))
+    types = schema(node.options.get("asn1", PROFILE), "VAM")
     sent: Fix | None = None
     cyclist: Message | None = None
     vams = 0

@@ -207,6 +207,7 @@ def test_what_cannot_be_is_one_line(wrong: dict[str, Any], line: str) -> None:
         ({"position_m": lambda agent: None}, r"position_m\('car_0'\) = None: two finite numbers in m are needed"),
         ({"position_m": lambda agent: (0, math.nan)}, r"position_m\('car_0'\) = .*: two finite numbers"),
         ({"send": lambda *_: "hello"}, r"send\('car_0'\) = 'hello': bytes are needed, or None"),
+        ({"send": lambda *_: bytes(5000)}, "5000 bytes"),
     ],
 )
 def test_what_functions_return_is_checked(functions: dict[str, Any], line: str) -> None:
@@ -218,3 +219,16 @@ def test_what_functions_return_is_checked(functions: dict[str, Any], line: str) 
     radio.reset(seed=1)
     with pytest.raises(VnetError, match=line):
         radio.step(dict.fromkeys(radio.agents, 1))
+
+
+def test_agents_must_be_among_the_possible_ones() -> None:
+    env = Crossing(2)
+    given: dict[str, Any] = {"position_m": env.position_m, "send": lambda *_: None, "receive": lambda *all: all[1]}
+    radio = emulator.radio_for(env, PERFECT, **given)
+    radio.reset(seed=1)
+    env.agents = [*env.agents, "car_9"]
+    with pytest.raises(VnetError, match="'car_9' is an agent, but not one of"):
+        radio.step(dict.fromkeys(env.agents, 1))
+    del env.possible_agents
+    with pytest.raises(VnetError, match="its possible_agents are needed"):
+        emulator.radio_for(env, PERFECT, **given)
