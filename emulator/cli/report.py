@@ -52,7 +52,7 @@ def compare(
 ) -> None:
     """Set two runs side by side, and show where they part: decision, frame, reception, event or value.
 
-    Status 0: same trace; 1: another; 2: error.
+    Status 0: nothing differs; 1: they part; 2: error.
     """
     from emulator.report.comparison import Comparison, print_comparison
 
@@ -63,7 +63,7 @@ def compare(
             from emulator.report.comparison import write_comparison
 
             print(write_comparison(comparison, out))
-        raise typer.Exit(0 if comparison.same_trace else 1)
+        raise typer.Exit(0 if comparison.same_trace and not comparison.partings else 1)
 
 
 def _write_report(folder: Path) -> Path:

@@ -307,7 +307,12 @@ class Sidelink(Mac):
         counter = self._counter(frame, period)
         last = slot + max(self._mac.t1_slots, min(self._t2_slots, period))
         wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, period, 10 * counter)
-        first, subchannel, repeat = self._select(flow.station, frame, wanted, _CHOICE)
+        found = self._candidates(flow.station, frame, wanted)
+        if not found.mask.any():
+            while flow.queue:
+                self._leave(flow.queue.popleft()[1], Outcome.no_grant, self._now_ns)
+            return
+        first, subchannel, repeat = self._choose(found, frame, _CHOICE)
         flow.grant = _Grant(first, subchannel, length, period, counter, repeat)
         self._book(self._use_of(flow, last), checks=True)
 
@@ -334,17 +339,18 @@ class Sidelink(Mac):
         """Select a resource for one frame."""
         last = slot + self._t2_slots
         wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, 0, 1)
-        first, subchannel, repeat = self._select(flow.station, sent.frame, wanted, _CHOICE)
+        found = self._candidates(flow.station, sent.frame, wanted)
+        if not found.mask.any():
+            self._leave(sent, Outcome.no_grant, self._now_ns)
+            return
+        first, subchannel, repeat = self._choose(found, sent.frame, _CHOICE)
         self._book(_Booking(flow, first, subchannel, length, sent, repeat=repeat, last=last), checks=True)
 
-    def _select(
-        self, station: _Station, frame: Frame, wanted: Wanted, which: int
-    ) -> tuple[int, int, tuple[int, int] | None]:
-        """Return the slot and the subchannel of a resource, and (slots later, subchannel) of a second one."""
-        return self._pair(self._candidates(station, frame, wanted), frame, which)
+    def _choose(self, found: Candidates, frame: Frame, which: int) -> tuple[int, int, tuple[int, int] | None]:
+        """Return the slot and the subchannel of a candidate, and (slots later, subchannel) of a second one.
 
-    def _pair(self, found: Candidates, frame: Frame, which: int) -> tuple[int, int, tuple[int, int] | None]:
-        """Choose among candidates; the earlier one of two that are chosen is used first."""
+        The earlier one of the two that are chosen is used first.
+        """
         first = found.chosen(self._draw(frame, which))
         near = found.around(first[0], REPEAT_SLOTS)
         if not self._mac.retransmit or not near.mask.any():
@@ -353,17 +359,24 @@ class Sidelink(Mac):
         return *first, (second[0] - first[0], second[1])
 
     def _candidates(self, station: _Station, frame: Frame, wanted: Wanted) -> Candidates:
-        booked = set(station.booked)
+        """Return the candidates of a station: none if it transmits in each slot of the window itself.
+
+        Its other grants keep the slots of their later uses, unless nothing is left then.
+        """
+        grants: set[int] = set()
         horizon = wanted.last + wanted.period * (wanted.times // 10 - 1) if wanted.period else wanted.last
         for grant in [flow.grant for flow in station.flows.values() if flow.grant is not None]:
             uses = {*range(grant.slot, horizon + 1, grant.period)}
             uses |= {slot + grant.repeat[0] for slot in uses} if grant.repeat else set()
             if wanted.period:  # its later uses must not meet them either
                 uses = {wanted.first + (slot - wanted.first) % wanted.period for slot in uses}
-            booked |= uses
+            grants |= uses
         now = self._now_ns // self._slot_ns
         self._sense(now)
-        found = self._grid.candidates(now, wanted._replace(booked=frozenset(booked)))
+        for booked in (grants | station.booked, station.booked):
+            found = self._grid.candidates(now, wanted._replace(booked=frozenset(booked)))
+            if found.mask.any():
+                break
         if self._mac.ranks_power:
             ties = self._draws.uniform(frame.sender, frame.seq, _TIES + found.mask.size, frame.draw)[_TIES:]
             found = found.quietest(self._mac.candidate_share, ties)
@@ -399,7 +412,7 @@ class Sidelink(Mac):
             station.booked.add(booking.slot)
             return
         self._booked[booking.slot].remove(booking)
-        booking.slot, booking.subchannel, booking.repeat = self._pair(found, sent.frame, _AGAIN)
+        booking.slot, booking.subchannel, booking.repeat = self._choose(found, sent.frame, _AGAIN)
         if grant is not None:
             grant.slot, grant.subchannel, grant.repeat = booking.slot, booking.subchannel, booking.repeat
         self._book(booking)

@@ -64,7 +64,7 @@ def test_kind_is_80211p_where_none_is_given_and_a_slot_bounds_the_payload() -> N
     plain, named = ({"radio": {"mac": mac}} for mac in ({}, {"kind": "80211p"}))
     assert scenario_of(plain, {}).radio == scenario_of(named, {}).radio
     assert Radio.model_validate(LTE).max_payload_bytes == 760
-    assert Radio.model_validate(with_mac(LTE, subchannels=20)).max_payload_bytes == 1400
+    assert Radio.model_validate(with_mac(LTE, subchannels=10)).max_payload_bytes == 1400
     assert Radio.model_validate({**LTE, "max_payload_bytes": 300}).max_payload_bytes == 300
 
 
@@ -165,6 +165,21 @@ def test_flows_of_two_periods_have_a_reservation_each(radio: dict[str, Any]) -> 
         kept = sum(after - before == period_ms * MS for before, after in pairwise(on_air_ns))
         assert kept >= 0.8 * len(on_air_ns)
     assert len({row["on_air_ns"] for row in rows}) == len(rows)
+
+
+@pytest.mark.parametrize(("scs_khz", "periods_ms"), [(15, (1, 100)), (30, (1, 2, 5, 100))])
+def test_flows_that_use_all_slots_leave_some_frames_without_a_place(
+    scs_khz: int, periods_ms: tuple[int, ...]
+) -> None:
+    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(NR, scs_khz=scs_khz))
+    for n in range(200):
+        for period_ms in periods_ms:
+            subject.transmit(n * MS, 0, [SentFrame("", bytes(50), period_ms=period_ms)])
+        subject.advance(n * MS)
+    subject.drain()
+    outcomes = Counter(row["outcome"] for row in subject.trace.to_table().to_pylist())
+    assert outcomes["delivered"] >= 190 and set(outcomes) <= {"delivered", "no_grant", "queue_full"}
+    assert outcomes.total() == 200 * len(periods_ms)
 
 
 @pytest.mark.parametrize("radio", [LTE, NR])

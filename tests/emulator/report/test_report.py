@@ -279,6 +279,16 @@ def test_compare_says_which_keys_differ_and_by_how_much(cooperative: Path, tmp_p
     assert "RMSE of the common error (m)" in page.text and "run.seed 1 5" in page.text
 
 
+def test_compare_ends_with_1_where_only_reported_values_part(cooperative: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(cooperative, tmp_path / "other"))
+    states = pq.read_table(other / "states.parquet")
+    heard = [value and value + 1 for value in states["heard"].to_pylist()]
+    planted = states.set_column(states.column_names.index("heard"), "heard", pa.array(heard, pa.float64()))
+    pq.write_table(planted, other / "states.parquet")
+    done = vnet(["compare", str(cooperative), str(other)])
+    assert done.exit_code == 1 and "a value of v" in done.output
+
+
 @pytest.mark.usefixtures("no_charts")
 def test_a_report_of_an_unfinished_run_says_so(beacon: Path, tmp_path: Path) -> None:
     finished = vnet(["report", str(beacon)])
