@@ -375,3 +375,29 @@ def test_cancelling_a_query_waits_for_its_callback_and_refuses_the_next(drive: D
         radio={"keys": ["none"]},
     )
     assert log(run)[:4] == ["['asked'] 0.3 True", "refused", "['asked', 'alive'] 0.6 True", "refused"]
+
+
+def test_timestamps_of_one_instant_rise_and_order_replies(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        times = [session.new_timestamp() for _ in range(3)]
+        print(times[0] < times[1] < times[2])
+
+        def answer(query):
+            for number in range(3):
+                query.reply(query.key_expr, str(number), timestamp=session.new_timestamp())
+            query.drop()
+
+        if sys.argv[1] == "v01":
+            session.declare_queryable("count", answer)
+            time.sleep(3)
+        else:
+            time.sleep(0.5)
+            print([reply.ok.payload.to_string() for reply in session.get("count", timeout=1) if reply.ok])
+        """,
+        vehicles=2,
+    )
+    assert log(run, "v01")[0] == "True"
+    assert log(run, "v02")[:2] == ["True", "['2']"]

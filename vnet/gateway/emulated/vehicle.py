@@ -71,6 +71,7 @@ class Vehicle(RadioSide[Asking]):
         self._has_tokens = asyncio.Event()
         self._subscribers_of = lru_cache(MOST_KEYS)(self._find_subscribers)
         self._session_numbers = count(1)
+        self._stamped_ns = 0
         self._hears, self._locates = asyncio.Event(), asyncio.Event()
         self.on_matching: list[Callable[[], None]] = []
         """Called when subscribers or queryables come or go."""
@@ -80,8 +81,9 @@ class Vehicle(RadioSide[Asking]):
         return ZenohId.of(self.node.id, self.node.incarnation, next(self._session_numbers))
 
     def new_timestamp(self, zid: ZenohId) -> zenoh.Timestamp:
-        """Return the present time by the vehicle's clock."""
-        return timestamp_at(EPOCH_NS + self.node.now_ns, zid)
+        """Return the present time by the vehicle's clock; later than all before it, as Zenoh's clock promises."""
+        self._stamped_ns = max(EPOCH_NS + self.node.now_ns, self._stamped_ns + 1)
+        return timestamp_at(self._stamped_ns, zid)
 
     # Entities come and go.
 
