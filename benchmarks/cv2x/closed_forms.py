@@ -47,6 +47,10 @@ class Case:
     keep: float | None = 0.0
     re_evaluation: bool = False
 
+    def __post_init__(self) -> None:
+        if self.vehicles > self.resources:
+            raise ValueError(f"{self.vehicles} vehicles: at most {self.resources}, one a resource")
+
     @property
     def resources(self) -> int:
         """Resources in a period, with slots of 1 ms."""

@@ -199,7 +199,7 @@ class Outcome(IntEnum):
     no_grant = (
         16,
         Facts(
-            meaning="its sender may use no more of the channel, or had another frame in the slot (sidelink)",
+            meaning="its sender may use no more of the channel, or its own frames have the slots (sidelink)",
             stage=Stage.SENDER,
             colour="slate",
             sign="▖",

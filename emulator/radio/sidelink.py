@@ -361,16 +361,13 @@ class Sidelink(Mac):
     def _candidates(self, station: _Station, frame: Frame, wanted: Wanted) -> Candidates:
         """Return the candidates of a station: none if it transmits in each slot of the window itself.
 
-        Its other grants keep the slots of their later uses, unless nothing is left then.
+        Its grants keep the slots of their later uses in the window, unless nothing is left then. Uses beyond it
+        repeat slots in which the station has transmitted, which the grid excludes.
         """
         grants: set[int] = set()
-        horizon = wanted.last + wanted.period * (wanted.times // 10 - 1) if wanted.period else wanted.last
         for grant in [flow.grant for flow in station.flows.values() if flow.grant is not None]:
-            uses = {*range(grant.slot, horizon + 1, grant.period)}
-            uses |= {slot + grant.repeat[0] for slot in uses} if grant.repeat else set()
-            if wanted.period:  # its later uses must not meet them either
-                uses = {wanted.first + (slot - wanted.first) % wanted.period for slot in uses}
-            grants |= uses
+            for slot in range(grant.slot, wanted.last + 1, grant.period):
+                grants |= {slot, slot + grant.repeat[0]} if grant.repeat else {slot}
         now = self._now_ns // self._slot_ns
         self._sense(now)
         for booked in (grants | station.booked, station.booked):

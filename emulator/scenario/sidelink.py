@@ -29,8 +29,6 @@ class Sidelink(Section):
     ranks_power: ClassVar[bool] = True
     """True if the quietest of the candidates are taken, and not any of them."""
     most_t1: ClassVar[int] = 4
-    most_blocks: ClassVar[int] = 100
-    """Resource blocks of the widest carrier (TS 36.101, TS 38.101)."""
 
     subchannels: int = Field(4, ge=1, le=MOST_SUBCHANNELS)
     """Subchannels, side by side in frequency."""
@@ -80,6 +78,11 @@ class Sidelink(Section):
         return 180
 
     @property
+    def most_blocks(self) -> int:
+        """Resource blocks of the widest carrier (TS 36.101, TS 38.101-1)."""
+        return 100
+
+    @property
     def candidate_share(self) -> float:
         """The share of resources that must remain as candidates."""
         return 0.2
@@ -125,7 +128,6 @@ class NrMode2(Sidelink):
     periods_ms: ClassVar[tuple[int, ...]] = (*range(1, 100), *LONG_PERIODS_MS)
     ranks_power: ClassVar[bool] = False
     most_t1: ClassVar[int] = 9
-    most_blocks: ClassVar[int] = 275
 
     kind: Literal["nr-mode2"]
     """This MAC."""
@@ -156,6 +158,11 @@ class NrMode2(Sidelink):
         return 12 * self.scs_khz
 
     @property
+    def most_blocks(self) -> int:
+        """Resource blocks of the widest carrier (TS 38.101-1, table 5.3.2-1)."""
+        return {15: 270, 30: 273, 60: 135}[self.scs_khz]
+
+    @property
     def candidate_share(self) -> float:
         """The share of resources that must remain as candidates."""
         return self.share_percent / 100
@@ -172,7 +179,7 @@ class CrLimit(Section):
     busy: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(min_length=1)
     """Channel busy ratios from which the limits hold, increasing."""
     most: tuple[Annotated[float, Field(gt=0, le=1)], ...]
-    """Largest channel occupancy ratio of a sender over 1000 ms; a frame beyond it is dropped (`no_grant`)."""
+    """Largest channel occupancy ratio of a sender over 1000 ms; a frame beyond it is `no_grant`."""
 
     @model_validator(mode="after")
     def _a_limit_for_each_busy_ratio(self) -> CrLimit:

@@ -103,6 +103,8 @@ def test_words_arrive_within_the_disc_alone() -> None:
     inside = outside = 0
     for seed in range(20):
         radio.reset(seed=seed)
+        for agent in radio.agents:
+            radio.action_space(agent).seed(seed)
         while radio.agents:
             one, other = (np.array(agent.state.p_pos) for agent in radio.unwrapped.world.agents)
             within = bool(np.hypot(*(one - other)) * METRE <= 80.0)
@@ -112,7 +114,7 @@ def test_words_arrive_within_the_disc_alone() -> None:
                 word = np.eye(10)[actions[agent] // 5] if within else np.zeros(10)
                 np.testing.assert_array_equal(observations[listener][-10:], word)
             inside, outside = inside + within, outside + (not within)
-    assert inside > 50 and outside > 50
+    assert inside > 20 and outside > 20
 
 
 def test_the_share_that_arrives_is_the_disc_s_closed_form() -> None:
@@ -207,7 +209,7 @@ def test_what_cannot_be_is_one_line(wrong: dict[str, Any], line: str) -> None:
         ({"position_m": lambda agent: None}, r"position_m\('car_0'\) = None: two finite numbers in m are needed"),
         ({"position_m": lambda agent: (0, math.nan)}, r"position_m\('car_0'\) = .*: two finite numbers"),
         ({"send": lambda *_: "hello"}, r"send\('car_0'\) = 'hello': bytes are needed, or None"),
-        ({"send": lambda *_: bytes(5000)}, "5000 bytes"),
+        ({"send": lambda *_: bytes(1401)}, "1401 bytes"),
     ],
 )
 def test_what_functions_return_is_checked(functions: dict[str, Any], line: str) -> None:

@@ -167,6 +167,38 @@ def test_flows_of_two_periods_have_a_reservation_each(radio: dict[str, Any]) -> 
     assert len({row["on_air_ns"] for row in rows}) == len(rows)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("radio", [LTE, NR])
+def test_reservations_of_one_sender_never_meet(radio: dict[str, Any], again: bool) -> None:
+    """No frame waits for a slot in which another flow transmits, and none loses its second transmission by one."""
+    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, t2_ms=30, retransmit=again))
+    for n in range(600):
+        for period_ms in (100, 200, 300):
+            if n * 100 % period_ms == 0:
+                subject.transmit(n * 100 * MS, 0, [SentFrame("", b"x", period_ms=period_ms)])
+        subject.advance(n * 100 * MS)
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()
+    assert max(row["left_ns"] - row["sent_ns"] for row in rows) <= 31 * MS
+    slot_ns = MS if radio is LTE else MS // 2
+    assert min(row["left_ns"] - row["on_air_ns"] for row in rows) >= (2 if again else 1) * slot_ns
+
+
+def test_queue_frames_counts_the_frames_of_all_flows() -> None:
+    subject = engine(line(0, 50), access_jitter_ms=0.0, queue_frames=2, **LTE)
+    for time_ms, period_ms in ((0, 100), (1, 200), (2, 300)):
+        subject.transmit(time_ms * MS, 0, [SentFrame("", b"x", period_ms=period_ms)])
+        subject.advance((time_ms + 1) * MS)
+    subject.drain()
+    assert [row["outcome"] for row in subject.trace.to_table().to_pylist()].count("queue_full") == 1
+
+
+def test_re_evaluation_leaves_a_resource_alone_that_nobody_has_reserved() -> None:
+    rows = [beacons(engine(line(0, 50), **with_mac(NR, re_evaluation=checks)), 1, 5.0) for checks in (False, True)]
+    assert rows[0] == rows[1]
+
+
 @pytest.mark.parametrize(("scs_khz", "periods_ms"), [(15, (1, 100)), (30, (1, 2, 5, 100))])
 def test_flows_that_use_all_slots_leave_some_frames_without_a_place(
     scs_khz: int, periods_ms: tuple[int, ...]
@@ -253,6 +285,7 @@ def test_a_second_transmission_has_fading_of_its_own() -> None:
     for again in (False, True):
         rows = beacons(engine(line(0, 200), **with_mac(LTE | fading, retransmit=again)), 1, 150.0)
         lost.append(sum(row["outcome"] != "delivered" for row in rows))
+        assert min(row["snr_db"] for row in rows if row["outcome"] == "delivered") >= 0, "the better one is noted"
     assert lost[0] > 150 and chance(lost[1], 1500, (lost[0] / 1500) ** 2)
 
 
