@@ -76,6 +76,8 @@ def check_run(folder: Path, own_checks: bool = False, checks: Sequence[str] = ()
 def _own_findings(recorded: OpenedRun, folder: Path, own_checks: bool, checks: Sequence[str]) -> list[Finding]:
     """Findings of checks of the user's own: as recorded, or of those that are run again."""
     program, found = recorded.scenario.program, {}
+    exceptions = tuple(each.model_copy(update={"command": None}) for each in program.exceptions)
+    program = program.model_copy(update={"command": None, "exceptions": exceptions})  # whose files may be gone
     if not own_checks:  # the folder has no say in where modules come from
         program = program.model_copy(update={"checks": (), "folders": ()})
         found = {finding.name: finding for finding in recorded_findings(recorded.record)}

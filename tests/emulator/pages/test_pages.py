@@ -70,7 +70,7 @@ def comparison(text: str) -> str:
         "comparison.html.j2",
         runs=[run, run],
         difference=text,
-        difference_rows=rows,
+        partings=rows,
         scenario=rows,
         key_figures=rows,
         reported=rows,

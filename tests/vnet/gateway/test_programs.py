@@ -7,6 +7,8 @@ from types import ModuleType
 
 import pytest
 
+from emulator.checks.judge import check_run
+from emulator.records.verdicts import Verdict
 from tests.vnet.gateway.conftest import Drive, events, log
 from vnet.gateway import client_config
 from vnet.gateway.emulated.modules import CLIENT_CONFIG, ENDPOINT
@@ -401,3 +403,9 @@ def test_timestamps_of_one_instant_rise_and_order_replies(drive: Drive) -> None:
     )
     assert log(run, "v01")[0] == "True"
     assert log(run, "v02")[:2] == ["True", "['2']"]
+
+
+def test_a_run_is_judged_again_without_its_programs(drive: Drive, tmp_path: Path) -> None:
+    run = drive("import zenoh; zenoh.open(zenoh.Config()).put('a', b'x')")
+    (tmp_path / "program0.py").unlink()
+    assert check_run(run.folder, False, ()).verdict is Verdict.VALID
