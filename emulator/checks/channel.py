@@ -7,6 +7,7 @@ from math import log, sqrt
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.distributions import binomial_interval
@@ -318,13 +319,19 @@ def _ruled(recorded: RecordedRun) -> Mask:
 
 def changed_bytes(recorded: RecordedRun) -> Mask:
     """Return the rows with other bytes than their frame's, as far as an uncorrupted original shows them."""
+    said, known = originals(recorded)
+    return np.asarray(known & (recorded.digest != said))
+
+
+def originals(recorded: RecordedRun) -> tuple[NDArray[np.uint64], Mask]:
+    """Return the digest of each row's frame, and the mask of those that an uncorrupted row of it shows."""
     index = recorded.frame_of_row
     altered = recorded.caused_by("corrupt", "custom", "custom_sender")
     plain = np.flatnonzero((recorded.copy == 0) & ~altered)[::-1]
     said = np.zeros(len(index), dtype=np.uint64)
     known = np.zeros(len(index), dtype=bool)
     said[index[plain]], known[index[plain]] = recorded.digest[plain], True
-    return np.asarray(known[index] & (recorded.digest != said[index]))
+    return said[index], known[index]
 
 
 def _replaced(recorded: RecordedRun) -> Mask:

@@ -41,7 +41,7 @@ class RadioSide(ABC, Generic[Q]):
         self, node_id: str, keys: Sequence[str] | None, query_s: float, liveliness_s: float, ros2: Ros2 | None
     ) -> None:
         self.node_id, self._query_s, self._ros2 = node_id, query_s, ros2
-        self._keys = keys or (RADIO_KEYS if ros2 is None else ROS2_KEYS)
+        self._keys = keys if keys is not None else RADIO_KEYS if ros2 is None else ROS2_KEYS
         self._expressions = [zenoh.KeyExpr(key) for key in self._keys]
         self._reassembly = Reassembly()
         self._queries: dict[int, Q] = {}

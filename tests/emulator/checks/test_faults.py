@@ -563,3 +563,9 @@ def test_in_real_time_what_was_sent_near_a_change_may_be_replayed_later() -> Non
 @pytest.mark.parametrize(("count", "text"), [(1, "1 fix is missing, "), (2000, "2,000 fixes are missing, ")])
 def test_what_shows_an_effect_is_counted_properly(count: int, text: str) -> None:
     assert _wrong_fixes(count).text.startswith(text)
+
+
+def test_a_corruption_of_all_receptions_is_seen_by_their_cause() -> None:
+    fault = {"kind": "corrupt", "probability": 1.0, "at_s": 0.5, "duration_s": 2.0}
+    recorded = simulated(fault, radio={"loss": 0.0})
+    assert not_valid(recorded) == {}

@@ -37,6 +37,34 @@ def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive
 
 
 @pytest.mark.slow
+def test_without_any_key_nothing_crosses(drive: Drive) -> None:
+    run = drive(TALK, vehicles=2, radio={"keys": []})
+    assert run.trace.num_rows == 0
+    assert not any("car/v02" in line for line in log(run, "v01"))
+
+
+@pytest.mark.slow
+def test_replies_go_to_the_asker_alone(drive: Drive) -> None:
+    """Queries of two vehicles have the same number."""
+    text = """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        if sys.argv[1] == "v01":
+            def answer(query):
+                query.reply("echo", query.payload)
+                query.drop()
+            queryable = session.declare_queryable("echo", answer)
+            time.sleep(1.8)
+        else:
+            time.sleep(0.2)
+            replies = session.get("echo", payload=sys.argv[1], consolidation=zenoh.ConsolidationMode.NONE, timeout=1)
+            print([reply.ok.payload.to_string() for reply in replies if reply.ok])
+        """
+    run = drive(text, vehicles=3)
+    assert [log(run, node)[0] for node in ("v02", "v03")] == ["['v02']", "['v03']"]
+
+
+@pytest.mark.slow
 def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(drive: Drive) -> None:
     run = drive(
         """

@@ -144,7 +144,7 @@ class Asking:
         self.on_end()
 
     def _expire(self) -> None:
-        self._end(Reply(ReplyError(zenoh.ZBytes("Timeout"), zenoh.Encoding.ZENOH_STRING)))
+        self._end(Reply(ReplyError(zenoh.ZBytes("Timeout"), NO_ENCODING)))
 
 
 def _is_not_older(sample: Sample, before: Sample | ReplyError) -> bool:
