@@ -146,6 +146,13 @@ class _Booking:
         """The sender."""
         return self.flow.station
 
+    @property
+    def slots(self) -> set[int]:
+        """The slots that it takes; the second one of a grant is known by the grant."""
+        if self.sent is None or self.repeat is None:
+            return {self.slot}
+        return {self.slot, self.slot + self.repeat[0]}
+
 
 _Event = tuple[int, int, int, int, Transmission | _Booking | None]
 """An event: its time in ns, kind, sender, number of the event, and what it is about."""
@@ -261,6 +268,7 @@ class Sidelink(Mac):
         length = self._link.length(frame.size_bytes)
         grant = flow.grant
         if grant is not None and grant.length < length:
+            station.booked.discard(grant.slot)
             flow.grant = grant = None
         if self._is_dynamic:
             self._send_alone(flow, sent, slot, length)
@@ -361,13 +369,17 @@ class Sidelink(Mac):
     def _candidates(self, station: _Station, frame: Frame, wanted: Wanted) -> Candidates:
         """Return the candidates of a station: none if it transmits in each slot of the window itself.
 
-        Its grants keep the slots of their later uses in the window, unless nothing is left then. Uses beyond it
-        repeat slots in which the station has transmitted, which the grid excludes.
+        Its grants keep the slots of their later uses, which no use of the new resource may meet, unless nothing is
+        left then.
         """
         grants: set[int] = set()
+        horizon = wanted.last + wanted.period * (wanted.times // 10 - 1) if wanted.period else wanted.last
         for grant in [flow.grant for flow in station.flows.values() if flow.grant is not None]:
-            for slot in range(grant.slot, wanted.last + 1, grant.period):
-                grants |= {slot, slot + grant.repeat[0]} if grant.repeat else {slot}
+            uses = {*range(grant.slot, horizon + 1, grant.period)}
+            uses |= {slot + grant.repeat[0] for slot in uses} if grant.repeat else set()
+            if wanted.period:
+                uses = {wanted.first + (slot - wanted.first) % wanted.period for slot in uses}
+            grants |= uses
         now = self._now_ns // self._slot_ns
         self._sense(now)
         for booked in (grants | station.booked, station.booked):
@@ -386,7 +398,7 @@ class Sidelink(Mac):
             known = booking.slot - self._mac.t1_slots + 1
             self._plan(known * self._slot_ns, DECISION, booking.slot)
         self._booked[booking.slot].append(booking)
-        booking.station.booked.add(booking.slot)
+        booking.station.booked |= booking.slots
         check_ns = (booking.slot - self._mac.t1_slots) * self._slot_ns
         if checks and self._checks_again and check_ns > self._now_ns:
             self._plan(check_ns, CHECK, booking.station.node, booking)
@@ -399,14 +411,14 @@ class Sidelink(Mac):
         sent = booking.sent or flow.queue[0][1]
         times = 10 * grant.counter if grant is not None else 1
         wanted = Wanted(station.node, booking.slot, booking.last, booking.length, booking.period, times)
-        station.booked.discard(booking.slot)
+        station.booked -= booking.slots
         if grant is not None:
             flow.grant = None  # whose own slots are free to it
         found = self._candidates(station, sent.frame, wanted)
         if grant is not None:
             flow.grant = grant
         if found.has(booking.slot, booking.subchannel) or not found.mask.any():
-            station.booked.add(booking.slot)
+            station.booked |= booking.slots
             return
         self._booked[booking.slot].remove(booking)
         booking.slot, booking.subchannel, booking.repeat = self._choose(found, sent.frame, _AGAIN)
@@ -463,6 +475,7 @@ class Sidelink(Mac):
 
     def _give_up(self, booking: _Booking) -> None:
         """Drop a frame that may not be sent; one that was sent before is complete without the second time."""
+        booking.station.booked -= booking.slots
         if booking.sent is not None:
             outcome = Outcome.pending if booking.is_repeat else Outcome.no_grant
             self._leave(booking.sent, outcome, booking.sent.end_ns if booking.is_repeat else self._now_ns)

@@ -155,7 +155,7 @@ class Radio(Section):
     """Senders send less where the medium is busy."""
     keys: tuple[str, ...] | None = None
     """For programs of `kind = "zenoh"`: key expressions that cross the radio, none of which overlap; `**` and
-    `**/@adv/**` if left out, nothing with `[]`. What is put elsewhere stays in its vehicle, and so does `vnet/**`."""
+    `**/@adv/**` if left out, none if empty. What is put elsewhere stays in its vehicle, and so does `vnet/**`."""
 
     profile: Literal["ros2"] | None = None
     """For programs of `kind = "zenoh"`: what their keys mean. With `ros2` topics and services of rmw_zenoh, and the

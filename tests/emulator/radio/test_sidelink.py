@@ -169,7 +169,7 @@ def test_flows_of_two_periods_have_a_reservation_each(radio: dict[str, Any]) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("again", [False, True])
-@pytest.mark.parametrize("radio", [LTE, NR])
+@pytest.mark.parametrize("radio", [LTE, NR, with_mac(NR, sensing_ms=100)])
 def test_reservations_of_one_sender_never_meet(radio: dict[str, Any], again: bool) -> None:
     """No frame waits for a slot in which another flow transmits, and none loses its second transmission by one."""
     subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, t2_ms=30, retransmit=again))
@@ -183,6 +183,28 @@ def test_reservations_of_one_sender_never_meet(radio: dict[str, Any], again: boo
     assert max(row["left_ns"] - row["sent_ns"] for row in rows) <= 31 * MS
     slot_ns = MS if radio is LTE else MS // 2
     assert min(row["left_ns"] - row["on_air_ns"] for row in rows) >= (2 if again else 1) * slot_ns
+
+
+@pytest.mark.slow
+def test_frames_with_a_resource_of_their_own_are_sent_twice_beside_others() -> None:
+    subject = engine(
+        line(0, 50), access_jitter_ms=0.0, **with_mac(NR, scheduling="dynamic", retransmit=True, t2_ms=40)
+    )
+    for n in range(800):
+        subject.transmit(n * 100 * MS // 4, 0, [SentFrame("", b"x")])
+        subject.advance(n * 100 * MS // 4)
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()
+    assert min(row["left_ns"] - row["on_air_ns"] for row in rows) >= MS
+
+
+def test_a_reservation_that_is_too_short_for_a_frame_leaves_its_slot() -> None:
+    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(NR, scs_khz=15))
+    for n in range(300):
+        subject.transmit(n * 2 * MS, 0, [SentFrame("", bytes(100 + n % 7 * 60), period_ms=2)])
+        subject.advance(n * 2 * MS)
+    subject.drain()
+    assert {row["outcome"] for row in subject.trace.to_table().to_pylist()} == {"delivered"}
 
 
 def test_queue_frames_counts_the_frames_of_all_flows() -> None:

@@ -57,7 +57,8 @@ def test_replies_go_to_the_asker_alone(drive: Drive) -> None:
             time.sleep(1.8)
         else:
             time.sleep(0.2)
-            replies = session.get("echo", payload=sys.argv[1], consolidation=zenoh.ConsolidationMode.NONE, timeout=1)
+            all_of_them = zenoh.ConsolidationMode.NONE
+            replies = session.get("echo", payload=sys.argv[1], consolidation=all_of_them, timeout=1)
             print([reply.ok.payload.to_string() for reply in replies if reply.ok])
         """
     run = drive(text, vehicles=3)
