@@ -287,6 +287,17 @@ def test_compare_ends_with_1_where_only_reported_values_part(cooperative: Path, 
     pq.write_table(planted, other / "states.parquet")
     done = vnet(["compare", str(cooperative), str(other)])
     assert done.exit_code == 1 and "a value of v" in done.output
+    parting = Comparison.of(cooperative, other).partings[0]
+    first = next(value for value in states["heard"].to_pylist() if value)
+    assert parting["A"] == f"heard = {first}" and parting["B"] == f"heard = {first + 1}"
+
+
+def test_compare_shows_where_runs_with_other_columns_part(beacon_run: Path, beacon: Path) -> None:
+    trace = pq.read_table(beacon / "trace.parquet")
+    power = pa.array([-60.0] * len(trace), pa.float32())
+    pq.write_table(trace.append_column("rssi_dbm", power), beacon / "trace.parquet")
+    done = vnet(["compare", str(beacon_run), str(beacon)])
+    assert done.exit_code == 1 and "first in row 0 of the trace: rssi_dbm" in done.output
 
 
 @pytest.mark.usefixtures("no_charts")
