@@ -7,10 +7,12 @@ as slot n ends. Its receptions are decided then, ahead of their time, which is w
 re-evaluation, the checks of resources), ordered by time, kind and sender as in `csma`. A selection in slot n knows
 of the slots before n alone, whatever has been decided.
 
-**Grants.** A sender without a reservation selects a resource when a frame is ready (`grid`), and holds it for as
-many frames as its reselection counter says, one in each reservation interval. As the counter ends it keeps the
-resource with a probability, and selects another otherwise. Frames wait for their grant in a queue. A frame that
-would wait beyond the selection window gets a resource of its own, once; so does each frame with dynamic scheduling.
+**Grants.** The frames of a sender that tell the same period are a flow. One without a reservation selects a
+resource when a frame is ready (`grid`), and holds it for as many frames as its reselection counter says, one in
+each reservation interval. As the counter ends it keeps the resource with a probability, and selects another
+otherwise. Frames wait for their flow's grant in a queue. A frame that would wait beyond the selection window gets
+a resource of its own, once; so does each frame with dynamic scheduling. If the sender's other flows leave no slot,
+it is dropped.
 
 **Draws** are those of the frame for which something is drawn: they depend on the seed, its sender and its number.
 """
@@ -260,7 +262,7 @@ class Sidelink(Mac):
     # Selecting resources.
 
     def _ready(self, station: _Station, sent: Transmission) -> None:
-        """Give a frame a place in its sender's grant, or a resource of its own."""
+        """Give a frame a place in its flow's grant, or a resource of its own."""
         frame, slot = sent.frame, self._now_ns // self._slot_ns
         station.coming -= 1
         flow = station.flow(frame.period_ms)

@@ -107,7 +107,10 @@ class Sidelink(Section):
         must_grow("bler_sinr_db", self.bler_sinr_db)
         must_not_grow("bler", self.bler)
         if (blocks := self.subchannels * self.data_blocks) > self.most_blocks:
-            raise ValueError(f"subchannels × data_blocks = {blocks}: must be at most {self.most_blocks}")
+            raise ValueError(
+                f"subchannels = {self.subchannels}: with data_blocks = {self.data_blocks} these are {blocks} resource "
+                f"blocks; at most {self.most_blocks} are allowed"
+            )
         return self
 
 

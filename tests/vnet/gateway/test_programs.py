@@ -409,3 +409,20 @@ def test_a_run_is_judged_again_without_its_programs(drive: Drive, tmp_path: Path
     run = drive("import zenoh; zenoh.open(zenoh.Config()).put('a', b'x')")
     (tmp_path / "program0.py").unlink()
     assert check_run(run.folder, False, ()).verdict is Verdict.VALID
+
+
+def test_imports_are_halted_and_locks_are_those_of_threading(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys
+        from _thread import RLock
+        with RLock():
+            pass
+        sys.modules["colorsys"] = None
+        try:
+            import colorsys
+        except ModuleNotFoundError as error:
+            print(error)
+        """
+    )
+    assert log(run)[0] == "import of colorsys halted; None in sys.modules"

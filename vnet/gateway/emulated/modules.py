@@ -217,6 +217,8 @@ class ProgramModules:
         """Return a module as the program sees it; load it if need be. Raises ImportError."""
         if (found := self.modules.get(name)) is not None:
             return found
+        if name in self.modules:
+            raise ModuleNotFoundError(f"import of {name} halted; None in sys.modules", name=name)
         parent = name.rpartition(".")[0]
         if parent:
             self.load(parent)
@@ -380,6 +382,7 @@ class ProgramModules:
 
     def _prepare_threading(self, module: Any) -> None:
         module.local = self.load("_threading_local").local
+        vars(self.load("_thread"))["RLock"] = module._PyRLock
         module.Event.is_set = module.Event.isSet = _looking(module.Event.is_set, nothing=False)
 
     def _prepare_queue(self, module: Any) -> None:
