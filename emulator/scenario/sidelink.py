@@ -108,8 +108,8 @@ class Sidelink(Section):
         must_not_grow("bler", self.bler)
         if (blocks := self.subchannels * self.data_blocks) > self.most_blocks:
             raise ValueError(
-                f"subchannels = {self.subchannels}: with data_blocks = {self.data_blocks} these are {blocks} resource "
-                f"blocks; at most {self.most_blocks} are allowed"
+                f"subchannels = {self.subchannels}: with data_blocks = {self.data_blocks} these are {blocks} "
+                f"resource blocks; at most {self.most_blocks} are allowed"
             )
         return self
 
