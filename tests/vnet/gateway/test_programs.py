@@ -426,3 +426,9 @@ def test_imports_are_halted_and_locks_are_those_of_threading(drive: Drive) -> No
         """
     )
     assert log(run)[0] == "import of colorsys halted; None in sys.modules"
+
+
+def test_a_status_that_is_a_crash_has_the_line_that_gave_it(drive: Drive) -> None:
+    run = drive("import sys, zenoh\n\nsys.exit(3)\n")
+    (crash,) = events(run, "crashed")
+    assert crash["error"].endswith("ended with 3") and 'program0.py", line 3' in crash["where"]

@@ -78,6 +78,7 @@ async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
         await modules.threads.run_main(partial(modules.run, words))
     except SystemExit as leave:
         if leave.code not in (None, 0):
-            raise ProgramError(f"{' '.join(words)} ended with {leave.code!r}") from leave
+            ended = ProgramError(f"{' '.join(words)} ended with {leave.code!r}")
+            raise ended.with_traceback(leave.__traceback__) from leave
     finally:
         modules.modules.close()
