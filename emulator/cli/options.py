@@ -239,12 +239,25 @@ class RunOptions:
 
     def output(self, check_determinism: Compared | None = None) -> OutputOptions:
         """Return the output that is asked for."""
-        return OutputOptions(self.log_format, self.quiet, check_determinism, self.report, self.verbose)
+        return OutputOptions(
+            self.log_format, self.quiet, check_determinism, report=self.report, verbose=self.verbose
+        )
 
     def load(self, pacing: Pacing | None) -> Scenario:
         """Load the scenario as these options change it. Raises VnetError."""
-        changes = self.overrides, self.program, pacing, self.seed, self.duration, self.option, self.checks
-        return load(self.scenario, *changes, self.order, self.order_seed, self.tape)
+        return load(
+            self.scenario,
+            self.overrides,
+            program=self.program,
+            pacing=pacing,
+            seed=self.seed,
+            duration=self.duration,
+            program_options=self.option,
+            checks=self.checks,
+            order=self.order,
+            order_seed=self.order_seed,
+            tape=self.tape,
+        )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,36 @@
+"""Options of commands that run a scenario: each has its effect."""
+
+from pathlib import Path
+
+from emulator.cli.options import Order, Pacing, RunOptions
+from tests.support.paths import ROOT
+
+BEACON = ROOT / "scenarios" / "beacon.toml"
+
+
+def test_each_option_changes_the_scenario() -> None:
+    options = RunOptions(
+        scenario=BEACON,
+        seed=3,
+        duration=12.5,
+        order=Order.SHUFFLE,
+        order_seed=7,
+        overrides=["radio.loss=0.5"],
+        option=["period_s=0.2"],
+    )
+    scenario = options.load(None)
+    run = scenario.run
+    assert (run.seed, run.duration_s, run.order, run.order_seed, run.pacing) == (3, 12.5, "shuffle", 7, "lockstep")
+    assert scenario.radio.loss == 0.5 and scenario.program.options["period_s"] == 0.2
+    assert RunOptions(scenario=BEACON).load(Pacing.REALTIME).run.pacing == "realtime"
+
+
+def test_a_tape_is_that_of_the_present_folder(tmp_path: Path) -> None:
+    tape = tmp_path / "tape.jsonl"
+    tape.write_text("")
+    assert RunOptions(scenario=BEACON, tape=tape).load(None).run.tape == tape
+
+
+def test_what_is_shown_is_what_was_asked_for() -> None:
+    shown = RunOptions(scenario=BEACON, quiet=True, verbose=True, report=False).output()
+    assert (shown.quiet, shown.verbose, shown.report) == (True, True, False)
