@@ -57,9 +57,11 @@ CHANNEL_KHZ = 9000
 """Width of the 50 resource blocks of 10 MHz, over which `radio.receiver.noise_dbm` is given."""
 _CHOICE, _COUNTER, _KEEP, _REPEAT, _SHOT, _AGAIN, _TIES = range(7)
 """Indices of a frame's draws."""
-_SECOND, _SECOND_FADING = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1B54A32D192ED03)
-"""Odd factors that make the draws of a second transmission, and those of its fading, out of those of the first."""
-_HIGH = np.uint64(48)
+_SECOND = np.uint64(0x9E3779B97F4A7C15)
+"""Odd factor that makes the draws of a second transmission out of those of the first."""
+_SECOND_FADING = np.uint64(0xD1B54A32D192ED03)
+"""Odd factor that makes those of its fading: the highest 16 bits of the product, to which all bits contribute."""
+_HIGHEST = np.uint64(48)
 
 DECISION, READY, CHECK = range(3)
 """Kinds of events, in the order in which those of one time are processed."""
@@ -375,7 +377,8 @@ class Sidelink(Mac):
         left then.
         """
         grants: set[int] = set()
-        horizon = wanted.last + wanted.period * (wanted.times // 10 - 1) if wanted.period else wanted.last
+        counter = wanted.times // 10  # with which the resource is used, until it is kept or left
+        horizon = wanted.last + wanted.period * (counter - 1) if wanted.period else wanted.last
         for grant in [flow.grant for flow in station.flows.values() if flow.grant is not None]:
             uses = {*range(grant.slot, horizon + 1, grant.period)}
             uses |= {slot + grant.repeat[0] for slot in uses} if grant.repeat else set()
@@ -554,7 +557,7 @@ class Sidelink(Mac):
         """Return the powers (N,) of a transmission: a second one has fading of its own."""
         signal = _signal(booking.sent)
         if booking.sent is not None and booking.is_repeat:
-            return self._signals.power_mw(booking.sent.frame, signal.random_draws * _SECOND_FADING >> _HIGH)
+            return self._signals.power_mw(booking.sent.frame, signal.random_draws * _SECOND_FADING >> _HIGHEST)
         return signal.power_mw
 
     def _follow(self, booking: _Booking) -> None:
