@@ -89,13 +89,13 @@ class _Grant:
 class _Station:
     """A sender: its flows by the period that their frames tell (0 for none), and the slots that it has booked.
 
-    `coming` counts the frames that will be ready, `ready_ns` is when the last of them is. `used` are the last slots
-    and lengths of its transmissions.
+    `frames` counts those that wait, or will be ready; `ready_ns` is when the last of them is. `used` are the last
+    slots and lengths of its transmissions.
     """
 
     node: int
     flows: dict[float, _Flow] = field(default_factory=dict)
-    coming: int = 0
+    frames: int = 0
     ready_ns: int = 0
     booked: set[int] = field(default_factory=set)
     used: deque[tuple[int, int]] = field(default_factory=deque)
@@ -105,11 +105,6 @@ class _Station:
         if period_ms not in self.flows:
             self.flows[period_ms] = _Flow(self)
         return self.flows[period_ms]
-
-    @property
-    def frames(self) -> int:
-        """Number of frames that have not been sent."""
-        return self.coming + sum(len(flow.queue) for flow in self.flows.values())
 
 
 @dataclass(slots=True, eq=False)
@@ -221,7 +216,7 @@ class Sidelink(Mac):
             self._leave(sent, Outcome.queue_full, frame.sent_ns)
             return
         station.ready_ns = max(slow_ns, station.ready_ns)
-        station.coming += 1
+        station.frames += 1
         self._plan(station.ready_ns, READY, frame.sender, sent)
 
     def take_sent(self) -> list[Transmission]:
@@ -266,7 +261,6 @@ class Sidelink(Mac):
     def _ready(self, station: _Station, sent: Transmission) -> None:
         """Give a frame a place in its flow's grant, or a resource of its own."""
         frame, slot = sent.frame, self._now_ns // self._slot_ns
-        station.coming -= 1
         flow = station.flow(frame.period_ms)
         flow.sent_ns.append(frame.sent_ns)
         length = self._link.length(frame.size_bytes)
@@ -321,6 +315,7 @@ class Sidelink(Mac):
         wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, period, 10 * counter)
         found = self._candidates(flow.station, frame, wanted)
         if not found.mask.any():
+            flow.station.frames -= len(flow.queue)
             while flow.queue:
                 self._leave(flow.queue.popleft()[1], Outcome.no_grant, self._now_ns)
             return
@@ -349,6 +344,7 @@ class Sidelink(Mac):
 
     def _send_alone(self, flow: _Flow, sent: Transmission, slot: int, length: int) -> None:
         """Select a resource for one frame."""
+        flow.station.frames -= 1
         last = slot + self._t2_slots
         wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, 0, 1)
         found = self._candidates(flow.station, sent.frame, wanted)
@@ -462,6 +458,7 @@ class Sidelink(Mac):
             grant.counter -= 1
         elif is_free and flow.queue and flow.queue[0][0] <= latest:
             booking.sent = flow.queue.popleft()[1]
+            flow.station.frames -= 1
             grant.unused = 0
             grant.counter -= 1
             if grant.counter <= 0 and self._draw(booking.sent.frame, _KEEP) < self._mac.keep_probability:
@@ -669,17 +666,20 @@ class SidelinkReception:
         deaf[:] = True
         for nth in range(max(len(signal.slots) for signal in signals)):
             frames = np.array([index for index, signal in enumerate(signals) if nth < len(signal.slots)])
+            some = slice(None) if len(frames) == len(signals) else frames  # much faster than an index of all
             slots = [signals[index].slots[nth] for index in frames]
             silent = np.array([slot.deaf for slot in slots])
             power_mw = np.array([slot.power_mw for slot in slots])
             others_mw = np.array([slot.others_mw for slot in slots])
             noise_mw = np.array([self._link.noise_mw(slot.length) for slot in slots])
-            deaf[frames] &= silent
+            deaf[some] &= silent
             hears = (power_mw >= self._link.sensing_mw) & ~silent
-            detected[frames] |= hears
-            able = np.flatnonzero(hears & undecided[frames])
+            detected[some] |= hears
+            able = np.flatnonzero(hears & undecided[some])
             own_mw, noise = power_mw.ravel()[able], noise_mw[able // self._count]
-            place = frames[able // self._count] * self._count + able % self._count
+            place = (
+                able if isinstance(some, slice) else frames[able // self._count] * self._count + able % self._count
+            )
             drawn = words.ravel()[place]
             draws = reception_draws(drawn * _SECOND if nth else drawn)
             alone.ravel()[place] |= draws >= self._link.error_rate(own_mw / noise)
@@ -703,12 +703,14 @@ class SidelinkReception:
         own_mw, ratio = np.full((2, len(transmissions), self._count), np.nan)
         for index, sent in enumerate(transmissions):
             if sent.sender_outcome == Outcome.pending:
-                for slot in _signal(sent).slots:
+                for nth, slot in enumerate(_signal(sent).slots):
                     each = slot.power_mw / (self._link.noise_mw(slot.length) + slot.others_mw)
-                    better = ~(each <= ratio[index])
-                    own_mw[index], ratio[index] = np.where(
-                        better, [slot.power_mw, each], [own_mw[index], ratio[index]]
-                    )
+                    if nth:
+                        better = each > ratio[index]
+                        np.copyto(own_mw[index], slot.power_mw, where=better)
+                        np.copyto(ratio[index], each, where=better)
+                    else:
+                        own_mw[index], ratio[index] = slot.power_mw, each
         place = frame_index * self._count + receiver  # a look-up with one index is much faster than with two
         found = np.array([own_mw.ravel()[place], ratio.ravel()[place]])
         found[:, found[0] == 0] = np.nan
