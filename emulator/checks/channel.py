@@ -319,11 +319,11 @@ def _ruled(recorded: RecordedRun) -> Mask:
 
 def changed_bytes(recorded: RecordedRun) -> Mask:
     """Return the rows with other bytes than their frame's, as far as an uncorrupted original shows them."""
-    said, known = originals(recorded)
+    said, known = frame_digests(recorded)
     return np.asarray(known & (recorded.digest != said))
 
 
-def originals(recorded: RecordedRun) -> tuple[NDArray[np.uint64], Mask]:
+def frame_digests(recorded: RecordedRun) -> tuple[NDArray[np.uint64], Mask]:
     """Return the digest of each row's frame, and the mask of those that an uncorrupted row of it shows."""
     index = recorded.frame_of_row
     altered = recorded.caused_by("corrupt", "custom", "custom_sender")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.checks.channel import binomial_band, changed_bytes, originals, received_twice
+from emulator.checks.channel import binomial_band, frame_digests, received_twice
 from emulator.checks.latency import bounds
 from emulator.checks.senders import is_noise, receiver_noise_m
 from emulator.faults.plan import PlannedFault
@@ -356,8 +356,9 @@ def effect(fault: Fault, recorded: RecordedRun, planned: PlannedFault) -> Findin
 @effect.register
 def _(fault: Corrupt, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     named = recorded.cause == planned.number
-    _, known = originals(recorded)
-    changed = named & changed_bytes(recorded) if (named & known).any() else named  # nobody received the original
+    said, known = frame_digests(recorded)
+    shown = named & known
+    changed = shown & (recorded.digest != said) if shown.any() else named  # nobody received the original
     text = "reception with changed bytes|receptions with changed bytes"
     return _found(int(changed.sum()), text, "no reception with changed bytes")
 
