@@ -31,6 +31,7 @@ from emulator.drivers.live.gateway import Gateway, is_peer, session_environment,
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from emulator.scenario.program import PYTHON
+from vnet.counted import counted
 from vnet.errors import ProgramError, VnetError, first_names, shown
 from vnet.gateway import filled_in
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
@@ -72,6 +73,8 @@ class _Vehicle:
     """True from time 0, or from its return, on."""
     early: dict[object, tuple[str, Any]] = field(default_factory=dict)
     """Queries of its programs and the latest sample of each key, which wait until its turn then."""
+    replaced: int = 0
+    """Samples that a later one of their key has replaced there."""
     outbox: list[SentFrame] = field(default_factory=list)
     reports: list[Report] = field(default_factory=list)
     notes: list[wire.Note] = field(default_factory=list)
@@ -266,10 +269,13 @@ class Gateways:
 
     def _close(self, node: str) -> list[str]:
         """Close a vehicle's gateway; return the names of the processes of its commands, which are its no more."""
-        vehicle = self._vehicles.pop(node, None)
+        vehicle = self._vehicles.get(node)
         if vehicle is None:
             return []
+        if vehicle.early or vehicle.outbox:
+            self._flush(vehicle, final=True)
         vehicle.on_air = False
+        del self._vehicles[node]
         self._closing[node] = asyncio.ensure_future(vehicle.gateway.close())
         return vehicle.names
 
@@ -371,7 +377,6 @@ class Gateways:
 
     def _take_turn(self, vehicle: _Vehicle) -> None:
         if self._is_there(vehicle):
-            self._send_early(vehicle, time.monotonic_ns())
             self._repeat(vehicle, 1.0, self._flush)
             self._repeat(vehicle, self._settings.liveliness_s, self._renew_tokens)
             if self._ros2 is not None:
@@ -382,12 +387,6 @@ class Gateways:
         if self._is_there(vehicle):
             act(vehicle)
             self._loop.call_later(period_s, self._repeat, vehicle, period_s, act)
-
-    def _send_early(self, vehicle: _Vehicle, arrived_ns: int) -> None:
-        early, vehicle.early = vehicle.early, {}
-        for what, told in early.values():
-            if (message := vehicle.gateway.take(what, told)) is not None:
-                self._transmit(vehicle, message, arrived_ns)
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:
         vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end
@@ -423,10 +422,10 @@ class Gateways:
             self._take_report(vehicle, told)
         elif what in ("query", "message"):
             key = getattr(told, "key", told)  # each query is kept
-            vehicle.early.pop(key, None)
+            vehicle.replaced += vehicle.early.pop(key, None) is not None
             vehicle.early[key] = what, told
             if vehicle.on_air:
-                self._send_early(vehicle, arrived_ns)
+                self._flush(vehicle, arrived_ns)
         elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
             self._transmit(vehicle, message, arrived_ns)
         elif what == "session":
@@ -435,10 +434,12 @@ class Gateways:
                 self._seek_peers()
 
     def _transmit(self, vehicle: _Vehicle, message: Message, arrived_ns: int) -> None:
-        """Send a message by the vehicle's radio as of the instant (ns of the monotonic clock) at which it arrived.
+        """Send a message by the vehicle's radio as of its arrival at an instant (ns of the monotonic clock)."""
+        self._enqueue(vehicle, message)
+        self._flush(vehicle, arrived_ns)
 
-        A reply is sent to one vehicle, if the MAC repeats what is lost.
-        """
+    def _enqueue(self, vehicle: _Vehicle, message: Message) -> None:
+        """Add the frames of a message: a reply's are for one vehicle, if the MAC repeats what is lost."""
         assert vehicle.fragments is not None
         node, to = vehicle.gateway.node_id, None
         if isinstance(message, CrossingTokens) and self._ros2 is not None and self._ros2.graph == "always":
@@ -459,7 +460,15 @@ class Gateways:
             vehicle.has_warned = True
             text = f"a message of {frames} frames, which cannot arrive: radio.queue_frames = {most}"
             self._note(vehicle, "warning", text)
-        self._flush(vehicle, arrived_ns)
+
+    def _enqueue_early(self, vehicle: _Vehicle) -> None:
+        early, vehicle.early = vehicle.early, {}
+        for what, told in early.values():
+            if (message := vehicle.gateway.take(what, told)) is not None:
+                self._enqueue(vehicle, message)
+        if vehicle.replaced:
+            samples, vehicle.replaced = counted(vehicle.replaced, "sample"), 0
+            self._note(vehicle, "info", f"{samples} of before the start not sent: later ones of their keys are")
 
     def _take_report(self, vehicle: _Vehicle, content: bytes) -> None:
         try:
@@ -472,7 +481,7 @@ class Gateways:
             vehicle.reports.append(report)
             self._flush_soon(vehicle)
 
-    def _note(self, vehicle: _Vehicle, level: Literal["debug", "warning", "error"], text: str) -> None:
+    def _note(self, vehicle: _Vehicle, level: Literal["debug", "info", "warning", "error"], text: str) -> None:
         vehicle.notes.append(wire.Note(vehicle.gateway.node_id, self._now_ns(), "log", level, text))
         self._flush_soon(vehicle)
 
@@ -484,8 +493,14 @@ class Gateways:
     def _flush(self, vehicle: _Vehicle, arrived_ns: int | None = None, final: bool = False) -> None:
         """Say what the vehicle sends, and acknowledge what it has been told: now, or as of an instant."""
         vehicle.is_due = False
-        if not self._is_there(vehicle) or (vehicle.is_paused and not final):
+        if not self._is_there(vehicle):
             return
+        self._enqueue_early(vehicle)
+        if vehicle.is_paused and not final:
+            return
+        if vehicle.outbox and not self._emulation.up[vehicle.gateway.node_id]:
+            frames, vehicle.outbox = counted(len(vehicle.outbox), "frame"), []
+            self._note(vehicle, "warning", f"{frames} not sent: the vehicle has ended")
         traffic = wire.Traffic(vehicle.outbox, vehicle.reports, vehicle.endings, notes=vehicle.notes)
         vehicle.outbox, vehicle.reports, vehicle.endings, vehicle.notes = [], [], [], []
         lateness, late = wire.Lateness(list(vehicle.lateness)), vehicle.late

@@ -25,6 +25,7 @@ class Rig:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, vehicles: int, radio: dict[str, Any]) -> None:
         self.routers: dict[str, Gateway] = {}
+        self.noted: list[wire.Note] = []
         self.told: asyncio.Queue[tuple[str, str, Any]] = asyncio.Queue()
         monkeypatch.setattr(Gateway, "open", lambda gateway, listen: self._open_none(gateway, listen))
         scenario = Scenario.model_validate(
@@ -37,6 +38,7 @@ class Rig:
         )
         launcher: Any = FakeLauncher()
         emulation = emulation_of(scenario)
+        self.emulation = emulation
         self.gateways = Gateways(emulation, launcher, False, lambda *_: None, self._tell, lambda: 0, ChangeSignal())
         self.gateways.start_agents("", Access.create("fake", []), [[node] for node in emulation.world.node_ids])
 
@@ -60,11 +62,17 @@ class Rig:
         """Have a program of a vehicle put a sample."""
         self.gateways.take("message", (self.routers[node], sample), arrived_ns)
 
+    def notes(self) -> list[str]:
+        """Return the lines of logs that were told with the messages since the last call."""
+        notes, self.noted = self.noted, []
+        return [each.text for each in notes]
+
     async def sent(self, count: int) -> list[tuple[list[Message | None], int]]:
         """Return the samples of the next messages with frames, and the instants of which they are."""
         found: list[tuple[list[Message | None], int]] = []
         while len(found) < count:
             what, _, item = await self.told.get()
+            self.noted += item[0].traffic.notes if what == "frames" else []
             if what == "frames" and item[0].traffic.frames:
                 reassembly = Reassembly()
                 found.append(([reassembly.take("x", each.payload) for each in item[0].traffic.frames], item[1]))
@@ -96,9 +104,31 @@ async def test_what_programs_put_before_the_start_goes_out_in_turns(monkeypatch:
         rig.put(node, SAMPLE, 1)
         rig.put(node, lane, 2)
         rig.gateways.send(node, wire.Batch([], 0, origin_ns=0))
-    first = await rig.sent(2)
-    assert [samples for samples, _ in first] == [[SAMPLE], [lane]], "v01 has the first turn"
+    ((first, _),) = await rig.sent(1)
+    assert first == [SAMPLE, lane], "v01 has the first turn"
     rig.put("v02", newer, 7)
-    assert await rig.sent(2) == [([lane], 7), ([newer], 7)]
+    assert await rig.sent(1) == [([lane, newer], 7)]
+    assert rig.notes() == ["1 sample of before the start not sent: later ones of their keys are"]
     assert rig.told.empty(), "the turn of v03 is far away"
+    await rig.gateways.close()
+
+
+@on_a_loop
+async def test_a_vehicle_that_ends_before_its_turn_sends_what_it_has_put(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or it is counted, if a fault has ended the vehicle: no sample is lost without a word."""
+    monkeypatch.setattr("emulator.drivers.live.gateways.TURNS_S", 1e6)
+    rig = Rig(monkeypatch, 3, {})
+    await rig.welcome("v01", "v02", "v03")
+    for node in ("v02", "v03"):
+        rig.put(node, SAMPLE, 1)
+    for node in ("v02", "v03", "v01"):
+        rig.gateways.send(node, wire.Batch([], 0, origin_ns=0))
+    assert (await rig.told.get())[1] == "v01", "its turn is at once, and it is the last to begin"
+    rig.gateways.detach("v02")
+    assert [samples for samples, _ in await rig.sent(1)] == [[SAMPLE]]
+    rig.emulation.up["v03"] = False
+    rig.gateways.kill("v03")
+    _, node, (frames, _) = await rig.told.get()
+    assert (node, list(frames.traffic.frames)) == ("v03", [])
+    assert [each.text for each in frames.traffic.notes] == ["1 frame not sent: the vehicle has ended"]
     await rig.gateways.close()
