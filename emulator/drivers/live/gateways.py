@@ -499,8 +499,8 @@ class Gateways:
         if vehicle.is_paused and not final:
             return
         if vehicle.outbox and not self._emulation.up[vehicle.gateway.node_id]:
-            frames, vehicle.outbox = counted(len(vehicle.outbox), "frame"), []
-            self._note(vehicle, "warning", f"{frames} not sent: the vehicle has ended")
+            lost, vehicle.outbox = counted(len(vehicle.outbox), "frame"), []
+            self._note(vehicle, "warning", f"{lost} not sent: the vehicle has ended")
         traffic = wire.Traffic(vehicle.outbox, vehicle.reports, vehicle.endings, notes=vehicle.notes)
         vehicle.outbox, vehicle.reports, vehicle.endings, vehicle.notes = [], [], [], []
         lateness, late = wire.Lateness(list(vehicle.lateness)), vehicle.late
