@@ -432,3 +432,15 @@ def test_a_status_that_is_a_crash_has_the_line_that_gave_it(drive: Drive) -> Non
     run = drive("import sys, zenoh\n\nsys.exit(3)\n")
     (crash,) = events(run, "crashed")
     assert crash["error"].endswith("ended with 3") and 'program0.py", line 3' in crash["where"]
+
+
+def test_programs_that_open_no_session_are_named(drive: Drive) -> None:
+    run = drive(
+        "import time; time.sleep(9)",
+        "print('done')",
+        "import zenoh; zenoh.open(zenoh.Config())",
+        "raise ValueError",
+    )
+    lines = [event["text"] for event in events(run, "log")]
+    named = [line for line in lines if line.endswith("v01 has opened no Zenoh session")]
+    assert len(named) == len(lines) == 2 and "program1.py" in named[0] and "program0.py" in named[1], lines

@@ -116,6 +116,8 @@ class ProgramModules:
         self.process = OwnProcess(self.threads)
         self.threads.on_interrupt = partial(self.process.send, signal.SIGINT)
         self.at_exit: list[Callable[[], object]] = []
+        self.has_session = False
+        """True once the program has opened a session of Zenoh's."""
         self.path: list[str] = []
         self.argv: list[str] = []
         own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)

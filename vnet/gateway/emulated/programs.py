@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from functools import partial
 from types import ModuleType
@@ -47,6 +48,7 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
         if timestamp_callback is not None:
             raise zenoh.ZError("timestamp_callback is not available on virtual time")
+        program.has_session = True
         return sessions.Session(vehicle, outlet, config)
 
     def scout(handler: Any = None, what: Any = None, config: zenoh.Config | None = None) -> sessions.Scout:
@@ -81,4 +83,6 @@ async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
             ended = ProgramError(f"{' '.join(words)} ended with {leave.code!r}")
             raise ended.with_traceback(leave.__traceback__) from leave
     finally:
+        if not modules.has_session and not isinstance(sys.exception(), Exception):
+            vehicle.node.log(f"{' '.join(words)} has opened no Zenoh session", "warning")
         modules.modules.close()
