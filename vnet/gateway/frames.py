@@ -99,9 +99,9 @@ class Fragment(msgspec.Struct, array_like=True, frozen=True):
     content: bytes
 
 
-def crossing_sample(sample: Any, source_of: SourceOf) -> CrossingSample:
-    """Return what of a sample crosses the radio."""
-    stamp, time, source = sample.timestamp, None, sample.source_info
+def crossing_sample(sample: Any, stamp: zenoh.Timestamp | None, source_of: SourceOf) -> CrossingSample:
+    """Return what of a sample crosses the radio, with a timestamp that it need not have had itself."""
+    time, source = None, sample.source_info
     if stamp is not None:
         ntp = stamp.get_time_as_ntp64()
         time = ntp.as_secs(), ntp.subsec_nanos(), bytes(stamp.get_id())
@@ -128,7 +128,7 @@ def crossing_query(number: int, query: Any) -> CrossingQuery:
 def crossing_reply(asker: str, query: CrossingQuery, reply: Any, source_of: SourceOf) -> CrossingReply:
     """Return what of a reply to another vehicle's query crosses the radio."""
     if reply.ok is not None:
-        return CrossingReply(asker, query.number, crossing_sample(reply.ok, source_of))
+        return CrossingReply(asker, query.number, crossing_sample(reply.ok, reply.ok.timestamp, source_of))
     return CrossingReply(asker, query.number, None, (reply.err.payload.to_bytes(), str(reply.err.encoding)))
 
 

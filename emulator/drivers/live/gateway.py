@@ -126,8 +126,10 @@ class Gateway(RadioSide[zenoh.Query]):
         return told
 
     def _put(self, sample: zenoh.Sample) -> None:
-        if self.crosses(str(sample.key_expr)):
-            self._tell("message", crossing_sample(sample, _source_of))
+        if self.crosses(str(sample.key_expr)) and self._session is not None:
+            # A delete has none, and the routers of receivers would give it theirs.
+            stamp = sample.timestamp or self._session.new_timestamp()
+            self._tell("message", crossing_sample(sample, stamp, _source_of))
 
     def _asked(self, query: zenoh.Query) -> None:
         if self.crosses(str(query.key_expr)):

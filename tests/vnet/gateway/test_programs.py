@@ -434,6 +434,7 @@ def test_a_status_that_is_a_crash_has_the_line_that_gave_it(drive: Drive) -> Non
     assert crash["error"].endswith("ended with 3") and 'program0.py", line 3' in crash["where"]
 
 
+@pytest.mark.slow
 def test_programs_that_open_no_session_are_named(drive: Drive) -> None:
     run = drive(
         "import time; time.sleep(9)",

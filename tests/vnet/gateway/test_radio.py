@@ -37,6 +37,27 @@ def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive
 
 
 @pytest.mark.slow
+def test_what_crosses_has_a_timestamp_of_its_vehicles_router(drive: Drive) -> None:
+    """Also a delete, which has none in its own vehicle: the routers of receivers would give it theirs."""
+    run = drive(
+        """
+        import sys, time, zenoh
+        session, other = zenoh.open(zenoh.Config()), zenoh.open(zenoh.Config())
+        other.declare_subscriber("k", lambda s: print(s.kind, s.timestamp and str(s.timestamp.get_id())))
+        print(session.info.routers_zid()[0])
+        if sys.argv[1] == "v01":
+            session.put("k", "x")
+            session.delete("k")
+        time.sleep(0.5)
+        """,
+        vehicles=2,
+    )
+    (router, *own), (_, *heard) = log(run, "v01"), log(run, "v02")
+    assert own[:2] == [f"SampleKind.PUT {router}", "SampleKind.DELETE None"]
+    assert heard[:2] == [f"SampleKind.PUT {router}", f"SampleKind.DELETE {router}"]
+
+
+@pytest.mark.slow
 def test_without_any_key_nothing_crosses(drive: Drive) -> None:
     run = drive(TALK, vehicles=2, radio={"keys": []})
     assert run.trace.num_rows == 0

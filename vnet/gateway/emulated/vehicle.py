@@ -141,7 +141,8 @@ class Vehicle(RadioSide[Asking]):
             if sample.timestamp is None and sample.kind == PUT:  # as routers do
                 stamped = msgspec.structs.replace(sample, timestamp=self.new_timestamp(self.zid))
             if self.crosses(key):
-                self._send(crossing_sample(stamped, number_of))
+                # Also a delete: by the radio Zenoh's routers would give it a later one, of the receiver's.
+                self._send(crossing_sample(stamped, stamped.timestamp or self.new_timestamp(self.zid), number_of))
             elif key == REPORT_KEY:
                 self._report(sample)
             others = [each for each in matching if each.session is not session and each.is_remote]

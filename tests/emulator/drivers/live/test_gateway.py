@@ -143,6 +143,8 @@ def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody() -> 
         samples = [await heard.get() for _ in range(4)]
         assert [str(each.key_expr) for each in samples] == ["car/0", "car/1", "car/2", "car/0"]
         assert [each.kind for each in samples] == [zenoh.SampleKind.PUT] * 3 + [zenoh.SampleKind.DELETE]
+        stamped = samples[3].timestamp
+        assert stamped is not None and str(stamped.get_id()) == str(sessions[0].info.routers_zid()[0])
         put = samples[0]
         assert (put.payload.to_bytes(), put.encoding) == (b"here", zenoh.Encoding.APPLICATION_JSON)
         assert put.attachment is not None and put.attachment.to_bytes() == b"extra"
