@@ -7,11 +7,10 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from emulator.records.parting import partings
+from emulator.records.parting import first_difference, first_frame
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import AGAIN
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, invalid, named, valid
@@ -32,20 +31,20 @@ ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outc
 def check_replay(folder: Path) -> Finding:
     """Compare a run with the second one in its folder. Raises VnetError if a table cannot be read."""
     again = folder / AGAIN
-    return compare_folders(folder, again) if RecordedRun.open(again).has_record else ONCE
+    runs = RecordedRun.open(folder), RecordedRun.open(again)
+    return compare_runs(*runs) if runs[1].has_record else ONCE
 
 
-def compare_folders(first: Path, second: Path) -> CheckResult:
+def compare_runs(ours: OpenedRun, theirs: OpenedRun) -> CheckResult:
     """Compare two finished runs, and name the first frame and line of the program in which they differ.
 
     Raises VnetError if a table cannot be read.
     """
-    ours, theirs = RecordedRun.open(first), RecordedRun.open(second)
     found = compare_tables(_tables(ours), _tables(theirs))
     if found.verdict is Verdict.VALID:
         return found
     told, figures = _first_frame(ours, theirs)
-    call, node = first_call(first, second)
+    call, node = first_call(ours.folder, theirs.folder)
     if call:
         told, figures = f"{told}; {call}", {**figures, "call": call, "vehicle": node}
     return CheckResult(found.name, found.verdict, f"{found.text}; {told}", {**found.figures, **figures})
@@ -53,7 +52,7 @@ def compare_folders(first: Path, second: Path) -> CheckResult:
 
 def _first_frame(ours: OpenedRun, theirs: OpenedRun) -> tuple[str, dict[str, Any]]:
     """Return the first frame in which two runs differ, as a phrase and as figures."""
-    parting = next((each for each in partings(ours, theirs) if each.kind == "frame"), None)
+    parting = first_frame(ours, theirs)
     if parting is None:
         return "no frame differs", {}
     frame = (parting.first or parting.second).partition(",")[0]
@@ -145,27 +144,6 @@ def _difference(name: str, first: pa.Table, second: pa.Table, index: int) -> Che
     ]
     text = f"two runs differ, first in row {index} of the {name}: {how}"
     return named("replay", invalid(text, table=name, row=index, differing=differing, rows=shown))
-
-
-def first_difference(first: pa.Table, second: pa.Table) -> int | None:
-    """The number of the first row in which two tables differ, or None."""
-    shared = min(len(first), len(second))
-    index = None if len(first) == len(second) else shared
-    for name in first.column_names:
-        ours, theirs = first[name].slice(0, shared), second[name].slice(0, shared)
-        if not ours.equals(theirs):
-            differing = _first(ours, theirs)
-            index = differing if index is None or (differing is not None and differing < index) else index
-    return index
-
-
-def _first(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> int | None:
-    """Return the index of the first row in which two columns differ; NaN equals NaN."""
-    if pa.types.is_integer(ours.type) and not ours.null_count and not theirs.null_count:
-        differing = np.flatnonzero(ours.to_numpy() != theirs.to_numpy())
-        return int(differing[0]) if len(differing) else None
-    pairs = zip_longest(ours.to_pylist(), theirs.to_pylist())
-    return next((number for number, (a, b) in enumerate(pairs) if a != b and str(a) != str(b)), None)
 
 
 def _row(table: pa.Table, index: int) -> dict[str, Any]:

@@ -18,9 +18,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from emulator.checks.judge import Judgement, Verdict
-from emulator.checks.replay import CALLS, check_replay, compare_folders
+from emulator.checks.replay import CALLS, check_replay, compare_runs
 from emulator.drivers.conclude import judge_further
 from emulator.drivers.emulation import Emulation
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import AGAIN
 from emulator.records.verdicts import CheckResult, Finding, named, unknown
 from vnet.errors import VnetError
@@ -161,7 +162,7 @@ def _other_hash_seed(emulation: Emulation, options: Sequence[str]) -> str:
         if status not in {each.exit_status for each in Verdict}:
             return f"note: {name} it ended with status {status}"
         try:
-            finding = compare_folders(emulation.folder.path, folder)
+            finding = compare_runs(*map(RecordedRun.open, (emulation.folder.path, folder)))
         except VnetError as error:
             return f"note: {name} it cannot be compared: {error}"
     if finding.verdict is Verdict.VALID:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, takewhile, zip_longest
 from typing import Any
@@ -20,6 +20,7 @@ from vnet.units import NS_PER_S
 
 FRAME = ("sent_ns", "sender", "seq", "size_bytes", "payload_digest")
 RECEPTION = ("sent_ns", "sender", "seq", "copy", "receiver", "outcome", "cause", "arrival_ns")
+EITHER = tuple(dict.fromkeys((*FRAME, *RECEPTION)))
 MOST_BEFORE = 8
 """Events and frames that are told of before a parting."""
 
@@ -58,7 +59,8 @@ def before(trace: pa.Table, events: Sequence[Event], node: str, end_ns: int) -> 
         for event in events
         if event.node == node and event.time_ns < end_ns
     ]
-    for row in trace.select(RECEPTION).to_pylist():
+    mine = [pc.equal(trace[column].cast(pa.string()), node) for column in ("sender", "receiver")]
+    for row in trace.select(RECEPTION).filter(pc.or_(*mine)).to_pylist():
         if row["receiver"] == node and row["arrival_ns"] is not None and row["arrival_ns"] <= end_ns:
             lines.append((row["arrival_ns"], f"heard frame {row['seq']} of {row['sender']}"))
         elif row["sender"] == node and row["sent_ns"] < end_ns:
@@ -121,19 +123,76 @@ def _line(details: dict[str, Any]) -> str:
 Row = dict[str, Any]
 
 
+def first_frame(first: OpenedRun, second: OpenedRun) -> Parting | None:
+    """Return the first frame in which two runs differ."""
+    return next((each for each in _first_in_traces(first, second) if each and each.kind == "frame"), None)
+
+
 def _first_in_traces(first: OpenedRun, second: OpenedRun) -> Iterator[Parting | None]:
-    """Yield the first frame and the first reception that differ; traces may have millions of rows."""
-    if not first.trace.equals(second.trace):
-        yield _first_entry("frame", _frames(first), _frames(second))
-        yield _first_entry("reception", _receptions(first), _receptions(second))
+    """Yield the first frame and the first reception that differ."""
+    traces = first.trace.select(EITHER), second.trace.select(EITHER)
+    row = first_difference(*traces)
+    if row is not None:
+        sent_ns = [trace["sent_ns"] for trace in traces]
+        known_ns = [pc.coalesce(trace["arrival_ns"], trace["sent_ns"]) for trace in traces]
+        yield _first_row("frame", traces, sent_ns, row, _frames)
+        yield _first_row("reception", traces, known_ns, row, _receptions)
 
 
-def _frames(run: OpenedRun) -> list[Entry]:
-    return sorted({_frame(row) for row in run.trace.select(FRAME).to_pylist()})
+def _first_row(
+    kind: str,
+    traces: Sequence[pa.Table],
+    times: Sequence[pa.ChunkedArray],
+    row: int,
+    entries: Callable[[Sequence[Row]], Sequence[Entry]],
+) -> Parting | None:
+    """Return the first entry in which two traces differ, whose rows before `row` are the same and have these times.
+
+    Traces may have millions of rows, so entries are made an instant at a time, of those that later rows are of.
+    """
+    times_ns = [each.to_numpy() for each in times]
+    orders = [np.argsort(each, kind="stable") for each in times_ns]
+    for instant in np.unique(np.concatenate([each[row:] for each in times_ns])):
+        found = []
+        for trace, time_ns, order in zip(traces, times_ns, orders, strict=True):
+            start, end = (np.searchsorted(time_ns, instant, side, sorter=order) for side in ("left", "right"))
+            found.append(entries(trace.take(order[start:end]).to_pylist()))
+        if (parting := _first_entry(kind, *found)) is not None:
+            return parting
+    return None
 
 
-def _receptions(run: OpenedRun) -> list[Entry]:
-    return sorted(_reception(row) for row in run.trace.select(RECEPTION).to_pylist())
+def first_difference(first: pa.Table, second: pa.Table) -> int | None:
+    """Return the number of the first row in which two tables of the same columns differ; NaN equals NaN."""
+    shared = min(len(first), len(second))
+    index = None if len(first) == len(second) else shared
+    for name in first.column_names:
+        ours, theirs = first[name].slice(0, shared), second[name].slice(0, shared)
+        if not ours.equals(theirs):
+            differing = _first_differing(ours, theirs)
+            index = differing if index is None or (differing is not None and differing < index) else index
+    return index
+
+
+def _first_differing(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> int | None:
+    """Return the index of the first row in which two columns differ; NaN equals NaN."""
+    ours, theirs = (
+        each.cast(pa.string()) if pa.types.is_dictionary(each.type) else each for each in (ours, theirs)
+    )
+    if ours.type == theirs.type and (pa.types.is_integer(ours.type) or pa.types.is_string(ours.type)):
+        either_null = pc.xor(pc.is_null(ours), pc.is_null(theirs))
+        index = pc.index(pc.or_(pc.fill_null(pc.not_equal(ours, theirs), False), either_null), True).as_py()
+        return index if index >= 0 else None
+    pairs = zip_longest(ours.to_pylist(), theirs.to_pylist())
+    return next((number for number, (a, b) in enumerate(pairs) if a != b and str(a) != str(b)), None)
+
+
+def _frames(rows: Sequence[Row]) -> list[Entry]:
+    return sorted({_frame(row) for row in rows})
+
+
+def _receptions(rows: Sequence[Row]) -> list[Entry]:
+    return sorted(_reception(row) for row in rows)
 
 
 def _frame(row: Row) -> Entry:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from emulator.checks.replay import compare_folders
+from emulator.checks.replay import compare_runs
 from emulator.pages.canvas import BLUE, RED, Canvas, FaultSpan, canvas, legend
 from emulator.pages.page import SIGNS, put_page, render, table
 from emulator.pages.text import cell
@@ -44,6 +44,8 @@ class Comparison:
 
     first: Source
     second: Source
+    runs: tuple[OpenedRun, OpenedRun]
+    """The runs with all columns, of which pages need some."""
     finding: CheckResult
 
     @classmethod
@@ -54,7 +56,8 @@ class Comparison:
         sources = Source(first), Source(second)
         for source in sources:
             _ = source.record, source.scenario
-        return cls(*sources, compare_folders(first, second))
+        runs = RecordedRun.open(first), RecordedRun.open(second)
+        return cls(*sources, runs, compare_runs(*runs))
 
     @property
     def records(self) -> tuple[Record, Record]:
@@ -83,17 +86,12 @@ class Comparison:
     @cached_property
     def before(self) -> list[str]:
         """Lines on what the vehicle had done and heard before the first parting."""
-        first, run = self._partings[0], self._whole[0]
+        first, run = self._partings[0], self.runs[0]
         return before(run.trace, run.events, first.node, first.time_ns)
 
     @cached_property
     def _partings(self) -> list[Parting]:
-        return partings(*self._whole)
-
-    @cached_property
-    def _whole(self) -> tuple[OpenedRun, OpenedRun]:
-        """The runs with all columns, of which pages need some."""
-        return RecordedRun.open(self.first.folder), RecordedRun.open(self.second.folder)
+        return partings(*self.runs)
 
     @cached_property
     def scenario(self) -> list[Row]:

@@ -1,15 +1,30 @@
 """Two runs are set side by side to the first decision, frame, reception, event and value in which they differ."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from emulator.api import simulate_into
 from emulator.cli.commands import app
-from emulator.records.parting import Entry, Parting, _first_entry, before, partings
+from emulator.records.parting import (
+    EITHER,
+    Entry,
+    Parting,
+    _first_entry,
+    _first_in_traces,
+    _frames,
+    _receptions,
+    before,
+    partings,
+)
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.tables import TRACE
 from emulator.scenario.scenario import Scenario
 
 
@@ -103,6 +118,40 @@ def test_a_parting_names_the_entry_that_one_run_lacks(
     first: list[Entry], second: list[Entry], expected: Parting | None
 ) -> None:
     assert _first_entry("frame", first, second) == expected
+
+
+rows = st.lists(
+    st.fixed_dictionaries(
+        {
+            "sent_ns": st.integers(0, 3),
+            "sender": st.sampled_from(["v01", "v02"]),
+            "seq": st.integers(0, 1),
+            "size_bytes": st.just(8),
+            "payload_digest": st.integers(0, 1),
+            "copy": st.just(0),
+            "receiver": st.sampled_from(["v01", "v02", "v03"]),
+            "outcome": st.sampled_from(["delivered", "lost"]),
+            "cause": st.none() | st.just("block-0"),
+            "arrival_ns": st.none() | st.integers(0, 6),
+        }
+    ),
+    max_size=6,
+)
+
+
+@given(rows, rows, rows)
+def test_traces_part_where_all_their_entries_do(same: list[Any], first: list[Any], second: list[Any]) -> None:
+    """In whatever order their rows are: a damaged trace is not sorted by time."""
+    schema = pa.schema([TRACE.schema.field(name) for name in EITHER])
+    ours, theirs = same + first, same + second
+    runs = [SimpleNamespace(trace=pa.Table.from_pylist(rows, schema)) for rows in (ours, theirs)]
+    found = [each for each in _first_in_traces(*runs) if each is not None]  # type: ignore[arg-type]
+    whole = [
+        _first_entry(kind, entries(ours), entries(theirs))
+        for kind, entries in (("frame", _frames), ("reception", _receptions))
+    ]
+    places = [(each.time_ns, each.kind, each.node) for each in whole if each is not None]
+    assert [(each.time_ns, each.kind, each.node) for each in found] == places
 
 
 @pytest.mark.slow
