@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from itertools import count
 from typing import Annotated, Any, Literal
+from zlib import crc32
 
 import msgspec
 import zenoh
@@ -19,6 +20,8 @@ from vnet.units import NS_PER_S
 
 FRAGMENT_BYTES = 24
 """Most bytes of a frame around its part of a message."""
+CHECKSUM_BYTES = 4
+"""Bytes at the end of a message in parts: one of other bytes would often be a message as well."""
 MOST_UNFINISHED = 64
 """Messages in parts that are kept of each sender until the rest has come; the oldest go first."""
 MOST_WHOLE = 1024
@@ -145,6 +148,10 @@ def sample_options(sample: CrossingSample) -> Mapping[str, Any]:
     }
 
 
+def _checksum(content: bytes) -> bytes:
+    return crc32(content).to_bytes(CHECKSUM_BYTES)
+
+
 def _bytes(content: zenoh.ZBytes | None) -> bytes | None:
     return None if content is None else content.to_bytes()
 
@@ -192,6 +199,8 @@ class Fragments:
         """Return the payloads of a message's frames. Raises TooLargeError."""
         content, number = _encode(message), next(self._numbers)
         size = self._max_payload - FRAGMENT_BYTES
+        if len(content) > size:
+            content += _checksum(content)
         parts = -(-len(content) // max(size, 1))
         if size < 1 or parts > MOST_FRAGMENTS:
             raise TooLargeError(
@@ -221,7 +230,11 @@ class Reassembly:
         parts[fragment.index] = fragment.content
         if len(parts) == fragment.parts:
             del unfinished[fragment.number]
-            return decode_message(b"".join(parts[index] for index in range(fragment.parts)))
+            whole = b"".join(parts[index] for index in range(fragment.parts))
+            content, checksum = whole[:-CHECKSUM_BYTES], whole[-CHECKSUM_BYTES:]
+            if checksum != _checksum(content):
+                raise LookupError(f"a part of message {fragment.number} has been changed")
+            return decode_message(content)
         if len(unfinished) > MOST_UNFINISHED:
             unfinished.popitem(last=False)
         return None

@@ -4,7 +4,7 @@ import contextlib
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from vnet.gateway.frames import (
@@ -61,6 +61,26 @@ def test_a_message_arrives_as_it_was_if_all_its_frames_do_and_else_not_at_all(
 
 
 @pytest.mark.slow
+@given(SAMPLES, st.data())
+def test_a_message_of_which_a_part_was_changed_is_that_message_or_none(
+    message: CrossingSample, data: st.DataObject
+) -> None:
+    """Most changes leave bytes that can be decoded: of a payload, or the number of a part."""
+    frames, reassembly = list(Fragments(100).of(message)), Reassembly()
+    assume(len(frames) > 1)
+    flips = data.draw(st.lists(st.tuples(*(st.integers(0, size) for size in (len(frames) - 1, 49, 7))), min_size=1))
+    for frame, place, bit in flips:
+        changed = bytearray(frames[frame])
+        changed[place % len(changed)] ^= 1 << bit
+        frames[frame] = bytes(changed)
+    heard = []
+    for frame in frames:
+        with contextlib.suppress(msgspec.MsgspecError, LookupError):
+            heard.append(reassembly.take("v01", frame))
+    assert set(heard) <= {None, message}
+
+
+@pytest.mark.slow
 @given(st.binary(max_size=100))
 def test_bytes_of_anybody_are_refused_or_are_a_message(content: bytes) -> None:
     with contextlib.suppress(msgspec.MsgspecError, LookupError):
@@ -90,5 +110,5 @@ def test_unfinished_messages_do_not_fill_the_memory() -> None:
 
 
 def test_what_needs_too_many_frames_is_refused_by_its_size() -> None:
-    with pytest.raises(TooLargeError, match=r"317 bytes .*radio.max_payload_bytes = 20"):
+    with pytest.raises(TooLargeError, match=r"321 bytes .*radio.max_payload_bytes = 20"):
         Fragments(20).of(CrossingQuery(0, "key", bytes(300), None, None))
