@@ -1,5 +1,6 @@
 """Fixtures for tests of all packages."""
 
+import functools
 import gc
 import os
 import re
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer.main
 from hypothesis import Phase, settings
 
 from tests.support import forked_commands
@@ -23,6 +25,9 @@ settings.register_profile("same", derandomize=True, deadline=None, max_examples=
 settings.load_profile("same")
 # For mutants: the first example that fails is enough, and looking for a smaller one takes minutes.
 settings.register_profile("first", settings.get_profile("same"), phases=[Phase.explicit, Phase.generate])
+
+# A thirtieth of a second for each command line, of an application that is always the same.
+vars(typer.main)["get_command"] = functools.cache(typer.main.get_command)
 
 
 gc.disable()  # while tests are collected: nothing of what is imported is garbage

@@ -1,9 +1,12 @@
 """The commands of the documentation: run as they are written; those that cannot run here are parsed."""
 
 import contextlib
+import copy
+import functools
 import importlib
 import importlib.util
 import io
+import os
 import re
 import shlex
 import subprocess
@@ -143,9 +146,7 @@ def parse(words: Sequence[str]) -> None:
     is_run(words)  # refuses what is not known
     if program in PYTHON:
         return
-    command = typer.main.get_command(APPS[program])
-    _disarm(command)
-    text, status = captured(command, arguments)
+    text, status = captured(_disarmed(program), arguments)
     if status != 0:
         raise DocsError(f"{shlex.join(words)}: {text.strip()}")
 
@@ -158,6 +159,14 @@ def _look_at(program: str, arguments: list[str]) -> None:
             raise DocsError(f"make: no such target: {', '.join(sorted(wrong))}")
     if program == "ip" and "exec" in arguments:
         parse(arguments[arguments.index("exec") + 2 :])
+
+
+@functools.cache
+def _disarmed(program: str) -> Any:
+    """Return a copy of a command that parses its command line, and does nothing."""
+    command = copy.deepcopy(typer.main.get_command(APPS[program]))
+    _disarm(command)
+    return command
 
 
 def _disarm(command: Any) -> None:
@@ -199,12 +208,12 @@ def _process(words: Sequence[str]) -> tuple[str, int]:
 @contextlib.contextmanager
 def forgetting(folder: Path) -> Iterator[None]:
     """Leave nothing of the modules in `folder` in this process."""
-    path = list(sys.path)
+    path, inside = list(sys.path), f"{folder}{os.sep}"
     importlib.invalidate_caches()
     try:
         yield
     finally:
         sys.path[:] = path
         for name, module in list(sys.modules.items()):
-            if Path(getattr(module, "__file__", None) or "/").is_relative_to(folder):
+            if str(getattr(module, "__file__", None)).startswith(inside):
                 del sys.modules[name]

@@ -55,10 +55,12 @@ _lock = threading.Lock()
 _schedules = 0
 _before_schedules: tuple[tuple[int, int, int], bool] = (gc.get_threshold(), False)
 BLOCKS_A_COUNT = 20
-"""Blocks from one count of all objects to the next: counting takes milliseconds."""
+"""Blocks from one count of many objects to the next: counting takes milliseconds."""
 _blocks = 0
 _objects = 0
 """Objects at the first count, or left by the last collection before a block."""
+_found_frozen = 0
+"""Blocks since others were last found to have frozen objects, with that one; 0 if they were found to have none."""
 _takers: weakref.WeakKeyDictionary[Node, weakref.WeakMethod[Taker]] = weakref.WeakKeyDictionary()
 _started_by: weakref.WeakKeyDictionary[threading.Thread, Node] = weakref.WeakKeyDictionary()
 _watchers = 0
@@ -78,7 +80,7 @@ def collected_by_schedule() -> Iterator[None]:
     with _lock:
         _schedules += 1
         if _schedules == 1:
-            freezes = gc.get_freeze_count() == 0
+            freezes = not _others_have_frozen()
             _before_schedules = gc.get_threshold(), freezes
             if freezes:
                 _freeze()
@@ -93,6 +95,16 @@ def collected_by_schedule() -> Iterator[None]:
                 gc.set_threshold(*_before_schedules[0])
                 if _before_schedules[1]:
                     gc.unfreeze()
+
+
+def _others_have_frozen() -> bool:
+    """Return True if objects are frozen before a block, which are counted only now and then once there are some."""
+    global _found_frozen
+    if _found_frozen % BLOCKS_A_COUNT == 0:
+        _found_frozen = int(gc.get_freeze_count() > 0)
+    else:
+        _found_frozen += 1
+    return _found_frozen > 0
 
 
 def _freeze() -> None:

@@ -29,6 +29,16 @@ class InCycle:
 
 
 @pytest.fixture
+def unfrozen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Have nothing frozen; afterwards all is frozen again, as `tests/conftest.py` has done."""
+    monkeypatch.setattr(outside_loop, "_found_frozen", 0)
+    gc.unfreeze()
+    yield
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture
 def thresholds() -> Iterator[tuple[int, int, int]]:
     """Have the collector's thresholds as they were, whatever a test does."""
     before = gc.get_threshold()
@@ -36,9 +46,9 @@ def thresholds() -> Iterator[tuple[int, int, int]]:
     gc.set_threshold(*before)
 
 
+@pytest.mark.usefixtures("unfrozen")
 def test_the_collector_waits_within_the_block_alone(thresholds: tuple[int, int, int]) -> None:
     gc.set_threshold(500, 7, 8)
-    gc.unfreeze()  # what an earlier test has left
     with collected_by_schedule():
         with collected_by_schedule():
             assert gc.get_threshold()[0] == MOST_UNCOLLECTED
@@ -49,6 +59,7 @@ def test_the_collector_waits_within_the_block_alone(thresholds: tuple[int, int, 
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unfrozen")
 @pytest.mark.parametrize(
     ("objects_before", "threshold", "collects"), [(1, 700, True), (1, 0, False), (10**9, 700, False)]
 )
@@ -59,7 +70,6 @@ def test_what_earlier_runs_have_left_is_collected_once_it_is_much(
     thresholds: tuple[int, int, int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    gc.unfreeze()  # what an earlier test has left
     monkeypatch.setattr(outside_loop, "_objects", objects_before)
     monkeypatch.setattr(outside_loop, "_blocks", BLOCKS_A_COUNT - 1)
     found: list[bool] = []
@@ -77,14 +87,30 @@ def test_a_collector_that_is_switched_off_by_its_threshold_stays_so(thresholds: 
     assert gc.get_threshold()[0] == 0
 
 
-def test_what_was_frozen_before_stays_frozen() -> None:
+@pytest.mark.usefixtures("unfrozen")
+def test_what_was_frozen_before_stays_frozen_and_is_counted_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+    count, counts = gc.get_freeze_count, []
+
+    def counted() -> int:
+        counts.append(count())
+        return counts[-1]
+
+    monkeypatch.setattr(gc, "get_freeze_count", counted)
+
+    def pass_blocks(number: int) -> None:
+        for _ in range(number):
+            with collected_by_schedule():
+                pass
+
     gc.freeze()
-    try:
-        with collected_by_schedule():
-            pass
-        assert gc.get_freeze_count() > 0
-    finally:
-        gc.unfreeze()
+    pass_blocks(BLOCKS_A_COUNT)
+    assert len(counts) == 1 and count() > 0
+    gc.unfreeze()
+    pass_blocks(1)
+    assert len(counts) == 2 and count() == 0
+    gc.freeze()
+    pass_blocks(1)
+    assert len(counts) == 3 and count() > 0
 
 
 @pytest.mark.parametrize("others", [(), ("v2",), ("v2", "v3")])
