@@ -657,6 +657,8 @@ class Emulation:
         self._log_changes(time_ns, active)
         absent = self._absent(time_ns // self.world.period_ns)
         killed = self._nodes_under(active, lambda fault: fault.forced)
+        # SIGTERM ends a Zenoh program in real time, and so does what stands for it: no `finally` block runs.
+        goes_hard = self.scenario.program.kind == "zenoh" and not self.scenario.has_gateways
         changes = self.presence.change(self._nodes_under(active, lambda fault: fault.ends), absent)
         for node in changes.stopped:
             self.engine.set_up(self.number[node], False)
@@ -667,7 +669,7 @@ class Emulation:
             self.come_back(changes.started, time_ns)
         return ProcessActions(
             time_ns=time_ns,
-            stop={node: node in killed for node in changes.stopped},
+            stop={node: goes_hard or node in killed for node in changes.stopped},
             start=changes.started,
             paused=self._nodes_under(active, lambda fault: not fault.ends),
             clocks=[clock_of(active, node, number, time_ns) for node, number in self.number.items()],
