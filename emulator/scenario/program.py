@@ -123,7 +123,8 @@ class ZenohSessions(Section):
         secure = not self.listen.startswith("tcp/")
         for name in ("certificate", "private_key", "authority"):
             if secure != (getattr(self, name) is not None):
-                raise ValueError(f"listen = {shown(self.listen)}: {name} goes with tls/ and quic/, which need it")
+                what = f"{name} is missing: a PEM file" if secure else f"{name} goes with tls/ or quic/"
+                raise ValueError(f"listen = {shown(self.listen)}: {what}")
         return self
 
 

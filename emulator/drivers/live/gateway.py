@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import secrets
+import ssl
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -22,6 +23,7 @@ import zenoh
 
 from emulator.drivers.agent_keys import Hear
 from emulator.scenario.program import ZenohSessions
+from vnet.errors import ProgramError, shown
 from vnet.gateway import STARTUP, client_config, session_variables
 from vnet.gateway.frames import (
     CrossingQuery,
@@ -292,6 +294,27 @@ def session_environment(
     path.chmod(0o600)
     python_path = os.pathsep.join(filter(None, [str(STARTUP), inherited.get("PYTHONPATH")]))
     return {**inherited, **session_variables(node, endpoint, client, path), "PYTHONPATH": python_path}
+
+
+def check_trust(settings: ZenohSessions) -> None:
+    """Raise ProgramError if commands would not trust the certificate of their endpoint: Zenoh does not say why."""
+    if settings.certificate is None or settings.private_key is None:
+        return
+    router, command = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    command.check_hostname = False
+    command.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # as Zenoh, which takes any certificate for an authority
+    try:
+        router.load_cert_chain(settings.certificate, settings.private_key)
+        command.load_verify_locations(settings.authority)
+        up, down = ssl.MemoryBIO(), ssl.MemoryBIO()
+        for side in (command.wrap_bio(down, up), router.wrap_bio(up, down, server_side=True)) * 2:
+            with suppress(ssl.SSLWantReadError):
+                side.do_handshake()
+    except OSError as error:  # also of files that are none
+        raise ProgramError(
+            f"program.zenoh: certificate = {shown(str(settings.certificate))} with its private_key is none that "
+            f"authority = {shown(str(settings.authority))} has issued: {getattr(error, 'verify_message', error)}"
+        ) from None
 
 
 def _known_source(sample: CrossingSample) -> zenoh.SourceInfo | None:

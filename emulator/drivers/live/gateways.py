@@ -27,7 +27,7 @@ import zenoh
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit, Launcher
-from emulator.drivers.live.gateway import Gateway, is_peer, session_environment, session_name
+from emulator.drivers.live.gateway import Gateway, check_trust, is_peer, session_environment, session_name
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from emulator.scenario.program import PYTHON
@@ -140,6 +140,8 @@ class Gateways:
         """Raise ProgramError for what is no command, and for vehicles without a port, before anything starts."""
         for words in self._program.all_commands if self._starts else ():
             _located(words)
+        if self._starts:
+            check_trust(self._settings)
         port = int(self._settings.listen.rpartition(":")[2])
         if port and port + len(node_ids) - 1 > HIGHEST_PORT:
             raise ProgramError(
