@@ -58,6 +58,61 @@ def test_what_crosses_has_a_timestamp_of_its_vehicles_router(drive: Drive) -> No
 
 
 @pytest.mark.slow
+def test_replies_of_others_have_the_querys_priority_and_a_replier(drive: Drive) -> None:
+    """Only a queryable of the asking session says itself whether its reply is express, as with Zenoh."""
+    run = drive(
+        """
+        import sys, time, zenoh
+        me, session = sys.argv[1], zenoh.open(zenoh.Config())
+
+        def answer(query):
+            with query:
+                query.reply(f"k/{me}", me, express=True)
+
+        queryable = session.declare_queryable(f"k/{me}", answer)
+        time.sleep(0.1)
+        if me == "v01":
+            for options in ({}, {"priority": zenoh.Priority.REAL_TIME, "express": True}):
+                for reply in sorted(session.get("k/*", **options), key=lambda reply: str(reply.ok.key_expr)):
+                    sample, replier = reply.ok, reply.replier_id
+                    own = replier == queryable.id
+                    print(sample.payload.to_string(), sample.express, sample.priority, own, replier.eid)
+        time.sleep(3.0)
+        """,
+        vehicles=2,
+        duration_s=4.0,
+    )
+    assert log(run)[:4] == [
+        "v01 True Priority.DATA True 1",
+        "v02 False Priority.DATA False 0",
+        "v01 True Priority.REAL_TIME True 1",
+        "v02 True Priority.REAL_TIME False 0",
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("history", "told"), [(True, ["live/v02"]), (False, [])])
+def test_a_token_that_was_heard_before_is_history(drive: Drive, history: bool, told: list[str]) -> None:
+    run = drive(
+        f"""
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        if sys.argv[1] == "v02":
+            token = session.liveliness().declare_token("live/v02")
+        else:
+            time.sleep(0.3)
+            print("listens")
+            hear = lambda sample: print(sample.key_expr)
+            session.liveliness().declare_subscriber("live/**", hear, history={history})
+        time.sleep(2)
+        """,
+        vehicles=2,
+        duration_s=1.5,
+    )
+    assert log(run) == ["listens", *told]
+
+
+@pytest.mark.slow
 def test_without_any_key_nothing_crosses(drive: Drive) -> None:
     run = drive(TALK, vehicles=2, radio={"keys": []})
     assert run.trace.num_rows == 0

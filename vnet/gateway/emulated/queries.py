@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Literal
 
+import msgspec
 import zenoh
 
 from vnet.gateway.emulated.values import (
@@ -88,6 +89,17 @@ class Asking:
         self._pending = 1
         self._timer: asyncio.TimerHandle | None = None
         self.is_over = False
+        self.session: object | None = None
+        """The session that asks, None for another vehicle."""
+
+    @property
+    def qos(self) -> dict[str, Any]:
+        """Quality of service of replies: the query's own."""
+        return {
+            "congestion_control": self.congestion_control or zenoh.CongestionControl.BLOCK,
+            "priority": self.priority or zenoh.Priority.DATA,
+            "express": bool(self.express),
+        }
 
     def expire_after(self, seconds: float) -> None:
         """End it then if it goes on."""
@@ -104,11 +116,14 @@ class Asking:
         if not self.is_over:
             entity.sink.push(query)
 
-    def reply(self, reply: Reply) -> None:
-        """Take a reply."""
+    def reply(self, reply: Reply, session: object | None = None) -> None:
+        """Take a reply of a session, None for one that comes by radio: of others it has the query's priority."""
         sample = reply.result
         if self.is_over:
             return
+        if isinstance(sample, Sample) and (session is None or session is not self.session):
+            sample = msgspec.structs.replace(sample, **self.qos)
+            reply = Reply(sample, reply.replier_id)
         if not isinstance(sample, Sample) or not self._consolidates:
             self.on_reply(reply)
             return
@@ -220,17 +235,15 @@ class Query:
         asking, key_expr = self._asking, key_of(key)
         if not asking.takes_any_key and not asking.key.intersects(key_expr):
             raise zenoh.ZError(f"Attempted to reply on `{key_expr}`, which does not intersect query `{asking.key}`")
-        qos = (
-            asking.congestion_control or zenoh.CongestionControl.BLOCK,
-            asking.priority or zenoh.Priority.DATA,
-            bool(asking.express if express is None else express),
-        )
-        self._answer(Sample(key_expr, payload, kind, encoding, timestamp, *qos, bytes_or_none(attachment)))
+        options = {**asking.qos, "attachment": bytes_or_none(attachment), "timestamp": timestamp}
+        if express is not None:
+            options["express"] = express
+        self._answer(Sample(key_expr, payload, kind, encoding, **options))
 
     def _answer(self, result: Sample | ReplyError) -> None:
         if not self._is_open:
             raise zenoh.ZError("the query has been dropped")
-        self._asking.reply(Reply(result, self._entity.id))
+        self._asking.reply(Reply(result, self._entity.id), self._entity.session)
 
     def drop(self) -> None:
         """Conclude it: no more replies come from here."""

@@ -24,6 +24,7 @@ from vnet.gateway.emulated.values import (
     NO_ENCODING,
     PUT,
     DueCallbacks,
+    EntityGlobalId,
     Reply,
     Sample,
     ZenohId,
@@ -89,11 +90,12 @@ class Vehicle(RadioSide[Asking]):
 
     def declare(self, entity: Entity) -> None:
         """Add an entity."""
+        if entity.kind != "token":
+            self._listen()  # first: tokens that were heard before are not told as new
         self._entities[entity.kind].append(entity)
         if entity.kind == "token":
             self._token_changed(entity.key, alive=True)
             return
-        self._listen()
         fix_keys = [FIX_KEY] if self._ros2 is None else [FIX_KEY, self._ros2.fix_key]
         if entity.kind == "subscriber" and any(map(entity.key.intersects, fix_keys)):
             self._locates.set()
@@ -166,6 +168,7 @@ class Vehicle(RadioSide[Asking]):
 
     def ask(self, asking: Asking, session: object | None, to_own: bool, to_others: bool) -> None:
         """Ask the queryables of a session, those of others, and other vehicles; None asks for another vehicle."""
+        asking.session = session
         intersecting = [each for each in self._entities["queryable"] if each.key.intersects(asking.key)]
         all_complete = asking.target == zenoh.QueryTarget.ALL_COMPLETE
         if to_others:
@@ -319,7 +322,7 @@ class Vehicle(RadioSide[Asking]):
                 entity.sink.push(shown)
 
     def _reply(self, query: Asking, answer: CrossingReply) -> None:
-        query.reply(Reply(result_of(answer)))
+        query.reply(Reply(result_of(answer), EntityGlobalId(self.zid, 0)))  # as a gateway, which passes it on
 
     async def tell_fixes(self) -> None:
         """Put each fix at the sessions, from the first subscriber on that takes them."""
