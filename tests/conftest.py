@@ -41,6 +41,17 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if SLOW_FILE.search(collection_path.read_text(encoding="utf-8")) else None
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what waits for processes, so that other workers compute meanwhile; end with files of quick tests.
+
+    The first worker takes the first of the tests, and those that are done take the last of others.
+    """
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    waiting = [path for path in slow if path.parent.name in ("system", "docs")]
+    items.sort(key=lambda item: (item.path not in waiting, item.path not in slow))
+
+
 def pytest_collection_finish() -> None:
     """Keep garbage collection from looking through all tests and modules again at the end of each simulation."""
     gc.enable()
