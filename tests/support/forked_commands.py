@@ -1,9 +1,9 @@
 """Processes of vnet without the second that each takes to import vnet: forks of one process.
 
 `Command([*VNET, …], …)` and `run([*VNET, …], …)` are `subprocess.Popen` and `subprocess.run` of the command, those
-of `[*MODULE, NAME, …]` of a module of this repository. Workers of cells, and repetitions of runs, that it starts
-are forked as well; those of this process, once it has called `fork_processes`. tests/emulator/cli,
-tests/system/test_wheel.py and tests/emulator/cells/test_worker.py start processes as users do.
+of `[*MODULE, NAME, …]` of a module of this repository. Workers of cells, repetitions of runs, and checks of
+programs that it starts are forked as well; those of this process, once it has called `fork_processes`.
+tests/emulator/cli, tests/system/test_wheel.py and tests/emulator/cells/test_worker.py start processes as users do.
 """
 
 import atexit
@@ -30,6 +30,7 @@ PYTHON = [sys.executable, "-P", "-m"]
 VNET = [*PYTHON, "emulator.cli"]
 MODULE = [*PYTHON, "runpy"]
 WORKER = "emulator.cells.worker"
+CHECK = "agents.program_check"
 _LENGTH = 2**20
 _NUMBER = "%-20d"
 
@@ -39,7 +40,7 @@ class Command(subprocess.Popen[str]):
 
     def _execute_child(self, args: Sequence[str], *more: Any) -> None:
         first = len(PYTHON)
-        known = list(args[:first]) == PYTHON and args[first] in (VNET[first], MODULE[first], WORKER)
+        known = list(args[:first]) == PYTHON and args[first] in (VNET[first], MODULE[first], WORKER, CHECK)
         assert known and more[1] is None, "no other command, and no `preexec_fn`"
         sys.audit("subprocess.Popen", args[0], args, more[4], more[5])
         passed, cwd, environment, pipes = more[3], more[4], more[5], more[9:15]
@@ -92,11 +93,12 @@ def run(
 
 
 def fork_processes() -> None:
-    """Have workers of cells, and repetitions of runs, that this process starts be forked from now on."""
+    """Have workers of cells, repetitions of runs and checks of programs be forked that this process starts."""
     from emulator.cells import worker
-    from emulator.drivers import determinism
+    from emulator.drivers import determinism, session
 
-    vars(worker)["subprocess"] = SimpleNamespace(**vars(subprocess) | {"Popen": Command})
+    for module in (worker, session):
+        vars(module)["subprocess"] = SimpleNamespace(**vars(subprocess) | {"Popen": Command})
     vars(determinism)["subprocess"] = SimpleNamespace(**vars(subprocess) | {"run": _run_any})
 
 
@@ -207,6 +209,7 @@ if __name__ == "__main__":
     import pyarrow
     import pytest  # noqa: F401  # what pages run as well
 
+    import agents.program_check
     import emulator.cells.sweep
     import emulator.cli
     import emulator.cli.commands
@@ -225,6 +228,8 @@ if __name__ == "__main__":
     sockets = [socket.socket(fileno=int(number)) for number in sys.argv[1:]]
     if (asked := serve(*sockets)) == WORKER:
         emulator.cells.worker._serve(int(sys.argv[1]))
+    elif asked == CHECK:
+        os._exit(agents.program_check.main(sys.argv[1:]))
     elif asked == "runpy":
         del sys.argv[0]
         runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
