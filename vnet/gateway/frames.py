@@ -39,7 +39,7 @@ Nanoseconds = Annotated[int, msgspec.Meta(ge=0, lt=NS_PER_S)]
 TimestampId = Annotated[bytes, msgspec.Meta(min_length=1, max_length=16)]
 
 
-SourceOf = Callable[[Any], tuple[int, int]]
+SourceOf = Callable[[Any], tuple[bytes, int]]
 """Returns what stands for a `SourceInfo` on the radio."""
 
 
@@ -59,7 +59,7 @@ class CrossingSample(msgspec.Struct, array_like=True, frozen=True, tag="sample")
     congestion: Literal["DROP", "BLOCK", "BLOCK_FIRST"]
     express: bool
     time: tuple[Seconds, Nanoseconds, TimestampId] | None
-    source: tuple[int, int] | None
+    source: tuple[bytes, int] | None
 
 
 class CrossingQuery(msgspec.Struct, array_like=True, frozen=True, tag="query"):

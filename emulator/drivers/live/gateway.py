@@ -42,6 +42,7 @@ from vnet.transport.session import open_local_router, router_endpoint
 
 MOST_SOURCES = 100_000
 """Instances of `SourceInfo` that are kept for samples on their way."""
+PROCESS_ID_BYTES = 8
 ECHO_S = 2.0
 """Seconds after a token was taken back in which Zenoh's echoes of it are not taken for a program's own."""
 REMOTE = zenoh.Locality.REMOTE
@@ -325,12 +326,12 @@ def _known_source(sample: CrossingSample) -> zenoh.SourceInfo | None:
 
 
 @cache
-def _this_process() -> int:
-    """Return a number that no process on any host shares."""
-    return secrets.randbits(62)
+def _this_process() -> bytes:
+    """Return an id that no process on any host shares."""
+    return secrets.token_bytes(PROCESS_ID_BYTES)
 
 
-def _source_of(source: zenoh.SourceInfo) -> tuple[int, int]:
+def _source_of(source: zenoh.SourceInfo) -> tuple[bytes, int]:
     """Return what stands for a `SourceInfo` on the radio."""
     number = next(_source_numbers)
     _sources[number] = source

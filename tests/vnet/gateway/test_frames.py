@@ -31,7 +31,7 @@ SAMPLES = st.builds(
     congestion=st.sampled_from(["DROP", "BLOCK", "BLOCK_FIRST"]),
     express=st.booleans(),
     time=st.none() | st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 10**9 - 1), st.just(b"\x01")),
-    source=st.none() | st.tuples(st.integers(0, 2**62), st.integers(0, 2**62)),
+    source=st.none() | st.tuples(st.binary(max_size=20), st.integers(0, 2**62)),
 )
 MESSAGES: st.SearchStrategy[Message] = st.one_of(
     SAMPLES,

@@ -445,3 +445,57 @@ def test_programs_that_open_no_session_are_named(drive: Drive) -> None:
     lines = [event["text"] for event in events(run, "log")]
     named = [line for line in lines if line.endswith("v01 has opened no Zenoh session")]
     assert len(named) == len(lines) == 2 and "program1.py" in named[0] and "program0.py" in named[1], lines
+
+
+@pytest.mark.slow
+def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
+    run = drive(
+        """
+        import time, zenoh, zenoh.ext
+        session = zenoh.open(zenoh.Config())
+        zid, publisher = session.zid(), session.declare_publisher("a")
+        print(len(str(zid)), len(bytes(zid)), repr(zid) == str(zid))
+        print(repr(publisher.id) == f"EntityGlobalId {{ zid: {zid}, eid: {publisher.id.eid} }}")
+        print(publisher.matching_status)
+        for act in (
+            lambda: session.put("a", "b", priority=5),
+            lambda: session.get("a", target=5),
+            publisher.undeclare,
+            publisher.undeclare,
+            lambda: zenoh.ext.declare_advanced_publisher(session, "a").matching_status,
+        ):
+            try:
+                act()
+            except (zenoh.ZError, TypeError, AttributeError) as error:
+                print(type(error).__name__, error)
+        token = session.liveliness().declare_token("t/a")
+        session.liveliness().declare_subscriber("t/*", lambda sample: print(sample.kind), history=True)
+        time.sleep(0.1)
+        session.close()
+        time.sleep(0.1)
+        """
+    )
+    assert log(run)[:-1] == [
+        "32 16 True",
+        "True",
+        "MatchingStatus { matching: true }",
+        "TypeError argument 'priority': 'int' object cannot be converted to 'Priority'",
+        "TypeError argument 'target': 'int' object cannot be converted to 'QueryTarget'",
+        "ZError Undeclared publisher",
+        "AttributeError 'AdvancedPublisher' object has no such attribute in Zenoh",
+        "SampleKind.PUT",
+    ]
+
+
+@pytest.mark.slow
+def test_the_end_of_a_run_is_no_failure_of_a_thread(drive: Drive) -> None:
+    run = drive(
+        """
+        import threading, time
+        threading.excepthook = lambda failed: print("failed", failed.exc_type.__name__)
+        threading.Thread(target=lambda: 1 / 0).start()
+        threading.Thread(target=lambda: time.sleep(9), daemon=True).start()
+        time.sleep(9)
+        """
+    )
+    assert log(run) == ["failed ZeroDivisionError"]

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial, partialmethod
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import msgspec
 import zenoh
@@ -100,8 +100,14 @@ def _every(seconds: float, act: Callable[[], object]) -> asyncio.Task[None]:
     return Task(repeat(), loop=loop)
 
 
+def _absent(publisher: AdvancedPublisher) -> NoReturn:
+    raise AttributeError("'AdvancedPublisher' object has no such attribute in Zenoh")
+
+
 class AdvancedPublisher(Publisher):
     """A publisher whose samples can be asked for later."""
+
+    matching_status = declare_matching_listener = property(_absent)
 
     def __init__(
         self,

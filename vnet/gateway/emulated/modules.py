@@ -385,6 +385,14 @@ class ProgramModules:
     def _prepare_threading(self, module: Any) -> None:
         module.local = self.load("_threading_local").local
         vars(self.load("_thread"))["RLock"] = module._PyRLock
+        make_hook = module._make_invoke_excepthook
+
+        def make_silent_hook() -> Callable[[Any], None]:
+            """As Python's for threads that fail: the end of a program is no failure of its threads."""
+            hook = make_hook()
+            return lambda thread: None if isinstance(sys.exception(), GreenletExit) else hook(thread)
+
+        module._make_invoke_excepthook = make_silent_hook
         module.Event.is_set = module.Event.isSet = _looking(module.Event.is_set, nothing=False)
 
     def _prepare_queue(self, module: Any) -> None:

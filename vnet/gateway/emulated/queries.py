@@ -40,7 +40,7 @@ class Entity:
 
     kind: Literal["subscriber", "queryable", "token", "watcher"]
     """A "watcher" is a subscriber of tokens."""
-    session: object
+    session: Any
     id: EntityGlobalId
     key: zenoh.KeyExpr
     sink: Sink = field(default_factory=lambda: Direct(lambda item: None))
@@ -242,7 +242,7 @@ class Query:
 
     def _answer(self, result: Sample | ReplyError) -> None:
         if not self._is_open:
-            raise zenoh.ZError("the query has been dropped")
+            raise zenoh.ZError("Dropped query")
         self._asking.reply(Reply(result, self._entity.id), self._entity.session)
 
     def drop(self) -> None:

@@ -50,11 +50,26 @@ _REFUSED_SETTINGS = (
 LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
 
 
-def _refuse(**given: object) -> None:
-    """Raise ZError for an argument that virtual time does not have."""
+_TYPES: dict[str, type] = {
+    "priority": zenoh.Priority,
+    "congestion_control": zenoh.CongestionControl,
+    "express": bool,
+    "timestamp": zenoh.Timestamp,
+    "target": zenoh.QueryTarget,
+}
+"""Types of arguments that are of no other."""
+
+
+def _check(**given: object) -> None:
+    """Raise TypeError for an argument of another type, and ZError for one that virtual time does not have."""
     for name, value in given.items():
-        if value is not None:
+        if value is None:
+            continue
+        if name not in _TYPES:
             raise zenoh.ZError(f"{name} is not available on virtual time: sessions have no transport")
+        if not isinstance(value, _TYPES[name]):
+            kind = type(value).__name__
+            raise TypeError(f"argument '{name}': '{kind}' object cannot be converted to '{_TYPES[name].__name__}'")
 
 
 class Declared:
@@ -62,6 +77,8 @@ class Declared:
 
     _ends: list[Callable[[], object]] | None = None
     """Undeclare it, one after another; None unless it is declared."""
+    _noun = "LivelinessToken"
+    """Word of Zenoh's messages for it."""
 
     def __enter__(self) -> Any:
         return self
@@ -72,7 +89,7 @@ class Declared:
     def check_declared(self) -> None:
         """Raise ZError if it has been undeclared."""
         if self._ends is None:
-            raise zenoh.ZError(f"Undeclared {type(self).__name__}")
+            raise zenoh.ZError(f"Undeclared {self._noun}")
 
     def undeclare(self) -> None:
         """Undeclare it. Raises ZError if it has been."""
@@ -88,6 +105,8 @@ class Declared:
 
 class Listening(Declared):
     """An entity that takes items, with the end of the channel that the program reads."""
+
+    _noun = "listener"
 
     def __init__(self, handler: Any, outlet: Outlet) -> None:
         self._sink, self.handler = sink_of(handler, outlet)
@@ -121,6 +140,7 @@ class Subscriber(Listening):
     """A subscriber."""
 
     kind: Literal["subscriber", "queryable", "watcher"] = "subscriber"
+    _noun = "subscriber"
 
     def __init__(
         self,
@@ -148,7 +168,7 @@ class Subscriber(Listening):
 class Queryable(Subscriber):
     """A queryable."""
 
-    kind = "queryable"
+    kind = _noun = "queryable"
 
 
 class Watcher(Subscriber):
@@ -273,6 +293,8 @@ class Sending(Declared):
 class Publisher(Sending):
     """A publisher."""
 
+    _noun = "publisher"
+
     def __init__(
         self,
         session: Session,
@@ -318,6 +340,8 @@ class Publisher(Sending):
 
 class Querier(Sending):
     """A querier."""
+
+    _noun = "querier"
 
     def __init__(
         self,
@@ -408,9 +432,9 @@ class Session:
     def close(self) -> None:
         """Undeclare all that the session has declared."""
         if not self._is_closed:
+            self._is_closed = True
             for end in list(self._ends):
                 self._end(end)
-            self._is_closed = True
 
     def is_closed(self) -> bool:
         """Return whether it has been closed."""
@@ -478,7 +502,13 @@ class Session:
         source_info: SourceInfo | None = None,
     ) -> Sample:
         """Put or delete a sample, and return it."""
-        _refuse(timestamp_instrumentation=timestamp_instrumentation)
+        _check(
+            timestamp_instrumentation=timestamp_instrumentation,
+            priority=priority,
+            congestion_control=congestion_control,
+            express=express,
+            timestamp=timestamp,
+        )
         self.check_open()
         sample = Sample(
             key_of(key),
@@ -508,7 +538,9 @@ class Session:
         **options: Any,
     ) -> Any:
         """Ask for replies."""
-        _refuse(timestamp_instrumentation=timestamp_instrumentation)
+        _check(
+            timestamp_instrumentation=timestamp_instrumentation, **{k: v for k, v in options.items() if k in _TYPES}
+        )
         self.check_open()
         sink, seen = sink_of(handler, self.outlet)
         selector = selector if isinstance(selector, zenoh.Selector) else zenoh.Selector(selector)

@@ -30,8 +30,8 @@ from vnet.gateway.frames import MOST_WHOLE, CrossingReply, CrossingSample, sampl
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
-EID_BITS = 16
-"""Bits of an entity's number: session and entity cross the radio as one number of 64 bits."""
+ZID_BYTES, EID_BYTES = 16, 4
+"""Bytes of the ids of a session and of its entity, as they cross the radio."""
 
 
 class _Value(msgspec.Struct, frozen=True, eq=False, gc=False):
@@ -46,6 +46,8 @@ class ZenohId(msgspec.Struct, frozen=True, gc=False):
     def __str__(self) -> str:
         return f"{self.number:x}"
 
+    __repr__ = __str__
+
     def __bytes__(self) -> bytes:
         return self.number.to_bytes(-(-self.number.bit_length() // 8), "little")
 
@@ -53,7 +55,7 @@ class ZenohId(msgspec.Struct, frozen=True, gc=False):
     def of(cls, *parts: object) -> ZenohId:
         """Return the id that these parts give."""
         digest = hashlib.sha256("/".join(map(str, parts)).encode()).digest()
-        return cls(int.from_bytes(digest[:6]) | 1 << 47)
+        return cls(int.from_bytes(digest[:ZID_BYTES]) | 1 << 8 * ZID_BYTES - 1)
 
 
 class EntityGlobalId(msgspec.Struct, frozen=True, gc=False):
@@ -61,6 +63,9 @@ class EntityGlobalId(msgspec.Struct, frozen=True, gc=False):
 
     zid: ZenohId
     eid: int
+
+    def __repr__(self) -> str:
+        return f"EntityGlobalId {{ zid: {self.zid}, eid: {self.eid} }}"
 
 
 class SourceInfo(msgspec.Struct, frozen=True, gc=False):
@@ -126,6 +131,9 @@ class MatchingStatus(_Value, frozen=True, eq=False, gc=False):
 
     matching: bool
 
+    def __repr__(self) -> str:
+        return f"MatchingStatus {{ matching: {str(self.matching).lower()} }}"
+
 
 class _ConfigType(type):
     def __instancecheck__(cls, instance: object) -> bool:
@@ -172,9 +180,10 @@ def timestamp_at(unix_ns: int, zid: ZenohId) -> zenoh.Timestamp:
     return zenoh.Timestamp(zenoh.NTP64(*divmod(unix_ns, NS_PER_S)), bytes(zid))
 
 
-def number_of(source: SourceInfo) -> tuple[int, int]:
+def origin_of(source: SourceInfo) -> tuple[bytes, int]:
     """Return what stands for a `SourceInfo` on the radio."""
-    return source.source_id.zid.number << EID_BITS | source.source_id.eid, source.source_sn
+    zid, eid = source.source_id.zid.number, source.source_id.eid
+    return zid.to_bytes(ZID_BYTES, "little") + eid.to_bytes(EID_BYTES, "little"), source.source_sn
 
 
 PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
@@ -218,8 +227,8 @@ def sample_of(crossing: CrossingSample) -> Sample:
     """Return the sample that has crossed the radio. Raises ZError, ValueError or OverflowError for none."""
     origin, source = crossing.source, None
     if origin is not None:
-        zid = ZenohId(origin[0] >> EID_BITS & (1 << 48) - 1)
-        source = SourceInfo(EntityGlobalId(zid, origin[0] & (1 << EID_BITS) - 1), origin[1])
+        zid, eid = (int.from_bytes(part, "little") for part in (origin[0][:ZID_BYTES], origin[0][ZID_BYTES:]))
+        source = SourceInfo(EntityGlobalId(ZenohId(zid), eid), origin[1])
     return Sample(
         key_of(crossing.key),
         zenoh.ZBytes(crossing.payload),

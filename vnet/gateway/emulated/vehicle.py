@@ -29,7 +29,7 @@ from vnet.gateway.emulated.values import (
     Sample,
     ZenohId,
     key_of,
-    number_of,
+    origin_of,
     result_of,
     sample_of,
     timestamp_at,
@@ -144,7 +144,7 @@ class Vehicle(RadioSide[Asking]):
                 stamped = msgspec.structs.replace(sample, timestamp=self.new_timestamp(self.zid))
             if self.crosses(key):
                 # Also a delete: by the radio Zenoh's routers would give it a later one, of the receiver's.
-                self._send(crossing_sample(stamped, stamped.timestamp or self.new_timestamp(self.zid), number_of))
+                self._send(crossing_sample(stamped, stamped.timestamp or self.new_timestamp(self.zid), origin_of))
             elif key == REPORT_KEY:
                 self._report(sample)
             others = [each for each in matching if each.session is not session and each.is_remote]
@@ -205,7 +205,7 @@ class Vehicle(RadioSide[Asking]):
         """Ask the sessions of this vehicle on behalf of another, and send their replies by radio."""
 
         def reply(reply: Reply) -> None:
-            self._send(crossing_reply(asker, query, reply, number_of))
+            self._send(crossing_reply(asker, query, reply, origin_of))
 
         asking = Asking(
             zenoh.Selector(query.selector),
@@ -244,7 +244,8 @@ class Vehicle(RadioSide[Asking]):
         if not alive and text in map(str, self.tokens(key)):
             return  # another of its name is there
         for watcher in self._entities["watcher"]:
-            if watcher.key.intersects(key) and not (alive and text in watcher.told):
+            is_news = text not in watcher.told if alive else not watcher.session.is_closed()
+            if is_news and watcher.key.intersects(key):
                 (watcher.told.add if alive else watcher.told.discard)(text)
                 watcher.sink.push(token_sample(key, alive))
 
