@@ -6,6 +6,7 @@ One frozen model a section. What is wrong becomes a `ScenarioError` of one line:
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,7 @@ from emulator.scenario.sections import DAY_S, FAR_M, Section, Switch
 from emulator.scenario.sidelink import CrLimit, Sidelink
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
 from vnet.errors import ProgramError, shown
+from vnet.gateway import PYTHON_FLAGS, python_words
 from vnet.units import NS_PER_MS, NS_PER_S, Grid
 
 MANY = 1_000_000_000
@@ -315,11 +317,14 @@ class Scenario(Section):
             if not self.program.commands:
                 raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
             for words in self.program.all_commands:
-                if len(words) < 2 or words[0] not in PYTHON:
+                if words[0] not in (*PYTHON, sys.executable) or not python_words(words):
                     raise ValueError(
                         f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT … "
-                        'or python -m MODULE …; any other needs run.pacing = "realtime"'
+                        f"or python -m MODULE …, perhaps with {' '.join(sorted(PYTHON_FLAGS))}; any other needs "
+                        'run.pacing = "realtime"'
                     )
+            if any(fault.kind == "router_restart" for fault in self.fault):
+                raise ValueError('router_restart needs run.pacing = "realtime": in lockstep there is no router')
             if self.radio.ros2 is not None and self.radio.ros2.graph == "always":
                 raise ValueError('radio.ros2.graph = "always" needs run.pacing = "realtime"')
             return self

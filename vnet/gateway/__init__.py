@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ STARTUP = Path(__file__).with_name("startup")
 """Folder on `PYTHONPATH` by which programs in Python heed `ZENOH_CONFIG_OVERRIDE`, whatever they open."""
 FILLED_IN = ("{id}", "{endpoint}", "{port}")
 """Words of a command that vnet fills in."""
+PYTHON_FLAGS = frozenset(["-u", "-B", "-E", "-I", "-O", "-OO", "-s", "-S", "-P", "-q"])
+"""Options of Python's command line that change nothing on virtual time."""
 
 
 def filled_in(words: Sequence[str], node: str, endpoint: str) -> list[str]:
@@ -20,6 +23,13 @@ def filled_in(words: Sequence[str], node: str, endpoint: str) -> list[str]:
     for name, value in zip(FILLED_IN, values, strict=True):
         filled = [word.replace(name, value) for word in filled]
     return filled
+
+
+def python_words(words: Sequence[str]) -> list[str]:
+    """Return the words of a command of Python's from its script, -m or -c on; none if it has another option."""
+    found = list(dropwhile(PYTHON_FLAGS.__contains__, words[1:]))
+    is_script = found and not found[0].startswith("-")
+    return found if is_script or (len(found) > 1 and found[0] in ("-m", "-c")) else []
 
 
 def client_config(endpoint: str) -> dict[str, Any]:

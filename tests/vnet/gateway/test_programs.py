@@ -4,11 +4,13 @@ import json
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 from emulator.checks.judge import check_run
 from emulator.records.verdicts import Verdict
+from emulator.scenario.scenario import Scenario
 from tests.vnet.gateway.conftest import Drive, events, log
 from vnet.gateway import client_config
 from vnet.gateway.emulated.modules import CLIENT_CONFIG, ENDPOINT
@@ -499,3 +501,24 @@ def test_the_end_of_a_run_is_no_failure_of_a_thread(drive: Drive) -> None:
         """
     )
     assert log(run) == ["failed ZeroDivisionError"]
+
+
+@pytest.mark.parametrize(
+    ("words", "fault", "text"),
+    [
+        (["python", "-W", "ignore", "talker.py"], [], "python SCRIPT … or python -m MODULE …, perhaps with -B -E"),
+        (["python3", "-um", "talker"], [], "python SCRIPT"),
+        (["python", "-m"], [], "python SCRIPT"),
+        (["python3.9", "talker.py"], [], "python SCRIPT"),
+        (
+            [sys.executable, "a.py"],
+            [{"kind": "router_restart", "at_s": 1.0, "down_s": 0.5}],
+            "router_restart needs",
+        ),
+    ],
+)
+def test_what_virtual_time_does_not_have_is_refused_when_the_scenario_is_read(
+    words: list[str], fault: list[dict[str, Any]], text: str
+) -> None:
+    with pytest.raises(ValueError, match=text):
+        Scenario.model_validate({"program": {"kind": "zenoh", "command": words}, "fault": fault})

@@ -25,7 +25,6 @@ from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from functools import cache, partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
-from itertools import dropwhile
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
@@ -33,7 +32,7 @@ from typing import Any, NoReturn
 from greenlet import GreenletExit
 
 from vnet.errors import ProgramError, shown
-from vnet.gateway import client_config, session_variables
+from vnet.gateway import client_config, python_words, session_variables
 from vnet.gateway.emulated.facade import Facade
 from vnet.gateway.emulated.loops import prepare_asyncio
 from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
@@ -48,8 +47,6 @@ CLIENT_CONFIG = Path(__file__).with_name("client.json5")
 """File of a client's configuration for that endpoint, as a gateway gives one."""
 EPOCH_NS = 1_735_689_600 * NS_PER_S
 """The wall clock of programs at the start of a run: 2025-01-01T00:00:00Z."""
-FLAGS = frozenset(["-u", "-B", "-E", "-I", "-O", "-OO", "-s", "-S", "-P", "-q"])
-"""Options of Python's command line that change nothing here."""
 CORES = 4
 """Cores that a program sees: the size of a pool of threads may not depend on the machine."""
 _OWN_COPIES = (
@@ -182,20 +179,18 @@ class ProgramModules:
     def _find_main(self, words: Sequence[str]) -> tuple[Any, str, ModuleSpec | None]:
         """Return code, file and specification of the program, and set `sys.argv` and `sys.path` for it."""
         here = str(Path.cwd())
-        words = [words[0], *dropwhile(FLAGS.__contains__, words[1:])]
-        if words[1:2] == ["-m"] and len(words) > 2:
+        words = [words[0], *python_words(words)]
+        if words[1] == "-m":
             self.path[:] = [here, *sys.path]
             spec = self._find_module(words[2])
             self.argv[:] = [spec.origin or "", *words[3:]]
             assert isinstance(spec.loader, SourceFileLoader)
             return spec.loader.get_code(spec.name), spec.origin or "", spec
-        if words[1:2] == ["-c"] and len(words) > 2:
+        if words[1] == "-c":
             self.path[:] = [here, *sys.path]
             self.argv[:] = ["-c", *words[3:]]
             return compile(words[2], "<string>", "exec", dont_inherit=True), "", None
-        script = next(iter(words[1:]), "-")
-        if script.startswith("-"):
-            raise ProgramError(f"program.command = {shown(list(words))}: a script or -m MODULE is expected")
+        script = words[1]
         path = Path(script)
         try:
             source = path.read_bytes()
