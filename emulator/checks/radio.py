@@ -301,7 +301,10 @@ def _audible(air: _Air, rows: NDArray[np.intp]) -> Mask:
 
 
 def _collided_alone(air: _Air) -> NDArray[np.intp]:
-    rows = np.flatnonzero(air.recorded.outcome_is("collided") & air.recorded.placed)
+    """Rows that collided with nothing; a receiver out of whose range all were may have sent what has no row."""
+    recorded = air.recorded
+    seen = recorded.places.always_in_range[recorded.receiver]
+    rows = np.flatnonzero(recorded.outcome_is("collided") & recorded.placed & seen)
     return np.asarray(rows[~_audible(air, rows)])
 
 

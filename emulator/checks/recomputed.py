@@ -209,7 +209,7 @@ def _wrong_busy_ratios(recorded: RecordedRun, engine: Engine) -> list[dict[str, 
     return [{"trace": BUSY.file, "window": int(windows[0]) if len(windows) else shared}]
 
 
-def _why_not_decided_again(recorded: RecordedRun) -> str:
+def _why_not_decided_again(recorded: OpenedRun) -> str:
     run, faults = recorded.scenario.run, [planned.fault for planned in recorded.plan]
     reasons = {
         "no frame was sent": not len(recorded.trace),
@@ -222,7 +222,7 @@ def _why_not_decided_again(recorded: RecordedRun) -> str:
         "programs choose power or bit rate": "gain_db" in recorded.trace.column_names,
         "a rule of your own changes frames": any(isinstance(fault, OwnRule) for fault in faults),
         "a fault replaces frames": any(isinstance(fault, StaleMessages) for fault in faults),
-        "frames that nobody was in range of are not in the trace": bool(_gaps(recorded))
+        "frames that nobody was in range of are not in the trace": bool(_unseen(recorded))
         and (recorded.shares_air or any(isinstance(fault, SenderFault) for fault in faults)),
     }
     return next((why for why, holds in reasons.items() if holds), "")
@@ -236,12 +236,13 @@ def _originals(recorded: RecordedRun) -> tuple[NDArray[np.intp], IntArray, IntAr
     return recorded.sender[rows], recorded.seq[rows], recorded.sent_ns[rows], recorded.column("size_bytes")[rows]
 
 
-def _gaps(recorded: RecordedRun) -> int:
-    """Return how many frames before a sender's last one are not in the trace."""
+def _unseen(recorded: OpenedRun) -> int:
+    """Return how many frames are not in the trace, by the numbers of those that are and by the verdict file."""
     sender, seq, _, _ = _originals(recorded)
     last = np.full(len(recorded.node_ids), -1)
     np.maximum.at(last, sender, seq)
-    return int((last + 1).sum()) - len(seq)
+    cost = recorded.record.cost if recorded.has_record else None
+    return max(int((last + 1).sum()), 0 if cost is None else cost.payload.frames) - len(seq)
 
 
 def _decided_again(recorded: RecordedRun) -> Engine:

@@ -20,7 +20,8 @@ def broken_rules(recorded: RecordedRun, mac: Sidelink) -> dict[str, NDArray[np.i
 
     Transmissions are whole slots, and begin `t1_slots` after their frame at the earliest. No vehicle transmits
     twice in a slot, or receives in one. `half_duplex` are the receptions of those that transmitted, and
-    `below_sensing` of those at which a signal is too weak.
+    `below_sensing` of those at which a signal is too weak. Frames that nobody is in range of have no rows: of a
+    vehicle that nobody heard at some time it is not known when it transmitted.
     """
     on_air = ~received_twice(recorded) & (recorded.on_air_ns >= 0)
     rows = np.flatnonzero(on_air)
@@ -36,13 +37,14 @@ def broken_rules(recorded: RecordedRun, mac: Sidelink) -> dict[str, NDArray[np.i
     deaf = np.logical_and.reduce([np.isin(each * count + recorded.receiver[rows], key) for each in slots])
     twice = [np.isin(each * count + recorded.sender[rows], key[times > 1]) for each in slots]
     outcome_deaf = recorded.outcome_is("half_duplex")[rows]
+    seen = recorded.places.always_in_range[recorded.receiver[rows]]
     judged = recorded.outcome_is(*ON_AIR)[rows]
     return {
         "unaligned": rows[unaligned],
         "too_soon": rows[begin_ns < earliest_ns],
         "twice": rows[np.logical_or.reduce(twice)],
         "heard_while_sending": rows[judged & deaf & ~outcome_deaf],
-        "deaf_without_sending": rows[outcome_deaf & ~deaf],
+        "deaf_without_sending": rows[outcome_deaf & ~deaf & seen],
         "wrongly_detected": _wrongly_detected(recorded, mac, rows[judged & ~outcome_deaf]),
     }
 

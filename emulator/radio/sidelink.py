@@ -436,9 +436,9 @@ class Sidelink(Mac):
         for booking in bookings:
             booking.station.booked.discard(slot)
             is_free = all(other.station is not booking.station for other in on_air)
-            if booking.grant is not None and not booking.is_repeat:
+            if booking.grant is not None:
                 self._use_grant(booking, is_free)
-            elif not is_free or not self._may_send(booking):
+            elif not booking.is_repeat and not (is_free and self._may_send(booking)):
                 self._give_up(booking)
             if booking.sent is not None:
                 on_air.append(booking)
@@ -476,11 +476,10 @@ class Sidelink(Mac):
             self._reserve(flow, self._now_ns // self._slot_ns)
 
     def _give_up(self, booking: _Booking) -> None:
-        """Drop a frame that may not be sent; one that was sent before is complete without the second time."""
+        """Drop a frame that may not be sent."""
         booking.station.booked -= booking.slots
         if booking.sent is not None:
-            outcome = Outcome.pending if booking.is_repeat else Outcome.no_grant
-            self._leave(booking.sent, outcome, booking.sent.end_ns if booking.is_repeat else self._now_ns)
+            self._leave(booking.sent, Outcome.no_grant, self._now_ns)
         booking.sent = None
 
     def _may_send(self, booking: _Booking) -> bool:
@@ -498,14 +497,18 @@ class Sidelink(Mac):
         occupied = booking.length + sum(length for _, length in station.used)
         return not limits or occupied <= limits[-1] * slots * self._mac.subchannels
 
+    def _count_use(self, booking: _Booking, slot: int) -> None:
+        """Note for congestion control that a station occupies a slot."""
+        if self._congestion is not None:
+            booking.station.used.append((slot, booking.length))
+
     def _transmit(self, slot: int, on_air: list[_Booking]) -> None:
         """Put frames on air in a slot."""
         for booking in on_air:
             sent = booking.sent
             assert sent is not None
-            if self._congestion is not None:
-                booking.station.used.append((slot, booking.length))
             if not booking.is_repeat:
+                self._count_use(booking, slot)
                 sent.on_air_ns = slot * self._slot_ns
             sent.end_ns = (slot + 1) * self._slot_ns
         if self._on_air and slot - self._on_air[0][0] >= MOST_UNSENSED:
@@ -558,16 +561,24 @@ class Sidelink(Mac):
         return signal.power_mw
 
     def _follow(self, booking: _Booking) -> None:
-        """Book the second transmission of a frame, or leave it to be judged."""
+        """Book the second transmission of a frame, or leave it to be judged.
+
+        Congestion control decides about it now: later, the frame would have arrived already without it.
+        """
         assert booking.sent is not None
-        if booking.repeat is None:
+        station, (gap, subchannel) = booking.station, booking.repeat or (0, 0)
+        slot = booking.slot + gap
+        is_taken = booking.grant is not None and slot in station.booked
+        if not gap or is_taken or not self._may_send(booking):
+            if booking.grant is None:
+                station.booked.discard(slot)
             self._leave(booking.sent, Outcome.pending, booking.sent.end_ns)
             return
-        gap, subchannel = booking.repeat
+        self._count_use(booking, slot)
         self._book(
             _Booking(
                 flow=booking.flow,
-                slot=booking.slot + gap,
+                slot=slot,
                 subchannel=subchannel,
                 length=booking.length,
                 sent=booking.sent,

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 import emulator
+from emulator.checks.judge import check_run
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.units import NS_PER_MS
@@ -64,6 +65,45 @@ def test_checks_find_nothing_with_faults_buildings_and_units(mac: dict[str, Any]
     assert run.verdict == "valid", run
     outcomes = run.trace.to_pydict()["outcome"]
     assert {"delivered", "fault", "below_sensing"} <= {*outcomes}
+
+
+def test_a_frame_is_complete_at_once_if_congestion_control_forbids_the_second_transmission(tmp_path: Path) -> None:
+    """What has arrived cannot arrive again a few slots later, when the second one would have been sent."""
+    scenario = {
+        "run": {"duration_s": 3.0, "settle_s": 0.2},
+        "network": {"vehicles": 12, "layout": "dense"},
+        "radio": {
+            "path_loss": PATH_LOSS,
+            "access_jitter_ms": 90.0,
+            "mac": {"kind": "lte-mode4", "retransmit": True},
+            "congestion": {"kind": "cr_limit", "busy": [0.0], "most": [0.00125]},
+        },
+        "program": {"entry": "agents.beacon:main"},
+    }
+    run = emulator.simulate(scenario, out=tmp_path / "run")
+    assert run.verdict == "valid", run
+    assert {*run.trace.to_pydict()["outcome"]} >= {"delivered", "no_grant"}
+
+
+def test_a_unit_that_vehicles_hear_and_do_not_reach_finds_them_deaf_while_they_send(tmp_path: Path) -> None:
+    """Frames that nobody is in range of have no rows: checks cannot ask whether somebody sent one."""
+    (tmp_path / "at.csv").write_text("id,x_m,y_m,heading_rad\n" + "".join(f"c{n},{n},0,0\n" for n in (600, 1500)))
+    for kind, jitter_ms, outcome in (("lte-mode4", 90.0, "half_duplex"), ("80211p", 1.0, "collided")):
+        scenario = {
+            "run": {"duration_s": 15.0, "settle_s": 0.5},
+            "network": {"kind": "file", "path": str(tmp_path / "at.csv")},
+            "radio": {
+                "access_jitter_ms": jitter_ms,
+                "path_loss": {"kind": "winner_b1", "tx_power_dbm": 10.0},
+                "mac": {"kind": kind},
+            },
+            "roadside": [{"position_m": [0.0, 0.0], "tx_power_dbm": 30.0}],
+            "program": {"entry": "agents.beacon:main"},
+        }
+        run = emulator.simulate(scenario, out=tmp_path / kind)
+        assert outcome in run.trace.to_pydict()["outcome"]
+        assert run.verdict == "valid", run
+        assert check_run(tmp_path / kind).verdict.value == "valid"
 
 
 CHOICES: dict[str, dict[str, Any]] = {"rate": {"rate_mbps": 6.0}, "period": {"period_ms": 30.0}}
