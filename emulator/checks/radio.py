@@ -24,6 +24,7 @@ from emulator.records.verdicts import Finding, not_exercised, result
 from emulator.scenario.faults import Throttle
 from emulator.scenario.radio import Edca, EtsiReactive, Limeric, Receiver
 from emulator.scenario.scenario import Radio
+from emulator.scenario.sidelink import Sidelink
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 
@@ -46,6 +47,11 @@ def check_fading(recorded: RecordedRun) -> Finding:
     if radio.sidelink is not None and radio.sidelink.retransmit:
         return not_exercised("frames are transmitted twice: how many fade depends on who transmits")
     reached = recorded.outcome_is(*ON_AIR) & ~recorded.outcome_is("half_duplex")
+    if radio.sidelink is not None:
+        alike = _of_one_length(recorded, radio.sidelink)
+        if len(alike) and not alike.any():
+            return not_exercised("no sender's frames all need as many subchannels")
+        reached &= alike
     drawing = np.flatnonzero(reached & ~received_twice(recorded) & recorded.placed)
     if not len(drawing):
         return nothing_seen(recorded, "no reception came as far as the receiver")
@@ -65,6 +71,23 @@ def check_fading(recorded: RecordedRun) -> Finding:
         broken_text = f"{counted(len(rows), 'reception')} with an impossible outcome"
         figures["impossible"] = len(rows)
     return result(broken + unlike, text, broken_text, recorded.rows(rows), **figures)
+
+
+def _of_one_length(recorded: RecordedRun, mac: Sidelink) -> Mask:
+    """Return the rows of senders whose frames all need as many subchannels.
+
+    Others send short frames on the resources of longer ones, on more subchannels than the trace tells.
+    """
+    length = _subchannels(recorded, mac)
+    least, most = np.full((2, len(recorded.node_ids)), [[np.iinfo(np.int64).max], [0]])
+    np.minimum.at(least, recorded.sender, length)
+    np.maximum.at(most, recorded.sender, length)
+    return np.asarray((least == most)[recorded.sender])
+
+
+def _subchannels(recorded: RecordedRun, mac: Sidelink) -> IntArray:
+    """Return the number of subchannels that the frame of each row needs."""
+    return np.asarray(-(-np.maximum(recorded.column("size_bytes"), 1) // mac.subchannel_bytes))
 
 
 def _unlike_their_law(
@@ -95,7 +118,7 @@ def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Ar
     first, of_row, _ = recorded.emissions  # far fewer than rows, which take long to sort
     airtime_ns, rate_mbps = recorded.airtime_ns[first], recorded.bitrate_mbps[first]
     if radio.sidelink is not None:  # where not the time on air counts, but the share of the channel
-        airtime_ns = -(-recorded.column("size_bytes")[first] // radio.sidelink.subchannel_bytes)
+        airtime_ns = _subchannels(recorded, radio.sidelink)[first]
     kinds, kind = np.unique(np.column_stack([airtime_ns, rate_mbps]), axis=0, return_inverse=True)
     kind = kind.ravel()[of_row[rows]]
     for number, m in enumerate(shapes):

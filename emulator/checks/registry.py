@@ -178,7 +178,8 @@ CHECKS: list[Check] = [
         "link; without fading, exactly those that must.",
         invalid=f"the total or the links' χ² {ONE_IN_A_MILLION}; or an impossible reception",
         unknown="no reception came so far",
-        not_applicable="unit-disc radio: no fading",
+        not_applicable="unit-disc radio: no fading; on a sidelink frames that are sent twice, or of senders whose "
+        "frames need different numbers of subchannels",
     ),
     Check(
         check_medium,

@@ -7,6 +7,7 @@ import pytest
 
 import emulator
 from emulator.checks.judge import check_run
+from emulator.records.recorded_run import ON_AIR
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.units import NS_PER_MS
@@ -104,6 +105,32 @@ def test_a_unit_that_vehicles_hear_and_do_not_reach_finds_them_deaf_while_they_s
         assert outcome in run.trace.to_pydict()["outcome"]
         assert run.verdict == "valid", run
         assert check_run(tmp_path / kind).verdict.value == "valid"
+
+
+async def mixes(node: Node) -> None:
+    """Send short and long frames by turns; but one vehicle sends long ones alone."""
+    async for fix in node.gnss:
+        is_long = node.id == "v01" or fix.time_ns // (100 * NS_PER_MS) % 2
+        await node.radio.broadcast(bytes(600 if is_long else 100), period_ms=100)
+
+
+def test_fading_of_short_frames_on_the_resources_of_long_ones_is_not_judged(tmp_path: Path) -> None:
+    """They go out on more subchannels than they need, with the power spread over them."""
+    scenario = {
+        "run": {"duration_s": 5.0, "settle_s": 0.5},
+        "network": {"vehicles": 20, "layout": "dense"},
+        "radio": {
+            "path_loss": {"kind": "winner_b1", "tx_power_dbm": 33.0, "floor_dbm": -110.0},
+            "max_peers": 1000,
+            "mac": {"kind": "nr-mode2"},
+            "fading": {},
+        },
+    }
+    run = emulator.simulate(scenario, program=mixes, out=tmp_path / "run")
+    (fading,) = (each for each in run.checks if each.name == "fading")
+    assert run.verdict == "valid" and fading.figures["faded"] > 10
+    of_v01 = sum(row["sender"] == "v01" and row["outcome"] in ON_AIR for row in run.trace.to_pylist())
+    assert 0 < fading.figures["pairs"] <= of_v01
 
 
 CHOICES: dict[str, dict[str, Any]] = {"rate": {"rate_mbps": 6.0}, "period": {"period_ms": 30.0}}
