@@ -32,6 +32,7 @@ from emulator.world.gnss_faults import FaultyGnss
 from emulator.world.world import Instant, build_world, components, periods_of
 from vnet.counted import counted
 from vnet.errors import ScenarioError, first_names, printable
+from vnet.radio import SentFrame
 from vnet.transport.wire import LARGEST_MESSAGE_BYTES
 from vnet.types import Array, IntArray, Mask
 
@@ -217,7 +218,7 @@ def _why_not_decided_again(recorded: OpenedRun) -> str:
         "the order of events was not FIFO": run.order != "fifo" or run.tape is not None,
         "the run was cut short": bool(recorded.event(*kinds_with(CUTS_RUN), EventKind.spun, EventKind.died)),
         f"receptions: more than {MOST_RECEPTIONS:,}": len(recorded.trace) > MOST_RECEPTIONS,
-        f"more than {MOST_BYTES:,} bytes": int(np.maximum(_originals(recorded)[3], 0).sum()) > MOST_BYTES,
+        f"more than {MOST_BYTES:,} bytes": _payload_bytes(recorded) > MOST_BYTES,
         "programs send to single vehicles": bool((recorded.attempt > 0).any()),
         "programs choose power or bit rate": "gain_db" in recorded.trace.column_names,
         "a rule of your own changes frames": any(isinstance(fault, OwnRule) for fault in faults),
@@ -228,21 +229,24 @@ def _why_not_decided_again(recorded: OpenedRun) -> str:
     return next((why for why, holds in reasons.items() if holds), "")
 
 
-def _originals(recorded: RecordedRun) -> tuple[NDArray[np.intp], IntArray, IntArray, IntArray]:
-    """Return sender, number, time and size of each frame that programs sent, in the order of sending."""
+def _originals(recorded: RecordedRun) -> NDArray[np.intp]:
+    """Return a row of each frame that programs sent, in the order of sending."""
     first = np.unique(recorded.emission[recorded.copy == 0], return_index=True)[1]
     rows = np.flatnonzero(recorded.copy == 0)[first]
-    rows = rows[np.lexsort((recorded.seq[rows], recorded.sender[rows], recorded.sent_ns[rows]))]
-    return recorded.sender[rows], recorded.seq[rows], recorded.sent_ns[rows], recorded.column("size_bytes")[rows]
+    return np.asarray(rows[np.lexsort((recorded.seq[rows], recorded.sender[rows], recorded.sent_ns[rows]))])
+
+
+def _payload_bytes(recorded: RecordedRun) -> int:
+    return int(np.maximum(recorded.column("size_bytes")[_originals(recorded)], 0).sum())
 
 
 def _unseen(recorded: OpenedRun) -> int:
     """Return how many frames are not in the trace, by the numbers of those that are and by the verdict file."""
-    sender, seq, _, _ = _originals(recorded)
+    rows = _originals(recorded)
     last = np.full(len(recorded.node_ids), -1)
-    np.maximum.at(last, sender, seq)
+    np.maximum.at(last, recorded.sender[rows], recorded.seq[rows])
     cost = recorded.record.cost if recorded.has_record else None
-    return max(int((last + 1).sum()), 0 if cost is None else cost.payload.frames) - len(seq)
+    return max(int((last + 1).sum()), 0 if cost is None else cost.payload.frames) - len(rows)
 
 
 def _decided_again(recorded: RecordedRun) -> Engine:
@@ -256,7 +260,9 @@ def _decided_again(recorded: RecordedRun) -> Engine:
         recorded.radio_inputs,
         arrivals=scenario.run.order_grid,
     )
-    sender, seq, sent_ns, size = _originals(recorded)
+    rows = _originals(recorded)
+    sent_ns, size_bytes = recorded.sent_ns[rows], recorded.column("size_bytes")[rows].tolist()
+    sender, seq, period_ms = (each[rows].tolist() for each in (recorded.sender, recorded.seq, recorded.period_ms))
     changes_ns = _changes_ns(recorded)
     endings = {event.time_ns for event in recorded.event(*kinds_with(ENDS_PROGRAM))}
     everybody = np.arange(len(recorded.node_ids))
@@ -285,9 +291,9 @@ def _decided_again(recorded: RecordedRun) -> Engine:
             engine.set_positions(places.position_m(period))
             placed = period
         for index in range(*frames.get(time_ns, (0, 0))):
-            node = int(sender[index])
-            engine.number_next(node, int(seq[index]))
-            engine.transmit(time_ns, node, [bytes(int(size[index]))])
+            engine.number_next(sender[index], seq[index])
+            frame = SentFrame("", bytes(size_bytes[index]), period_ms=period_ms[index] or None)
+            engine.transmit(time_ns, sender[index], [frame])
         if time_ns in endings:
             set_up(time_ns)
     engine.look_ahead(recorded.closed_ns, ())

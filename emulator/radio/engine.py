@@ -56,7 +56,7 @@ from emulator.radio.stages import (
     sender_side,
 )
 from emulator.radio.topology import Topology, connectivity_of
-from emulator.radio.trace import CHOSEN, Trace, payload_digest
+from emulator.radio.trace import CHOSEN, PERIOD, Trace, payload_digest
 from emulator.radio.unicast import Unicasts
 from emulator.scenario.scenario import Radio, least_latency_ns
 from emulator.world.neighbours import Links
@@ -475,12 +475,14 @@ class Engine:
             ticket, self._trace.acknowledges = self._unicasts.register(node, asked.number), True
         if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
+        period_ms = allowed_period_ms(self._periods_ms, asked)
+        self._trace.tells_periods |= period_ms > 0
         return {
             "gain_db": gain_db,
             "bitrate_mbps": bitrate_mbps,
             "to": to,
             "ticket": ticket,
-            "period_ms": allowed_period_ms(self._periods_ms, asked),
+            "period_ms": period_ms,
         }
 
     def _enqueue(self, frames: Sequence[Frame]) -> None:
@@ -579,6 +581,8 @@ class Engine:
         columns = dict(zip(_COLUMNS, np.array([_VALUES(sent) for sent in transmissions], np.int64).T, strict=True))
         if self._trace.chooses:
             columns.update(zip(CHOSEN, np.array([_CHOICES(sent) for sent in transmissions]).T, strict=True))
+        if self._trace.tells_periods:
+            columns[PERIOD] = np.array([sent.frame.period_ms for sent in transmissions])
         if self._trace.acknowledges:
             columns["attempt"] = np.array([sent.attempt for sent in transmissions])
         columns["payload_digest"] = np.array(

@@ -39,6 +39,7 @@ _FRAME = np.dtype(
         ("copy", "<i2"),
         ("gain_db", "<f8"),
         ("bitrate_mbps", "<f8"),
+        ("period_ms", "<i2"),
         ("attempt", "<i2"),
         ("ack_on_air_ns", "<i8"),
         ("acked", "?"),
@@ -82,8 +83,11 @@ POWER_STEPS_DB = 100
 """Steps of a decibel to which powers are rounded."""
 UNKNOWN_POWER = -(1 << 15)
 """Power of a reception of a frame that was never on air."""
-UNHASHED = ("rssi_dbm", "snr_db")
-"""Columns that the hash leaves out. What decides a reception is in others, and powers have been added later."""
+POWERS = ("rssi_dbm", "snr_db")
+PERIOD = "period_ms"
+"""Column of the trace where programs tell the period of a reservation."""
+UNHASHED = (*POWERS, PERIOD)
+"""Columns that the hash leaves out. What decides a reception is in others, and these have been added later."""
 _NULLABLE = ("arrival_ns", "on_air_ns", "ack_on_air_ns")
 _NAMED = ("sender", "receiver", "outcome", "cause")
 
@@ -138,6 +142,8 @@ class Trace:
         self.knows_power = knows_power
         self.chooses = False
         """True if a program has chosen a power or a bit rate."""
+        self.tells_periods = False
+        """True if a program has told the period of a reservation."""
         self.acknowledges = False
         """True if a program has sent a frame to a single vehicle."""
         self._altered: dict[int, int] = {}
@@ -176,7 +182,7 @@ class Trace:
         rows["arrival_ns"] = np.where(arrives, arrival_ns, NOT_ARRIVING)
         if powers_db is not None:
             powers = self._powers.add(len(outcome))
-            for name, power_db in zip(UNHASHED, powers_db, strict=True):
+            for name, power_db in zip(POWERS, powers_db, strict=True):
                 steps = np.clip(np.rint(power_db * POWER_STEPS_DB), UNKNOWN_POWER + 1, -UNKNOWN_POWER - 1)
                 steps[np.isnan(steps)] = UNKNOWN_POWER
                 powers[name] = steps
@@ -256,10 +262,11 @@ class Trace:
         With `[radio.mac]` there are two more columns: `on_air_ns`, the start of a frame's transmission (null if it
         never started), and `left_ns`, the time at which it ended or the frame was dropped. With a path loss there
         are `rssi_dbm` and `snr_db`, null for a frame that was never on air. Where programs have chosen a power or a
-        bit rate, there are `gain_db`, the frame's power above the scenario's, and `bitrate_mbps`. Where they have
-        sent frames to single vehicles, there are `attempt` (0 for a broadcast), `ack_on_air_ns`, the start of the
-        acknowledgement (null without one), and `acked`, whether the sender received that. Where the machine
-        delivered late, in real time, there is `late_ns`, its part of the latency.
+        bit rate, there are `gain_db`, the frame's power above the scenario's, and `bitrate_mbps`; where they have
+        told the period of a reservation, `period_ms`, 0 for other frames. Where they have sent frames to single
+        vehicles, there are `attempt` (0 for a broadcast), `ack_on_air_ns`, the start of the acknowledgement (null
+        without one), and `acked`, whether the sender received that. Where the machine delivered late, in real time,
+        there is `late_ns`, its part of the latency.
         """
         receptions, frames, powers = self._receptions.records, self._frames.records, self._powers.records
         order = self._canonical_order()
@@ -297,9 +304,10 @@ class Trace:
                 "copy": plain("copy"),
                 **({"on_air_ns": optional("on_air_ns"), "left_ns": plain("left_ns")} if self._knows_air else {}),
                 **({name: plain(name) for name in CHOSEN} if self.chooses else {}),
+                **({PERIOD: plain(PERIOD)} if self.tells_periods else {}),
                 **(_exchanges(frames[of_row]) if self.acknowledges else {}),
                 **({LATE: pa.array(self._late(order))} if self._late_ns else {}),
-                **({name: _in_db(powers[name][order]) for name in UNHASHED} if self.knows_power else {}),
+                **({name: _in_db(powers[name][order]) for name in POWERS} if self.knows_power else {}),
             }
         )
 

@@ -287,6 +287,11 @@ class RecordedRun:
             return np.broadcast_to(default, len(self.trace))
         return np.asarray(self.trace[name].to_numpy(), dtype=np.float64)
 
+    @property
+    def period_ms(self) -> IntArray:
+        """The period of each row's reservation as its program told it; 0 if it did not."""
+        return self._optional("period_ms", 0)
+
     @cached_property
     def attempt(self) -> IntArray:
         """Number of the transmission of a frame to a single vehicle, from 1 on; 0 for broadcasts."""

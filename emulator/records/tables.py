@@ -243,6 +243,8 @@ TRACE = Table(
                          _never),
         "gain_db": Column(FLOAT, f"{_CHOSEN}power of the frame above that of the scenario", is_due=_never),
         "bitrate_mbps": Column(FLOAT, f"{_CHOSEN}its bit rate", is_due=_never),
+        "period_ms": Column(pa.int16(), "on a sidelink where programs tell it: the period of the reservation, or 0",
+                            is_due=_never),
         "attempt": Column(pa.int16(), f"{_UNICAST}number of the transmission, each of which has one row, that of "
                                        "its "
                           "addressee, with another `copy`; 0 for a broadcast", is_due=_never),
