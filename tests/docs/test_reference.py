@@ -9,7 +9,7 @@ import pytest
 from docs.generate import PAGES, REFERENCE, faults, files
 from docs.generate.keys import key_table
 from emulator.radio.outcomes import Outcome
-from emulator.radio.trace import ACKNOWLEDGED, CHOSEN, LATE
+from emulator.radio.trace import ACKNOWLEDGED, CHOSEN, LATE, PERIOD
 from emulator.records.tables import BUSY, METRICS, STATES, TABLES, TRACE, Column
 from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
@@ -66,7 +66,7 @@ def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
     assert verdict.keys() == files.VERDICT.keys()
     assert verdict["frames_by_outcome"].keys() == {outcome.name for outcome in Outcome} - {"pending"}
-    optional = set(CHOSEN) | set(ACKNOWLEDGED) | {LATE}
+    optional = {*CHOSEN, *ACKNOWLEDGED, LATE, PERIOD}
     for table in (TRACE, STATES, BUSY, METRICS):
         own = ["neighbours"] if table is STATES else []  # what the program reports
         due = [name for name in table.columns if table is not TRACE or name not in optional]

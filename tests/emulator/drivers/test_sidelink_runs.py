@@ -69,7 +69,7 @@ def test_checks_find_nothing_with_faults_buildings_and_units(mac: dict[str, Any]
 
 
 def test_a_frame_is_complete_at_once_if_congestion_control_forbids_the_second_transmission(tmp_path: Path) -> None:
-    """What has arrived cannot arrive again a few slots later, when the second one would have been sent."""
+    """Congestion control decides about both before the first has arrived."""
     scenario = {
         "run": {"duration_s": 3.0, "settle_s": 0.2},
         "network": {"vehicles": 12, "layout": "dense"},
