@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.forked_commands import VNET, run
+from tests.support.forked_commands import MODULE, VNET, run
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -29,14 +29,8 @@ def run_tests(pytester: pytest.Pytester, code: str, *options: str) -> pytest.Run
 
 def session_of_its_own(pytester: pytest.Pytester, *options: str) -> subprocess.CompletedProcess[str]:
     """Run pytest in a process of its own, which may end by a signal."""
-    return subprocess.run(
-        [sys.executable, "-m", "pytest", *options],
-        cwd=pytester.path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    words, environment = [*MODULE, "pytest", *options], {**os.environ, "PYTHONPATH": str(ROOT)}
+    return run(words, cwd=pytester.path, env=environment, capture_output=True, timeout=300)
 
 
 def verdict_of(folder: Path) -> dict[str, Any]:
