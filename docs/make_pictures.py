@@ -39,11 +39,11 @@ SCENARIO = Path(__file__).parent / "pictures" / "pictures.toml"
 VEHICLE = "v08"
 AT_S = 12.0
 TABS = ("overview", "radio", "vehicle", "program")
-DECLARED = program_figures(Program(entry="agents.cooperative:main"))
+VIEWS = program_figures(Program(entry="agents.cooperative:main")).views
 CONTENT = Content(
-    estimates=(*DECLARED.estimates, POSITION),
-    charts=tuple((chart["id"], chart["axis"]) for chart in DECLARED.charts),
-    peers=DECLARED.peers,
+    estimates=(*VIEWS.estimates, POSITION),
+    charts=tuple((chart.id, chart.axis) for chart in VIEWS.charts),
+    peers=VIEWS.peers,
     values=("heard", "bytes", "rejected"),
 )
 """Data of the run, from which the tabs of the native viewer are made."""

@@ -101,7 +101,7 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
     `noise_m` is, by rule, the noise per axis and round with which the linear model deviates as much.
     """
-    key = RecordedRun.open(run).declared.key
+    key = RecordedRun.open(run).record.key_figures
     figure = next((each.name for each in key if each.of_agreement), None)
     if figure is None:
         raise VnetError(f"{run}: its program declares no deviation between vehicles")

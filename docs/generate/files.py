@@ -117,6 +117,7 @@ VERDICT = {
     "packet_delivery_ratio": "[of broadcasts](../export.md#radio-figures), without copies; null without any",
     "figures": "means of some metrics, after the first fifth of the run",
     "key_figures": "those of them that summaries show, with their titles, as the program declares them",
+    "views": "`PEERS`, `CHARTS`, `ESTIMATES` as it [declares](../how-to/results.md#declare-figures-of-periods)",
     "roadside_units": "number of roadside units",
     "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",
     "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",

@@ -112,6 +112,7 @@ def conclude(
         "metrics_sha256": emulation.metrics.sha256(),
         **verdict_figures(recorded, emulation.metrics.rows),
         "key_figures": [asdict(each) for each in emulation.metrics.declared.key],
+        "views": asdict(emulation.metrics.declared.views),
         "start_up_s": _start_up_s(emulation),
         "wall_s": round(wall_s, 3),
         "real_time_factor": round(emulated_s / wall_s, 3) if wall_s > 0 else None,

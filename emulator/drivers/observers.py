@@ -42,7 +42,8 @@ class Messages:
         if self._scenario is not self._emulation.scenario:  # faults are planned while a run is on
             self._scenario = self._emulation.scenario
             world = RecordedWorld.of(self._emulation.world)
-            self._scene = scene_message(world, self._scenario, self._emulation.folder.scenario_text)
+            text, views = self._emulation.folder.scenario_text, self._emulation.metrics.declared.views
+            self._scene = scene_message(world, self._scenario, text, views)
         return self._scene
 
     def period(self, view: PeriodView) -> dict[str, Any]:

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, make_dataclass
-from functools import cache
+from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from functools import cache, partial
 from itertools import starmap
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from emulator.scenario.own_functions import CONSTANT, declared, load_entry
 from emulator.scenario.program import Program
+from emulator.scenario.sections import first_problem
 from emulator.world.world import Instant
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, VnetError, printable
 from vnet.types import Array
 from vnet.units import unit_of
 
@@ -27,6 +29,8 @@ VECTORS = {"estimate_m": 2, "covariance_m2": 4}
 """Columns of the states of which vnet's own figures are made, and the numbers that each entry has."""
 SAME = 1e-9
 """Relative difference of two errors up to which they are those of the same positions."""
+LONGEST_SHOWN = 400
+"""Characters of a title, a label or a caption that a program declares."""
 NUMBER, NUMBERS = "float | None", "list[float | None]"
 """Types of a figure, as annotations."""
 _Mask: TypeAlias = NDArray[np.bool_]
@@ -125,6 +129,45 @@ class Estimate:
     """Column of points, x and y in turns."""
 
 
+_Shown = Annotated[str, AfterValidator(partial(printable, longest=LONGEST_SHOWN))]
+
+
+@dataclass(frozen=True)
+class DeclaredChart:
+    """A chart of figures that belong together: `lines` are their names by label."""
+
+    id: Annotated[str, Field(pattern=r"^[\w.-]{1,64}$")]
+    title: _Shown
+    axis: _Shown
+    lines: Annotated[Mapping[_Shown, str], Field(min_length=1)]
+    text: _Shown
+    """Its caption."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """What report, picture and recording show of a program's figures: a run's folder and its scene have it."""
+
+    peers: tuple[str, ...] = ()
+    """Names before a dot that stand for one value of each pair of vehicles: they stay in `values`."""
+    charts: tuple[DeclaredChart, ...] = ()
+    """Charts of report, picture and recording."""
+    estimates: tuple[Estimate, ...] = ()
+    """Estimates that a recording shows around the truth, beside positions."""
+
+
+NO_VIEWS = Views()
+_VIEWS = TypeAdapter(Views)
+
+
+def views_of(data: Mapping[str, Any]) -> Views:
+    """Return views that are given as data. Raises VnetError for what cannot be."""
+    try:
+        return _VIEWS.validate_python(data)
+    except ValidationError as error:
+        raise VnetError(f"views: {first_problem(error, _VIEWS)}") from None
+
+
 @dataclass(frozen=True)
 class ProgramFigures:
     """Figures that a run's program declares, with vnet's own: docs/how-to/results.md."""
@@ -133,14 +176,9 @@ class ProgramFigures:
     """The class of a row of the metrics."""
     columns: Mapping[str, ReportedColumn] = field(default_factory=dict)
     """By reported name, the columns that the states have for its lists."""
-    peers: tuple[str, ...] = ()
-    """Names before a dot that stand for one value of each pair of vehicles: they stay in `values`."""
     key: tuple[KeyFigure, ...] = POSITION_FIGURES
     """Figures that summary, report, comparison, sweep, list of runs and terminal show, in this order."""
-    charts: tuple[Mapping[str, Any], ...] = ()
-    """Charts of the report: `id`, `title`, `axis`, `text`, and `lines`, names of figures by label."""
-    estimates: tuple[Estimate, ...] = ()
-    """Estimates that a recording shows around the truth, beside positions."""
+    views: Views = NO_VIEWS
     compute: Callable[[Periods], Mapping[str, Sequence[Any]]] = lambda periods: {}
 
     @property
@@ -150,7 +188,7 @@ class ProgramFigures:
 
     def is_of_peer(self, name: str) -> bool:
         """Return whether a reported name stands for a value of a pair of vehicles."""
-        return name.partition(".")[0] in self.peers and "." in name
+        return name.partition(".")[0] in self.views.peers and "." in name
 
 
 def program_figures(program: Program) -> ProgramFigures:
@@ -187,15 +225,19 @@ def _of_entry(entry: str) -> ProgramFigures:
         types = [(name, own[name].type if name in own else theirs[name]) for name in names]
         columns = getattr(kind, "COLUMNS", {}).items()
         return ProgramFigures(
-            make_dataclass("PeriodFigures", types, frozen=True),
-            {reported: ReportedColumn(*column) for reported, column in columns},
-            tuple(getattr(kind, "PEERS", ())),
-            (*(KeyFigure(**each) for each in getattr(kind, "KEY_FIGURES", ())), *POSITION_FIGURES),
-            tuple(getattr(kind, "CHARTS", ())),
-            tuple(Estimate(**each) for each in getattr(kind, "ESTIMATES", ())),
-            kind.compute,
+            row=make_dataclass("PeriodFigures", types, frozen=True),
+            columns={reported: ReportedColumn(*column) for reported, column in columns},
+            key=(*(KeyFigure(**each) for each in getattr(kind, "KEY_FIGURES", ())), *POSITION_FIGURES),
+            views=views_of(
+                {
+                    "peers": getattr(kind, "PEERS", ()),
+                    "charts": [asdict(DeclaredChart(**each)) for each in getattr(kind, "CHARTS", ())],
+                    "estimates": [asdict(Estimate(**each)) for each in getattr(kind, "ESTIMATES", ())],
+                }
+            ),
+            compute=kind.compute,
         )
-    except (AttributeError, TypeError) as error:
+    except (AttributeError, TypeError, VnetError) as error:
         raise ScenarioError(f"{CONSTANT}: {entry!r} declares no figures of periods: {error}") from None
 
 

@@ -26,7 +26,7 @@ from emulator.radio.outcomes import Outcome, Stage, decided_at
 from emulator.radio.topology import connectivity_of
 from emulator.radio.trace import ACKNOWLEDGED, LATE
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events
-from emulator.records.period_figures import ProgramFigures, figures_if_here
+from emulator.records.period_figures import ProgramFigures, Views, figures_if_here
 from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import numbers_of, reported_columns, value_columns
@@ -738,6 +738,15 @@ class OpenedRun(RecordedRun):
                 f"reads 1 to {FORMAT}"
             )
         return replace(record, reproduce=_from_here(record.reproduce, self.folder))
+
+    @cached_property
+    def views(self) -> Views:
+        """What the program declares to be shown: as the folder says, also where the program is not installed."""
+        try:
+            kept = self.record.views
+        except VnetError:  # a run that was killed
+            kept = None
+        return self.declared.views if kept is None else kept
 
     def refuse_later_format(self) -> None:
         """Raise VnetError if the folder is of a later format; its verdict may be missing or broken."""

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from emulator.records.costs import RunCost
-from emulator.records.period_figures import POSITION_FIGURES, KeyFigure, shown_figures
+from emulator.records.period_figures import POSITION_FIGURES, KeyFigure, Views, shown_figures
 from emulator.records.reported import ReportedFigure
 from emulator.scenario.sections import first_problem
 from vnet.bounded import read_regular
@@ -167,6 +167,8 @@ class Record:
     versions: dict[str, str] = field(default_factory=dict)
     key_figures: list[KeyFigure] = field(default_factory=list)
     """Those of `figures` that sum the run up, as its program declares them."""
+    views: Views | None = None
+    """What its program declares to be shown of them; None in folders of an earlier vnet."""
 
     @property
     def judgement(self) -> Judgement:

@@ -32,6 +32,7 @@ from emulator.records.distributions import binomial_interval
 from emulator.records.driven_table import of_vehicles
 from emulator.records.events import EventKind
 from emulator.records.metrics import anees_band
+from emulator.records.period_figures import DeclaredChart
 from emulator.records.radio_metrics import BIN_M
 from emulator.records.tables import DRIVEN
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, faults_note, time_figure
@@ -244,7 +245,7 @@ def mean_of_peers(prefix: str, source: Source) -> Array:
     return np.asarray(total.reshape(count, count) / np.maximum(1, reports)[:, None])
 
 
-def _lines(source: Source, names: dict[str, str]) -> list[Line]:
+def _lines(source: Source, names: Mapping[str, str]) -> list[Line]:
     """Return columns of the metrics by label; those that no program reported are dropped.
 
     Raises VnetError if none is left.
@@ -261,12 +262,11 @@ def _lines(source: Source, names: dict[str, str]) -> list[Line]:
     return found
 
 
-def declared_chart(chart: Mapping[str, Any], source: Source) -> Drawing:
+def declared_chart(chart: DeclaredChart, source: Source) -> Drawing:
     """Draw figures that the program declares to belong together."""
-    names = chart["lines"]
-    lines = _lines(source, names)
-    text = chart["text"] + _add_reference(source, next(iter(names.values())), lines)
-    made = time_figure(lines, chart["axis"], source.end_s, source.spans)
+    lines = _lines(source, chart.lines)
+    text = chart.text + _add_reference(source, next(iter(chart.lines.values())), lines)
+    made = time_figure(lines, chart.axis, source.end_s, source.spans)
     return Drawing(made, text + faults_note(made, source))
 
 
@@ -359,11 +359,10 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
 
 def figures_of(source: Source) -> Drawers:
     """Return title and drawing of the figures of a run, by id: those that its program declares around vnet's."""
-    declared = source.declared
-    first = {each["id"]: (each["title"], partial(declared_chart, each)) for each in declared.charts}
+    first = {each.id: (each.title, partial(declared_chart, each)) for each in source.views.charts}
     last = {
         f"peers-{name}": (f"{title_of(name).capitalize()} by vehicle", partial(peers, name))
-        for name in declared.peers
+        for name in source.views.peers
     }
     of_run: dict[str, tuple[str, Callable[[Source], Drawing]]] = {**first, **FIGURES, **last}
     return {key: (title, partial(figure, source)) for key, (title, figure) in of_run.items()}

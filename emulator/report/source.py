@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from emulator.pages.canvas import FaultSpan
 from emulator.records.events import CUTS_RUN, Event, EventKind
-from emulator.records.period_figures import SAME, ProgramFigures
+from emulator.records.period_figures import SAME, Views
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reference import Reference, reference_of, reference_series
@@ -41,9 +41,9 @@ class Source(OpenedRun):
         super().__init__(folder, TABLES)
 
     @cached_property
-    def declared(self) -> ProgramFigures:
-        """The figures that the program declares; none where the scenario cannot be read."""
-        return maybe(lambda: super(Source, self).declared) or ProgramFigures()
+    def views(self) -> Views:
+        """What the program declares to be shown; nothing where the scenario cannot be read."""
+        return maybe(lambda: super(Source, self).views) or Views()
 
     @cached_property
     def radio(self) -> RadioMetrics:
@@ -84,6 +84,8 @@ class Source(OpenedRun):
         """(periods,) a column of the metrics; NaN where nobody reported. Raises VnetError if nobody ever did."""
         if name not in self.metrics.column_names:
             raise NothingToShow("no program reported what it needs")
+        if not pa.types.is_floating(self.metrics[name].type):
+            raise VnetError(f"{name} is no number a period")
         column = np.asarray(self.metrics[name].cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=float)
         if not np.isfinite(column).any():
             raise NothingToShow("no program reported what it needs")

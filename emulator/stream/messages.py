@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.radio.topology import component_links
 from emulator.radio.trace import decided_ns
 from emulator.records.events import Event
-from emulator.records.period_figures import VECTORS, ProgramFigures
+from emulator.records.period_figures import NO_VIEWS, VECTORS, ProgramFigures, Views
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import MOST_DOTTED, figures_among
 from emulator.scenario.scenario import Scenario
@@ -53,7 +53,9 @@ def unpack_pairs(message: Mapping[str, Any]) -> NDArray[np.int32]:
     return np.frombuffer(message["pairs"], dtype="<i4").reshape(-1, 4)
 
 
-def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) -> dict[str, Any]:
+def scene_message(
+    world: RecordedWorld, scenario: Scenario, scenario_text: str, views: Views = NO_VIEWS
+) -> dict[str, Any]:
     """Return the message of a run's constants; only faults may be added to its `scenario` during the run.
 
     `node_ids`; lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`, which is infinite for a line in both
@@ -61,7 +63,8 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
     if links or path loss decide connectivity); `component` (int16, n), the connected component of each vehicle at
     the start (-1: absent), or by all links of the run where they are given over time and vehicles stand; `area_m`
     (float32, 2 × 2), the corners of the bounding box of all positions during the run; `moves`, true if vehicles
-    drive; `scenario_text`, the resolved scenario as TOML.
+    drive; `scenario_text`, the resolved scenario as TOML; `views` that its program
+    declares.
     """
     radio = scenario.radio
     links = component_links(scenario, world.radio_inputs, world.position_m)
@@ -81,6 +84,7 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
         "period_ns": scenario.period_ns,
         "duration_ns": scenario.duration_ns,
         "scenario": scenario_text,
+        "views": asdict(views),
     }
 
 
@@ -116,7 +120,7 @@ def beliefs_of(number: Mapping[str, int], reports: Iterable[Report], declared: P
     return Beliefs(
         columns,
         lists,
-        {name: _of_peers(name, number, last) for name in declared.peers},
+        {name: _of_peers(name, number, last) for name in declared.views.peers},
         values=_values(number, last, declared),
         texts=_texts(number, last, declared),
     )

@@ -62,7 +62,7 @@ def _check_states(run: OpenedRun, periods: int) -> None:
 
 
 def _messages(run: OpenedRun, figures: Sequence[Any]) -> Iterator[Message]:
-    yield "scene", scene_message(run.world, run.scenario, run.scenario_text)
+    yield "scene", scene_message(run.world, run.scenario, run.scenario_text, run.views)
     events = _by_period(run.events, run.scenario.period_ns, len(figures))
     if figures:
         yield from _periods(run, figures, events)
@@ -108,14 +108,14 @@ class _Trace:
         return rows
 
 
-def _states(run: RecordedRun) -> Iterator[tuple[Instant, Beliefs]]:
+def _states(run: OpenedRun) -> Iterator[tuple[Instant, Beliefs]]:
     """Yield the truth and the fixes of each period, and what nodes reported in it. Headings of fixes are NaN."""
     rows = max(1, ROWS_AT_ONCE // len(run.node_ids)) * len(run.node_ids)
     for first in range(0, len(run.states), rows):
         yield from _split(run, run.states.slice(first, rows))
 
 
-def _split(run: RecordedRun, table: pa.Table) -> Iterator[tuple[Instant, Beliefs]]:
+def _split(run: OpenedRun, table: pa.Table) -> Iterator[tuple[Instant, Beliefs]]:
     count, node_ids = len(run.node_ids), run.node_ids
     kinds = {name: table.schema.field(name).type for name in run.reported_names}
     sizes = {name: kind.list_size for name, kind in kinds.items() if pa.types.is_fixed_size_list(kind)}
@@ -126,7 +126,7 @@ def _split(run: RecordedRun, table: pa.Table) -> Iterator[tuple[Instant, Beliefs
     }
     lists = {name: _by_row(table[name].combine_chunks()) for name, kind in kinds.items() if pa.types.is_list(kind)}
     values_of = table["values"].combine_chunks()
-    peers = {name: _of_peers(values_of, f"{name}.", run.number) for name in run.declared.peers}
+    peers = {name: _of_peers(values_of, f"{name}.", run.number) for name in run.views.peers}
     values, texts = _values(run, table)
     first = table["period"][0].as_py()
     for place in range(len(heading)):

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 import rerun.blueprint as rrb
 
-from emulator.records.period_figures import Estimate, ProgramFigures
+from emulator.records.period_figures import Estimate, Views
 from emulator.viewer.drawing import POSITION, TIMELINE, PeriodArrays
 from emulator.viewer.radio_scene import WINDOW_S
 from emulator.viewer.vehicle_scene import entity, titled
@@ -36,16 +36,16 @@ class Content:
     values: tuple[str, ...] = ()
     texts: tuple[str, ...] = ()
 
-    def after(self, period: PeriodArrays, declared: ProgramFigures, values: list[str], texts: list[str]) -> Content:
+    def after(self, period: PeriodArrays, views: Views, values: list[str], texts: list[str]) -> Content:
         """Return the content of the run up to and with this period."""
         off_m = period.points("estimate_m") - period.points("fix_m")
-        seen = [each for each in declared.estimates if np.isfinite(period.points(each.estimate)).any()]
+        seen = [each for each in views.estimates if np.isfinite(period.points(each.estimate)).any()]
         if (np.abs(off_m) > SAME_M).any():
             seen.append(POSITION)
         charts = [
-            (each["id"], each["axis"])
-            for each in declared.charts
-            if any(np.isfinite(period.figure(name)) for name in each["lines"].values())
+            (each.id, each.axis)
+            for each in views.charts
+            if any(np.isfinite(period.figure(name)) for name in each.lines.values())
         ]
         return replace(
             self,

@@ -92,9 +92,9 @@ class PeriodArrays:
         return unpack(self.message[name])[:, 0]
 
     def figure(self, name: str) -> float:
-        """One of the figures; NaN where there is none."""
+        """One of the figures; NaN where there is no number."""
         value = self.message["figures"].get(name)
-        return float("nan") if value is None else float(value)
+        return float(value) if isinstance(value, float | int) else float("nan")
 
     @cached_property
     def up(self) -> NDArray[np.bool_]:

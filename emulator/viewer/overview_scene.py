@@ -13,7 +13,7 @@ import rerun as rr
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import WARNING, EventKind, level_of
-from emulator.records.period_figures import ProgramFigures, figures_if_here
+from emulator.records.period_figures import Views, figures_if_here
 from emulator.records.reference import Setting, reference_of
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.records.tables import STATES, columns_of
@@ -64,9 +64,9 @@ LEGEND_STEP = 3.1
 class OverviewScene:
     """Draws the network, from the scene and period messages of a run."""
 
-    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], declared: ProgramFigures) -> None:
+    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], views: Views) -> None:
         self._canvas = canvas
-        self._declared = declared
+        self._views = views
         self._node_ids: list[str] = scene["node_ids"]
         try:
             self._reference: DrawnReference | None = DrawnReference(scene)
@@ -79,7 +79,7 @@ class OverviewScene:
         self._known_faults: set[str] = set()
         self._down: list[str] | None = None
         self._up: bytes | None = None
-        self._clouds: dict[str, dict[str, Floats]] = {each.name: {} for each in declared.estimates}
+        self._clouds: dict[str, dict[str, Floats]] = {each.name: {} for each in views.estimates}
         """Each vehicle's latest, by estimate."""
         self._next_ellipses_s = self._next_peers_s = 0.0
         self._draw_static(scene)
@@ -108,16 +108,16 @@ class OverviewScene:
             canvas.point_style("map/background", GREY, 1.5, order=-20.0)
         draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
         draw_legend(canvas, scene)
-        for each in (POSITION, *self._declared.estimates):
+        for each in (POSITION, *self._views.estimates):
             canvas.rings(each.name, each.rings_m)
-        for chart in self._declared.charts:
-            lines = [(label, colour, 2.0) for label, colour in zip(chart["lines"], CURVES, strict=False)]
-            first = next(iter(chart["lines"].values()))
+        for chart in self._views.charts:
+            lines = [(label, colour, 2.0) for label, colour in zip(chart.lines, CURVES, strict=False)]
+            first = next(iter(chart.lines.values()))
             if self._reference is not None:
                 lines.append((self._reference.label, GREEN, 1.5))
             if first in self._published:
                 lines.append((self._published[first][0], GREY, 1.5))
-            canvas.series(f"figures/{chart['id']}", lines)
+            canvas.series(f"figures/{chart.id}", lines)
         canvas.states("faults/down", {NOBODY: DARK})
         canvas.series("figures/position", [("estimate", SKY, 2.0), ("raw fix", GREY, 1.0)])
 
@@ -129,7 +129,7 @@ class OverviewScene:
         canvas.point_style("map/estimate", BLUE, 2.5, order=31.0)
         canvas.point_style("position/fix", GREY, 3.0, self._node_ids)
         canvas.point_style("position/estimate", SKY, 4.0, self._node_ids)
-        for each in self._declared.estimates:
+        for each in self._views.estimates:
             canvas.point_style(f"{each.name}/cloud", GREY, 1.0)
             canvas.point_style(f"{each.name}/estimate", SKY, 4.0, self._node_ids)
             canvas.strip_style(f"{each.name}/ellipses", (*SKY, 130), 1.2)
@@ -163,7 +163,7 @@ class OverviewScene:
         is_time = period.time_s >= self._next_ellipses_s
         if is_time:
             self._next_ellipses_s = period.time_s + ELLIPSES_EVERY_S
-        for each in self._declared.estimates:
+        for each in self._views.estimates:
             off_m, clouds = period.off_truth(each), self._clouds[each.name]
             canvas.points(f"{each.name}/estimate", off_m)
             clouds |= period.clouds(each)
@@ -176,14 +176,14 @@ class OverviewScene:
 
     def _figures(self, period: PeriodArrays) -> None:
         found = {} if self._reference is None else self._reference.step(period.message)
-        for chart in self._declared.charts:
-            names = list(chart["lines"].values())[: len(CURVES)]
+        for chart in self._views.charts:
+            names = list(chart.lines.values())[: len(CURVES)]
             values = [period.figure(name) for name in names]
             if self._reference is not None:
                 values.append(found.get(names[0], float("nan")))
             if names[0] in self._published:
                 values.append(self._published[names[0]][1])
-            self._canvas.plot(f"figures/{chart['id']}", *values)
+            self._canvas.plot(f"figures/{chart.id}", *values)
         self._canvas.plot("figures/position", period.figure("position_rmse_m"), period.figure("fix_rmse_m"))
 
     def _of_peers(self, period: PeriodArrays) -> None:

@@ -10,15 +10,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import rerun as rr
 
-from emulator.records.period_figures import ProgramFigures, figures_if_here
-from emulator.records.run_folder import SCENARIO_FILE
-from emulator.scenario.loading import parse_recorded_scenario
+from emulator.records.period_figures import NO_VIEWS, views_of
 from emulator.viewer.blueprints import Content, blueprint
 from emulator.viewer.drawing import Canvas, PeriodArrays
 from emulator.viewer.overview_scene import OverviewScene
@@ -47,7 +44,7 @@ class Recorder:
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
         self._program: ProgramScene | None = None
         self._content = Content()
-        self._declared = ProgramFigures()
+        self._views = NO_VIEWS
         self._node_ids: list[str] = []
         self._waiting: deque[PeriodArrays] = deque()
         self._last: int | None = None
@@ -82,13 +79,12 @@ class Recorder:
         vehicle = self._vehicle or self._node_ids[0]
         if vehicle not in self._node_ids:
             raise VnetError(f"no such vehicle: {vehicle}; there are {first_names(self._node_ids)}")
-        scenario = parse_recorded_scenario(scene["scenario"], Path(SCENARIO_FILE))
-        self._declared = figures_if_here(scenario.program)
-        self._overview = OverviewScene(self._canvas, scene, self._declared)
+        self._views = views_of(scene.get("views", {}))
+        self._overview = OverviewScene(self._canvas, scene, self._views)
         self._parts = [
             self._overview,
             RadioScene(self._canvas, scene),
-            VehicleScene(self._canvas, scene, vehicle, self._declared),
+            VehicleScene(self._canvas, scene, vehicle, self._views),
         ]
         self._vehicle = vehicle
         self._program = ProgramScene(self._canvas, scene, vehicle)
@@ -112,7 +108,7 @@ class Recorder:
         """Draw what programs report, and lay out views for what the run has shown for the first time."""
         assert self._program is not None and self._vehicle is not None
         self._program.period(period)
-        content = self._content.after(period, self._declared, self._program.names, self._program.texts)
+        content = self._content.after(period, self._views, self._program.names, self._program.texts)
         if content != self._content:
             self._content = content
             self._recording.send_blueprint(blueprint(self._vehicle, content=content))

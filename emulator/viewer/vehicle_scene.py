@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from emulator.radio.outcomes import Outcome
-from emulator.records.period_figures import ProgramFigures
+from emulator.records.period_figures import Views
 from emulator.viewer.drawing import (
     BLUE,
     GREEN,
@@ -48,15 +48,15 @@ def range_rings_m(reach_m: float) -> list[float]:
 class VehicleScene:
     """Draws one vehicle below `/vehicle`, from the scene and period messages of a run."""
 
-    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], vehicle: str, declared: ProgramFigures) -> None:
+    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], vehicle: str, views: Views) -> None:
         self._canvas = canvas
-        self._estimates = (POSITION, *declared.estimates)
+        self._estimates = (POSITION, *views.estimates)
         self._node_ids: list[str] = scene["node_ids"]
         self._vehicle = vehicle
         self._number = self._node_ids.index(vehicle)
         periods = round(WINDOW_S * 1e9 / scene["period_ns"])
         self._tried, self._heard = SlidingSum(periods), SlidingSum(periods)
-        self._peers = {name: np.full(len(self._node_ids), np.nan) for name in declared.peers}
+        self._peers = {name: np.full(len(self._node_ids), np.nan) for name in views.peers}
         self._next_s = self._next_slow_s = 0.0
         self._is_there = True
         self._set_styles()

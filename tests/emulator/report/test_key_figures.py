@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from emulator.checks.judge import check_run
 from emulator.drivers.session import Session
 from emulator.drivers.status import Course
 from emulator.records.period_figures import program_figures
+from emulator.records.recorded_run import RecordedRun
 from emulator.report.comparison import Comparison, comparison_page
+from emulator.report.figures import figures_of
 from emulator.report.index import index_page
 from emulator.report.source import Source
 from emulator.report.sweep_page import heading
@@ -29,7 +32,7 @@ from emulator.terminal.dashboard import Dashboard
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from tests.support.recordings import read_back
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, VnetError
 from vnet.node import Node
 
 DECLARES = __name__
@@ -94,6 +97,33 @@ def test_a_recording_and_the_live_picture_have_a_declared_figure(run: Path, tmp_
     console = Console(file=io.StringIO(), width=100, height=20)
     console.print(Dashboard(course.snapshot()))
     assert "middle" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.slow
+def test_a_folder_shows_declared_charts_where_the_program_is_not_installed(run: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(run, tmp_path / "run"))
+    text = (folder / "scenario.toml").read_text()
+    (folder / "scenario.toml").write_text(text.replace(__name__, "not_installed"))
+    assert "Middle of all vehicles" in report_page(Source(folder))
+    assert figures_of(Source(folder))["middle"][0] == "Middle of all vehicles"  # those of the picture
+    with Recorder(Sinks(save=tmp_path / "run.rrd"), "run") as recorder:
+        for stream, message in messages(folder):
+            recorder.take(stream, message)
+    assert "/figures/middle" in read_back(tmp_path / "run.rrd")
+
+
+@pytest.mark.slow
+def test_views_of_a_folder_that_cannot_be_are_one_line(run: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(run, tmp_path / "run"))
+    verdict = json.loads((folder / "verdict.json").read_text())
+    for change, said in {
+        "id": "<b>",
+        "lines": {},
+    }.items():
+        wrong = {**verdict, "views": {"charts": [{**verdict["views"]["charts"][0], change: said}]}}
+        (folder / "verdict.json").write_text(json.dumps(wrong))
+        with pytest.raises(VnetError, match=rf"verdict\.json: views\.charts\.0\.{change}"):
+            _ = RecordedRun.open(folder).record
 
 
 class Wrong:
