@@ -17,6 +17,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from emulator.learning.vehicle_environment import Spaces, whole_seed
 from emulator.radio.engine import Engine
+from emulator.radio.outcomes import Outcome
 from emulator.scenario.scenario import Scenario
 from emulator.world.radio_inputs import RadioInputs, load_buildings, load_links
 from vnet.errors import PayloadTooLargeError, VnetError, shown
@@ -52,11 +53,17 @@ class RadioEnvironment(BaseParallelWrapper):
         links = load_links(scenario.radio, self._node_ids)
         self._inputs = RadioInputs(links, load_buildings(scenario, None, EVERYWHERE_M))
         self._engine: Engine | None = None
+        self._frames = 0
 
     @property
     def outcomes(self) -> dict[str, int]:
-        """Number of receptions of the episode so far, by outcome; those out of range are among them."""
-        counts = {} if self._engine is None else self._engine.counts
+        """Number of receptions of the episode so far, by outcome; those out of range are among them.
+
+        Those of a frame that still waits to be sent are `pending`, each other agent's.
+        """
+        counts = {} if self._engine is None else dict(self._engine.counts)
+        waiting = self._frames * (len(self._node_ids) - 1) - sum(counts.values())
+        counts[Outcome.pending] = counts.get(Outcome.pending, 0) + waiting
         return {outcome.name: count for outcome, count in counts.items() if count}
 
     def observation_space(self, agent: str) -> Any:
@@ -75,7 +82,7 @@ class RadioEnvironment(BaseParallelWrapper):
         if seed is not None:
             self._seed = whole_seed(seed)
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._time_ns = 0
+        self._time_ns = self._frames = 0
         self._position_m = np.zeros((len(self._node_ids), 2))
         self._engine = Engine(self._node_ids, self._scenario.radio, self._seed, self._position_m, self._inputs)
         self._seed += 1
@@ -99,6 +106,7 @@ class RadioEnvironment(BaseParallelWrapper):
                 raise PayloadTooLargeError(len(payload), most)
             if payload is not None:
                 self._engine.transmit(self._time_ns, number, [payload])
+                self._frames += 1
         observations, *rest = self.env.step(actions)
         self._time_ns += self._step_ns
         packets: dict[str, list[Packet]] = {agent: [] for agent in self._node_ids}

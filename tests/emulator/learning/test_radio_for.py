@@ -91,6 +91,17 @@ def test_with_a_perfect_radio_a_particle_world_is_itself(world: Any, continuous:
         assert radio.outcomes == {"delivered": 25 * speakers}
 
 
+@pytest.mark.parametrize("mac", ["lte-mode4", "nr-mode2", "80211p"])
+def test_a_frame_that_still_waits_at_the_end_of_an_episode_is_pending(mac: str) -> None:
+    radio = {"mac": {"kind": mac}, "access_jitter_ms": 90.0, "path_loss": {"kind": "winner_b1"}}
+    world = particles(simple_reference_v3, {"radio": radio})
+    for seed in range(4):
+        world.reset(seed=seed)
+        while world.agents:
+            world.step(dict.fromkeys(world.agents, 1))
+        assert sum(world.outcomes.values()) == 25 * 2 and world.outcomes.get("pending", 0) <= 4
+
+
 def test_it_passes_pettingzoo_s_tests(capsys: pytest.CaptureFixture[str]) -> None:
     lossy = {"radio": {"loss": 0.5}}
     parallel_api_test(particles(simple_reference_v3, lossy), num_cycles=60)
