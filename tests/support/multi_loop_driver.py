@@ -10,7 +10,7 @@ import math
 import queue
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -98,6 +98,13 @@ def run_apart(scenario: Scenario) -> Emulation:
         finals = [traffic for process in apart.processes.values() for traffic in process.end(killed=False)]
         emulation.take_final(emulation.duration_ns, finals)
     return emulation
+
+
+def run_other_ways(scenario: Scenario) -> Iterator[Emulation]:
+    """Run what `run_together` simulates on loops of its processes, in three processes, and without windows."""
+    yield run_apart(scenario)
+    yield run_forked(scenario)
+    yield run_together(scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": False})}))
 
 
 class _Apart(Processes):

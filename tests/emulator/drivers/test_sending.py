@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.emulation import Emulation
-from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
+from tests.support.multi_loop_driver import run_apart, run_other_ways, run_together, scenario_of
 from vnet import Node
 
 pytestmark = pytest.mark.slow
@@ -109,11 +109,10 @@ def told(emulation: Emulation) -> list[tuple[str, int, str]]:
 @pytest.mark.parametrize(("entry", "latency_ms"), [(SENDS, 2.0), (FORGETS, 0.05)], ids=["awaits", "forgets"])
 def test_live_processes_are_told_what_their_simulation_is(entry: str, latency_ms: float) -> None:
     plan = scenario(entry, latency_ms=latency_ms, loss=0.3)
-    without = plan.model_copy(update={"run": plan.run.model_copy(update={"windows": False})})
     together = run_together(plan)
     expected = told(together)
     assert len(expected) > 60
-    for other in (run_apart(plan), run_forked(plan), run_together(without)):
+    for other in run_other_ways(plan):
         assert told(other) == expected
         assert other.engine.trace.sha256() == together.engine.trace.sha256()
 

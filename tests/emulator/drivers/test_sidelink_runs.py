@@ -8,7 +8,7 @@ import pytest
 import emulator
 from emulator.checks.judge import check_run
 from emulator.records.recorded_run import ON_AIR
-from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
+from tests.support.multi_loop_driver import run_other_ways, run_together, scenario_of
 from vnet import Node
 from vnet.units import NS_PER_MS
 
@@ -44,10 +44,8 @@ def test_live_processes_do_what_their_simulation_does(mac: dict[str, Any], laten
     sections = {"run": {"duration_s": 1.6, "settle_s": 0.1}, "radio": radio(mac, latency_ms=latency_ms)}
     program = "tests.support.window_programs:improvises"
     scenario = scenario_of(FAULTS, program, 5, network={"layout": "dense"}, **sections)
-    without = scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": False})})
     expected = run_together(scenario).engine.trace.sha256()
-    for found in (run_apart(scenario), run_together(without), run_forked(scenario)):
-        assert found.engine.trace.sha256() == expected
+    assert [other.engine.trace.sha256() for other in run_other_ways(scenario)] == [expected] * 3
 
 
 @pytest.mark.parametrize("mac", MACS, ids=["mode 4", "mode 2", "dynamic"])
@@ -144,9 +142,7 @@ async def asks(node: Node) -> None:
             if call == "send":
                 await node.radio.send("v02", b"x")
             else:
-                await node.radio.broadcast(
-                    b"x", **{"rate": {"rate_mbps": 6.0}, "period": {"period_ms": 30.0}}[call]
-                )
+                await node.radio.broadcast(b"x", **CHOICES[call])
             node.event(call, ok=True)
         except ValueError as error:
             node.event(call, error=str(error))
