@@ -7,7 +7,7 @@ from tests.hunt.layouts import differences
 
 @pytest.mark.slow
 def test_random_programs_give_one_trace_in_simulated_layouts() -> None:
-    assert [*differences([2, 3, 4])] == []
+    assert [*differences([2, 4])] == []
 
 
 @pytest.mark.slow
