@@ -162,11 +162,7 @@ class _RealTimeAgent:
         self._wake_pending = False
         self._flush_pending = False
         self._started = False
-        self._seq = 0
-        self._expected = 0
-        self._missed: list[tuple[int, int]] = []
-        self._lateness = [0] * wire.LATENESS_BINS
-        self._late: list[tuple[int, int]] = []
+        self._receipts = wire.Receipts()
         """Batches with a late packet that the emulator has not been told of, and when they came."""
         self._sends: dict[tuple[str, int], int] = {}
         """Frames to single vehicles without a result, by node and number, and the `seq` with which they went."""
@@ -250,9 +246,6 @@ class _RealTimeAgent:
             self._over.set_exception(TransportError(self._attachment.orphaned(patience_s)))
 
     def _take(self, batch: wire.Batch, arrived_ns: int) -> None:
-        if batch.seq > self._expected:
-            self._missed.append((self._expected, batch.seq - 1))
-        self._expected = batch.seq + 1
         if batch.origin_ns is not None and not self._started:
             same_machine = self._boot_id != "" and self._boot_id == wire.boot_id()
             head_start_ns = 0 if batch.start_ns else wire.HEAD_START_NS
@@ -264,11 +257,7 @@ class _RealTimeAgent:
         now_ns = arrived_ns - self._origin_ns
         self._host.apply_clock_error(batch.clocks, self._loop)
         self._host.busy.add(batch.busy)
-        late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
-        for each_ns in late_ns:
-            self._lateness[wire.lateness_bin(each_ns)] += 1
-        if max(late_ns, default=0) >= wire.LATENESS_LIMIT_NS:
-            self._late.append((batch.seq, now_ns))
+        self._receipts.take(batch, now_ns)
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
         self._take_results(batch)
         if batch.messages:
@@ -310,22 +299,9 @@ class _RealTimeAgent:
     def _flush(self, final: bool = False) -> None:
         self._flush_pending = False
         traffic = self._host.take_traffic()
-        self._sends.update(((each.node, each.number), self._seq) for each in traffic.frames if each.to is not None)
-        self._attachment.say(
-            wire.Frames(
-                self._attachment.nonce,
-                self._seq,
-                self._expected,
-                self._missed,
-                traffic,
-                wire.Lateness(self._lateness),
-                final,
-                self._take_overdue(),
-                self._late,
-            )
-        )
-        self._seq += 1
-        self._missed, self._late = [], []
+        seq = self._receipts.seq
+        self._sends.update(((each.node, each.number), seq) for each in traffic.frames if each.to is not None)
+        self._attachment.say(self._receipts.frames(self._attachment.nonce, traffic, final, self._take_overdue()))
         self._attachment.publish(traffic)
 
     async def _acknowledge(self) -> None:

@@ -445,6 +445,38 @@ class Batch(Message, frozen=True):
     lost: Sequence[tuple[Count, Count]] = ()
 
 
+class Receipts:
+    """Real time: the batches that have come to a process, and what it acknowledges with its next `Frames`."""
+
+    def __init__(self) -> None:
+        self.seq = 0
+        """Number of the next `Frames`."""
+        self._expected = 0
+        self._missed: list[tuple[int, int]] = []
+        self._lateness = [0] * LATENESS_BINS
+        self._late: list[tuple[int, int]] = []
+
+    def take(self, batch: Batch, now_ns: int) -> None:
+        """Take note of a batch that has come at `now_ns` of the run."""
+        if batch.seq > self._expected:
+            self._missed.append((self._expected, batch.seq - 1))
+        self._expected = batch.seq + 1
+        late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
+        for each_ns in late_ns:
+            self._lateness[lateness_bin(each_ns)] += 1
+        if max(late_ns, default=0) >= LATENESS_LIMIT_NS:
+            self._late.append((batch.seq, now_ns))
+
+    def frames(
+        self, nonce: bytes, traffic: Traffic, final: bool = False, unseen: Sequence[MessageRef] = ()
+    ) -> Frames:
+        """Return the next message of the process."""
+        seq, missed, late = self.seq, self._missed, self._late
+        self.seq, self._missed, self._late = seq + 1, [], []
+        lateness = Lateness(tuple(self._lateness))
+        return Frames(nonce, seq, self._expected, missed, traffic, lateness, final, unseen, late)
+
+
 class StackRequest(Message, frozen=True):
     """Request for the stacks of a process for which the emulator has waited too long."""
 

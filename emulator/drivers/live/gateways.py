@@ -79,11 +79,8 @@ class _Vehicle:
     reports: list[Report] = field(default_factory=list)
     notes: list[wire.Note] = field(default_factory=list)
     endings: list[wire.Ending] = field(default_factory=list)
-    seq: int = 0
-    received_seq: int = 0
+    receipts: wire.Receipts = field(default_factory=wire.Receipts)
     unicasts: int = 0
-    lateness: list[int] = field(default_factory=lambda: [0] * wire.LATENESS_BINS)
-    late: list[tuple[int, int]] = field(default_factory=list)
     is_due: bool = False
     has_warned: bool = False
     """True once it was told that a message has more frames than the radio's queue."""
@@ -353,17 +350,12 @@ class Gateways:
 
     def _take_batch(self, vehicle: _Vehicle, batch: wire.Batch) -> None:
         now_ns = self._now_ns()
-        vehicle.received_seq = batch.seq + 1
+        vehicle.receipts.take(batch, now_ns)
         if batch.origin_ns is not None and not vehicle.on_air:
             delay_s = max(batch.origin_ns + batch.start_ns - time.monotonic_ns(), 0) / NS_PER_S
             turn = self._emulation.number[vehicle.gateway.node_id] / len(self._emulation.number)
             turn_s = 0.0 if batch.start_ns else TURNS_S * turn  # who comes back is alone
             self._loop.call_later(delay_s, self._go_on_air, vehicle, turn_s)
-        late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
-        for each_ns in late_ns:
-            vehicle.lateness[wire.lateness_bin(each_ns)] += 1
-        if max(late_ns, default=0) >= wire.LATENESS_LIMIT_NS:
-            vehicle.late.append((batch.seq, now_ns))
         for fix in batch.fixes:
             vehicle.gateway.show_fix(fix.fix())
         for packet in batch.packets:
@@ -505,12 +497,7 @@ class Gateways:
             self._note(vehicle, "warning", f"{lost} not sent: the vehicle has ended")
         traffic = wire.Traffic(vehicle.outbox, vehicle.reports, vehicle.endings, notes=vehicle.notes)
         vehicle.outbox, vehicle.reports, vehicle.endings, vehicle.notes = [], [], [], []
-        lateness, late = wire.Lateness(list(vehicle.lateness)), vehicle.late
-        frames = wire.Frames(
-            vehicle.nonce, vehicle.seq, vehicle.received_seq, (), traffic, lateness, final, (), late
-        )
-        vehicle.late = []
-        vehicle.seq += 1
+        frames = vehicle.receipts.frames(vehicle.nonce, traffic, final)
         self._tell("frames", vehicle.gateway.node_id, (frames, arrived_ns or time.monotonic_ns()))
 
     # Sessions.

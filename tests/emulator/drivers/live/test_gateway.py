@@ -152,7 +152,8 @@ def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody() -> 
         assert put.congestion_control == zenoh.CongestionControl.BLOCK
         assert len(vehicles[0].frames) == 4
         assert vehicles[1].frames == []
-        assert own.qsize() == 4  # past the radio, and not again by it
+        assert [(await own.get()).kind for _ in range(4)] == [each.kind for each in samples]
+        assert own.empty()  # past the radio, and not again by it
 
     two(test)
 
