@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from tests.support.paths import ROOT
-from vnet.gateway.emulated.programs import REFUSED, zenoh_modules
+from vnet.gateway.emulated import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
 MODULES = zenoh_modules(

@@ -33,10 +33,9 @@ from greenlet import GreenletExit
 
 from vnet.errors import ProgramError, shown
 from vnet.gateway import client_config, python_words, session_variables
-from vnet.gateway.emulated.facade import Facade
 from vnet.gateway.emulated.loops import prepare_asyncio
 from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
-from vnet.gateway.emulated.shown import hide, import_shared, show
+from vnet.gateway.emulated.shown import Facade, hide, import_shared, show
 from vnet.gateway.emulated.strands import Threads, look, set_generator_hooks, sleep
 from vnet.node import Node
 from vnet.units import NS_PER_S

@@ -1,4 +1,4 @@
-"""Modules of which each program has its own, as `sys.modules` has them: for what finds a module there by its name.
+"""Modules of which each program has its own, and how `sys.modules` has them, for what finds a module by its name.
 
 `pickle` finds classes so, and `pydantic` and others the names of annotations. What stands here in `sys.modules` is,
 to the code of a program, that program's own module, and to all other code what was there before.
@@ -12,6 +12,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
+
+
+class Facade(ModuleType):
+    """Stands for a module of which some names are others."""
+
+    def __init__(self, real: ModuleType, **own: Any) -> None:
+        super().__init__(real.__name__, real.__doc__)
+        names = {
+            name: value for name, value in vars(real).items() if not name.startswith("__") or name == "__all__"
+        }
+        vars(self).update(names, **own)
+        self.__real = real
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.__real, name)
 
 
 class _Proxy(ModuleType):

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
-from vnet.gateway.emulated.facade import Facade
+from vnet.gateway.emulated.shown import Facade
 from vnet.runtime.asyncio_internals import note_greenlet
 from vnet.runtime.outside_loop import tell_failed_thread
 from vnet.runtime.own_asyncio import Task, present_node
