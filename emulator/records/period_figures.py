@@ -146,7 +146,7 @@ class DeclaredChart:
 
 @dataclass(frozen=True)
 class Views:
-    """What report, picture and recording show of a program's figures: a run's folder and its scene have it."""
+    """A program's declarations that report, picture and recording show: a run's folder and its scene have them."""
 
     peers: tuple[str, ...] = ()
     """Names before a dot that stand for one value of each pair of vehicles: they stay in `values`."""

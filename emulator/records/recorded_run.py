@@ -741,7 +741,7 @@ class OpenedRun(RecordedRun):
 
     @cached_property
     def views(self) -> Views:
-        """What the program declares to be shown: as the folder says, also where the program is not installed."""
+        """The program's declarations as the folder has them, also where the program is not installed."""
         try:
             kept = self.record.views
         except VnetError:  # a run that was killed

@@ -168,7 +168,7 @@ class Record:
     key_figures: list[KeyFigure] = field(default_factory=list)
     """Those of `figures` that sum the run up, as its program declares them."""
     views: Views | None = None
-    """What its program declares to be shown of them; None in folders of an earlier vnet."""
+    """Its program's declarations for views; None in folders of an earlier vnet."""
 
     @property
     def judgement(self) -> Judgement:

@@ -42,7 +42,7 @@ class Source(OpenedRun):
 
     @cached_property
     def views(self) -> Views:
-        """What the program declares to be shown; nothing where the scenario cannot be read."""
+        """The program's declarations for views; none where the scenario cannot be read."""
         return maybe(lambda: super(Source, self).views) or Views()
 
     @cached_property
