@@ -106,7 +106,8 @@ class Drawn:
 
     def draw(self, choose: Chooser) -> float:
         """Draw one number."""
-        return choose.integer(self.low, self.high) * self.times / self.per
+        number = choose.integer(self.low, self.high) * self.times
+        return number if self.per == 1 else number / self.per
 
 
 class Selector(Section):

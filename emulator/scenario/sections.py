@@ -5,10 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails
 
 from vnet.errors import did_you_mean, printable, shown
 
@@ -61,6 +69,26 @@ class Section(BaseModel):
     """The classes of a section that has several kinds, told apart by the key `kind`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _numbers_are_numbers(cls, given: Any, validate: ModelWrapValidatorHandler[Any]) -> Any:
+        """Refuse true, "4" and 4.0 for 4, which pydantic takes."""
+        made = validate(given)
+        for key in given if isinstance(given, dict) else ():
+            if key in made.model_fields_set and (problem := _of_another_type(given[key], getattr(made, key))):
+                wrong = InitErrorDetails(type=problem, loc=(key,), input=given[key])
+                raise ValidationError.from_exception_data(cls.__name__, [wrong])
+        return made
+
+
+def _of_another_type(given: Any, made: Any) -> Literal["", "int_type", "float_type"]:
+    """Return pydantic's type of error if a number was made of something else; "" if not."""
+    if isinstance(made, tuple) and isinstance(given, list | tuple):
+        return next(filter(None, map(_of_another_type, given, made)), "")
+    if type(made) is int and isinstance(given, bool | str | float):
+        return "int_type"
+    return "float_type" if type(made) is float and isinstance(given, bool | str) else ""
 
 
 def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]) -> str:
