@@ -65,6 +65,9 @@ def time_figure(
     lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[FaultSpan] = (), linear: bool = False
 ) -> Canvas:
     """Draw lines against time, spans of faults behind them; logarithmic if they spread far, unless `linear`."""
+    everything = np.concatenate([line.value[np.isfinite(line.value)] for line in lines])
+    positive = everything[everything > 0]
+    is_log = not linear and len(positive) > 0 and positive.max() > WIDE_RANGE * positive.min()
     rows = math.ceil(len(lines) / LEGEND_COLUMNS) if len(lines) > 1 else 0
     made = canvas(TIME, y_label, rows, spans, end_s)
     for line in lines:
@@ -75,10 +78,9 @@ def time_figure(
             "marker": marker,
             "label": line.label,
         }
-        made.axes.plot(*thin(line.time_s, line.value), **shown)
-    everything = np.concatenate([line.value[np.isfinite(line.value)] for line in lines])
-    positive = everything[everything > 0]
-    if not linear and len(positive) and positive.max() > WIDE_RANGE * positive.min():
+        value = np.where(line.value > 0, line.value, np.nan) if is_log else line.value  # zero is a gap
+        made.axes.plot(*thin(line.time_s, value), **shown)
+    if is_log:
         logarithmic(made.axes)
     else:
         from_zero(made.axes)

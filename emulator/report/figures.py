@@ -95,6 +95,8 @@ def links(source: Source) -> Drawing:
         lowest, farthest_km = min(lowest, least), max(farthest_km, last_km)
     made.axes.set_xlim(0, max(farthest_km * 1.03, 1e-3))
     made.axes.set_ylim(max(0, np.floor((lowest - 3) / 10) * 10), 102)
+    made.axes.set_yticks([tick for tick in made.axes.get_yticks() if tick <= 100])
+    made.axes.set_ylim(top=102)
     legend(made)
     return Drawing(made, text)
 

@@ -1,4 +1,4 @@
-"""A run as one picture, laid out as its recording: heading, map and events on the left, curves on the right.
+"""A run as one picture: heading, map, events and reported values on the left, curves on the right.
 
 The figures are those of the report. matplotlib draws them, as Rerun's viewer needs a display or a graphics driver.
 """
@@ -6,11 +6,10 @@ The figures are those of the report. matplotlib draws them, as Rerun's viewer ne
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from itertools import islice
+from collections.abc import Iterable, Iterator
+from itertools import accumulate, islice
 from pathlib import Path
-from textwrap import shorten
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from emulator.pages.canvas import INK, PAPER, QUIET, WIDTH_PX, styled
 from emulator.pages.text import as_text
@@ -19,7 +18,7 @@ from emulator.records.events import SAID, SAMPLES, Event
 from emulator.records.run_folder import check_is_run
 from emulator.report.figures import figures_of
 from emulator.report.map_figures import map_charts
-from emulator.report.program_figures import Drawers
+from emulator.report.program_figures import Drawers, program_charts
 from emulator.report.source import NothingToShow, Source, maybe
 from emulator.report.write import key_figures
 from vnet.errors import VnetError
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+_Drawn: TypeAlias = "tuple[str, NDArray[Any]]"
+_Rows: TypeAlias = list[tuple[int, list[_Drawn]]]
 DPI = 72
 """Pixels an inch: a point is a pixel."""
 MAP_PX, CURVE_PX = 760, 480
@@ -36,9 +37,9 @@ MAP_PX, CURVE_PX = 760, 480
 MARGIN_PX, HEADING_PX, TITLE_PX, LINE_PX = 20, 84, 22, 17
 COLUMNS, ROWS = 2, 4
 """Curves beside the map: the first ones of the report that have data."""
-MOST_EVENTS = 12
-LONGEST_LINE = 104
-"""Letters of a line of an event or of the heading."""
+MOST_EVENTS, MOST_SAID = 12, 6
+LONGEST_LINE, LONGEST_HEADING = 104, 230
+"""Letters of a line of an event, and of the figures below the name."""
 
 
 def write_picture(folder: Path, path: Path) -> None:
@@ -61,11 +62,14 @@ def _picture(source: Source) -> Figure:
     problems: list[str] = []
     chart = next(_drawn({"map": map_charts(source)["map"]}, MAP_PX, problems), None)
     curves = list(islice(_drawn(figures_of(source), CURVE_PX, problems), COLUMNS * ROWS))
-    rows = [curves[first : first + COLUMNS] for first in range(0, len(curves), COLUMNS)]
-    heights = [TITLE_PX + max(pixels.shape[0] for _, pixels in row) for row in rows]
+    right = _in_rows(curves)
+    right_px = sum(height for height, _ in right)
     events = [line[:LONGEST_LINE] for line in (*_events(source), *problems)]
     left_px = (TITLE_PX + chart[1].shape[0] if chart else 0) + (TITLE_PX + LINE_PX * len(events))
-    height_px = HEADING_PX + max(left_px, sum(heights)) + MARGIN_PX
+    own = _in_rows(_drawn(program_charts(source), MAP_PX // COLUMNS, []))
+    ends_px = accumulate((height for height, _ in own), initial=left_px + LINE_PX)
+    own = [row for row, end_px in zip(own, islice(ends_px, 1, None), strict=True) if end_px <= right_px]
+    height_px = HEADING_PX + max(left_px, right_px) + MARGIN_PX
     width_px = 3 * MARGIN_PX + MAP_PX + COLUMNS * CURVE_PX
     figure = Figure(figsize=(width_px / DPI, height_px / DPI), dpi=DPI)
 
@@ -75,6 +79,12 @@ def _picture(source: Source) -> Figure:
     def place(title: str, pixels: NDArray[Any], x: int, y: int) -> None:
         write(title, x + 8, y + 4, fontsize=13, color=INK)
         figure.figimage(pixels, x, height_px - y - TITLE_PX - pixels.shape[0])
+
+    def place_all(rows: _Rows, x: int, y: int, width_px: int) -> None:
+        for height, row in rows:
+            for column, (title, pixels) in enumerate(row):
+                place(title, pixels, x + column * width_px, y)
+            y += height
 
     name, facts = _heading(source)
     write(name, MARGIN_PX, 16, fontsize=20, color=INK)
@@ -86,15 +96,19 @@ def _picture(source: Source) -> Figure:
     write("Events", MARGIN_PX + 8, y + 4, fontsize=13, color=INK)
     for number, line in enumerate(events):
         write(line, MARGIN_PX + 8, y + TITLE_PX + 4 + LINE_PX * number, color=QUIET)
-    y = HEADING_PX
-    for row, height in zip(rows, heights, strict=True):
-        for column, (title, pixels) in enumerate(row):
-            place(title, pixels, 2 * MARGIN_PX + MAP_PX + column * CURVE_PX, y)
-        y += height
+    place_all(own, MARGIN_PX, HEADING_PX + left_px + LINE_PX, MAP_PX // COLUMNS)
+    place_all(right, 2 * MARGIN_PX + MAP_PX, HEADING_PX, CURVE_PX)
     return figure
 
 
-def _drawn(drawers: Drawers, width_px: int, problems: list[str]) -> Iterator[tuple[str, NDArray[Any]]]:
+def _in_rows(drawn: Iterable[_Drawn]) -> _Rows:
+    """Return titles and pixels in rows, each with its height."""
+    curves = list(drawn)
+    rows = [curves[first : first + COLUMNS] for first in range(0, len(curves), COLUMNS)]
+    return [(TITLE_PX + max(pixels.shape[0] for _, pixels in row), row) for row in rows]
+
+
+def _drawn(drawers: Drawers, width_px: int, problems: list[str]) -> Iterator[_Drawn]:
     """Yield title and pixels of each figure for which the run has data; what cannot be drawn is added in words."""
     from matplotlib.image import imread
 
@@ -118,16 +132,21 @@ def _heading(source: Source) -> tuple[str, str]:
     name = source.folder.resolve().name
     if record is None:
         return name, "without a verdict"
-    facts = " · ".join(f"{title} {value}" for title, value in key_figures(record).items())
-    return f"{name}: {record.verdict.value}", shorten(facts, 2 * LONGEST_LINE, placeholder=" …")
+    facts = [f"{title} {value}" for title, value in key_figures(record).items()]
+    while len(" · ".join(facts)) > LONGEST_HEADING:
+        facts[-2:] = ["…"]
+    return f"{name}: {record.verdict.value}", " · ".join(facts)
 
 
 def _events(source: Source) -> list[str]:
-    """Return the last events in a line each, without what programs said and samples."""
-    events = [event for event in maybe(lambda: source.events) or () if not event.has(SAMPLES | SAID)]
-    return [_line(event) for event in events[-MOST_EVENTS:]] or ["none"]
+    """Return the last events, and the last that programs told, in a line each; samples are left out."""
+    events = [event for event in maybe(lambda: source.events) or () if not event.has(SAMPLES)]
+    said = [event for event in events if event.has(SAID)][-MOST_SAID:]
+    shown = [event for event in events if not event.has(SAID)][-MOST_EVENTS:] + said
+    return [_line(event) for event in sorted(shown, key=lambda event: event.time_ns)] or ["none"]
 
 
 def _line(event: Event) -> str:
     who = event.node or event.details.get("fault", "")
-    return f"{event.time_ns / 1e9:8.2f} s   {event.kind}   {who}   {event.said}"
+    said = event.what if event.has(SAID) else event.said
+    return f"{event.time_ns / 1e9:8.2f} s   {event.kind}   {who}   {said}"

@@ -123,7 +123,7 @@ def totals(source: Source) -> Drawing:
     """Draw the numbers and shares of the outcomes of the whole run."""
     trace = in_range(source)
     bars = _bars(trace)
-    made = canvas("share of receptions (%)", "outcome", plot_px=31 * len(bars) + 6)
+    made = canvas("share of receptions (%)", "", plot_px=31 * len(bars) + 6)
     axes = made.axes
     for row, (label, outcome, count) in enumerate(bars):
         share = 100 * count / len(trace)
