@@ -46,3 +46,9 @@ def test_a_file_in_place_of_the_package_is_named(script: str, package: str, tmp_
 def test_an_interrupt_while_the_package_is_imported_is_silent(script: str, module: str, tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(AT_IMPORT.format(module=module))
     assert start(script, tmp_path, "--version") == (130, "")
+
+
+def test_the_package_imports_nothing_before_ctrl_c_is_guarded() -> None:
+    code = "import sys; before = {*sys.modules}; import vnet; print({*sys.modules} - before)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "{'vnet'}\n"
