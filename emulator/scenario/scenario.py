@@ -128,7 +128,8 @@ class Radio(Section):
     latency_ms: float = Field(2.0, ge=0.001, le=1000 * DAY_S)
     """Least time from the end of the transmission to the arrival."""
     jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
-    """Jitter of the latency: uniform from 0, drawn for each receiver."""
+    """Jitter of the latency: uniform from 0, drawn for each receiver; by default 0 with `program.kind = "zenoh"`,
+    as Zenoh keeps the order of what one program puts."""
     access_jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
     """Random wait before the transmission: uniform from 0, drawn for each frame."""
     delivery_tick_us: int = Field(0, ge=0, le=MANY)
@@ -292,6 +293,17 @@ class Scenario(Section):
     @classmethod
     def _units_have_names(cls, units: tuple[RoadsideUnit, ...]) -> tuple[RoadsideUnit, ...]:
         return with_names(units)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _zenoh_keeps_its_order(cls, data: Any) -> Any:
+        """Fill in no jitter for Zenoh programs: Zenoh delivers what one of them puts in the order of putting."""
+        if not isinstance(data, dict) or not isinstance(program := data.get("program"), dict):
+            return data
+        radio = data.get("radio", {})
+        if program.get("kind") != "zenoh" or not isinstance(radio, dict):
+            return data
+        return {**data, "radio": {"jitter_ms": 0.0, **radio}}
 
     @model_validator(mode="after")
     def _faults_start_in_time(self) -> Scenario:

@@ -37,6 +37,30 @@ def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive
 
 
 @pytest.mark.slow
+def test_what_one_program_puts_arrives_in_that_order(drive: Drive) -> None:
+    """Of any size, puts and deletes, with queries among them: Zenoh promises it of each publisher."""
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        session.declare_subscriber("k/**", lambda s: print(s.key_expr, s.kind))
+        queryable = session.declare_queryable("q/**", lambda query: print(query.key_expr, "query"))
+        time.sleep(0.1)
+        if sys.argv[1] == "v01":
+            for n in range(12):
+                session.put(f"k/{n}", bytes(n * 200))
+                session.delete(f"k/{n}")
+                session.get(f"q/{n}", lambda reply: None)
+        time.sleep(1.5)
+        """,
+        vehicles=2,
+    )
+    kinds = ("SampleKind.PUT", "SampleKind.DELETE", "query")
+    expected = [f"{'q' if kind == 'query' else 'k'}/{n} {kind}" for n in range(12) for kind in kinds]
+    assert log(run, "v02")[: len(expected)] == expected
+
+
+@pytest.mark.slow
 def test_what_crosses_has_a_timestamp_of_its_vehicles_router(drive: Drive) -> None:
     """Also a delete, which has none in its own vehicle: the routers of receivers would give it theirs."""
     run = drive(
