@@ -6,7 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 PYTEST := $(BIN)/pytest --dist worksteal -n
-# The slow tests wait for processes, connections and timers for a quarter of their time: half as many workers again.
+# Whole runs, which come first, wait for processes, connections and timers while other workers compute: half as many
+# workers again as cores keep all cores busy.
 CORES := $(shell nproc 2>/dev/null || echo 1)
 WAITING := $(shell expr \( 3 \* $(CORES) + 1 \) / 2)
 COVERAGE := --cov --cov-report=
