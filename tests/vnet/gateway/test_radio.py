@@ -38,7 +38,7 @@ def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive
 
 @pytest.mark.slow
 def test_what_one_program_puts_arrives_in_that_order(drive: Drive) -> None:
-    """Of any size, puts and deletes, with queries among them: Zenoh promises it of each publisher."""
+    """Puts and deletes of any size, with queries among them, do: Zenoh promises it of each publisher."""
     run = drive(
         """
         import sys, time, zenoh
