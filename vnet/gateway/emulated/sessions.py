@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial, partialmethod
 from itertools import count
 from typing import Any, Literal
@@ -60,16 +60,16 @@ _TYPES: dict[str, type] = {
 """Types of arguments that are of no other."""
 
 
-def _check(**given: object) -> None:
-    """Raise TypeError for an argument of another type, and ZError for one that virtual time does not have."""
-    for name, value in given.items():
+def _check(options: Mapping[str, object]) -> None:
+    """Raise TypeError for an option of another type, and ZError for one that virtual time does not have."""
+    for name, value in options.items():
         if value is None:
             continue
-        if name not in _TYPES:
+        if name == "timestamp_instrumentation":
             raise zenoh.ZError(f"{name} is not available on virtual time: sessions have no transport")
-        if not isinstance(value, _TYPES[name]):
-            kind = type(value).__name__
-            raise TypeError(f"argument '{name}': '{kind}' object cannot be converted to '{_TYPES[name].__name__}'")
+        if not isinstance(value, kind := _TYPES.get(name, object)):
+            given = type(value).__name__
+            raise TypeError(f"argument '{name}': '{given}' object cannot be converted to '{kind.__name__}'")
 
 
 class Declared:
@@ -319,6 +319,7 @@ class Publisher(Sending):
             "express": express,
             "allowed_destination": allowed_destination,
         }
+        _check(self._qos)
 
     encoding: zenoh.Encoding
     congestion_control: zenoh.CongestionControl
@@ -334,6 +335,7 @@ class Publisher(Sending):
         self._publish(DELETE, NOTHING, **options)
 
     def _publish(self, kind: zenoh.SampleKind, payload: Any, **options: Any) -> Sample:
+        _check(options)
         self.check_declared()
         return self.session.publish(kind, self.key_expr, payload, **self._qos, **options)
 
@@ -479,10 +481,12 @@ class Session:
 
     def put(self, key_expr: Any, payload: Any, **options: Any) -> None:
         """Put a sample."""
+        _check(options)
         self.publish(PUT, key_expr, payload, **options)
 
     def delete(self, key_expr: Any, **options: Any) -> None:
         """Delete a key."""
+        _check(options)
         self.publish(DELETE, key_expr, NOTHING, **options)
 
     def publish(
@@ -502,13 +506,6 @@ class Session:
         source_info: SourceInfo | None = None,
     ) -> Sample:
         """Put or delete a sample, and return it."""
-        _check(
-            timestamp_instrumentation=timestamp_instrumentation,
-            priority=priority,
-            congestion_control=congestion_control,
-            express=express,
-            timestamp=timestamp,
-        )
         self.check_open()
         sample = Sample(
             key_of(key),
@@ -538,9 +535,7 @@ class Session:
         **options: Any,
     ) -> Any:
         """Ask for replies."""
-        _check(
-            timestamp_instrumentation=timestamp_instrumentation, **{k: v for k, v in options.items() if k in _TYPES}
-        )
+        _check({**options, "timestamp_instrumentation": timestamp_instrumentation})
         self.check_open()
         sink, seen = sink_of(handler, self.outlet)
         selector = selector if isinstance(selector, zenoh.Selector) else zenoh.Selector(selector)
