@@ -1,6 +1,8 @@
 """The analysis of a network against closed forms, and the cases that have no network worth the name."""
 
+import json
 import math
+from dataclasses import asdict
 from io import StringIO
 from pathlib import Path
 
@@ -12,6 +14,9 @@ from rich.console import Console
 
 from emulator import analyze as subject
 from emulator.analyze import FASTEST, analysis_table, analyze, analyze_graph
+from emulator.records.period_figures import KeyFigure
+from emulator.records.run_folder import FORMAT
+from emulator.records.verdicts import Record, Verdict
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 
@@ -210,6 +215,9 @@ def test_a_network_of_the_published_character() -> None:
 def write_metrics(folder: Path, deviation_m: list[float | None]) -> Path:
     pq.write_table(pa.table({"deviation_m": pa.array(deviation_m, pa.float64())}), folder / "metrics.parquet")
     (folder / "scenario.toml").write_text('program.entry = "agents.cooperative:main"\n')
+    shown = [KeyFigure("deviation_m", "deviation", of_agreement=True)]
+    record = Record(FORMAT, Verdict.VALID, [], [], "", 1.0, 1.0, 1, 7, {}, {}, "", key_figures=shown)
+    (folder / "verdict.json").write_text(json.dumps(asdict(record)))
     return folder
 
 
