@@ -155,7 +155,8 @@ def emulator(
 
 
 def _announce(scenario: Scenario, asked: OutputOptions) -> None:
-    """Say what is going to run, before anything that takes time."""
+    """Say what is going to run, before anything that takes time. Raises ScenarioError where an extra is missing."""
+    scenario.require_extras()
     run = scenario.run
     if not asked.only_the_result:
         say_first(f"{run.name}: {run.pacing}, seed {run.seed}, {run.duration_s:g} s of emulated time")

@@ -29,7 +29,8 @@ from emulator.scenario.radio import (
 from emulator.scenario.sections import DAY_S, FAR_M, Section, Switch
 from emulator.scenario.sidelink import CrLimit, Sidelink
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
-from vnet.errors import ProgramError, shown
+from vnet.errors import ProgramError, ScenarioError, shown
+from vnet.extras import require
 from vnet.gateway import PYTHON_FLAGS, python_words
 from vnet.units import NS_PER_MS, NS_PER_S, Grid
 
@@ -394,6 +395,13 @@ class Scenario(Section):
     def has_gateways(self) -> bool:
         """True if programs speak Zenoh to gateways, and not as agents to the emulator."""
         return self.program.kind == "zenoh" and self.run.pacing == "realtime"
+
+    def require_extras(self) -> None:
+        """Raise ScenarioError in one line where what the scenario needs is in an extra that is not installed."""
+        if self.radio.is_physical:
+            require("a physical radio (radio.path_loss, radio.mac)", "scipy", error=ScenarioError)
+        if self.network.kind == "city":
+            require("a generated city", "scipy", error=ScenarioError)
 
     def options_of(self, node: str) -> dict[str, Any]:
         """Return the options of a node's program: those of the scenario, or what a Zenoh program is run with."""

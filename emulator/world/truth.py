@@ -18,7 +18,6 @@ from emulator.world.projection import CoordinateFrame
 from emulator.world.radio_inputs import RadioInputs, load_buildings, load_links
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names, shown
-from vnet.extras import require
 from vnet.node import NOTHING_SENSED, Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
@@ -96,8 +95,7 @@ class World:
         self.lane_of = lane_of
         self.notes = motion.notes
         self.course_m, self._heading_rad = motion.position_m, motion.heading_rad
-        if scenario.radio.is_physical:
-            require("a physical radio (radio.path_loss, radio.mac)", "scipy", error=ScenarioError)
+        scenario.require_extras()
         buildings = load_buildings(scenario, frame, self.area_m)
         self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings, scenario.roadside)
         if buildings is not None and not len(buildings):

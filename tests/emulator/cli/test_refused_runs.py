@@ -47,6 +47,14 @@ def test_a_debugger_needs_a_terminal(command: str) -> None:
     assert not Path("runs").exists()
 
 
+@pytest.mark.parametrize("command", ["run", "simulate"])
+def test_a_missing_extra_is_the_only_line(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vnet.extras.is_installed", lambda library: library != "scipy")
+    status, stderr = vnet(command, "80211p", "--duration", "1")
+    assert status == 2 and stderr.startswith("vnet: a physical radio (radio.path_loss, radio.mac) needs scipy: pip")
+    assert stderr.count("\n") == 1
+
+
 def test_users_of_a_run_are_made_for_its_program(here: Path) -> None:
     assert vnet("access", BEACON, "--program", "good:main", "--out", "access")[0] == 0
     assert (here / "access" / "credentials").is_dir()
