@@ -203,34 +203,36 @@ def check_kept_up(recorded: RecordedRun) -> Finding:
 
 
 def check_liveness(recorded: RecordedRun) -> Finding:
-    """Check that after the last fault every node that is up reports at least once a second."""
+    """Check that after the last fault every node that is up goes on reporting, at least once a second."""
     if not recorded.reported.any():
         return not_exercised("the program reports nothing")
     window = max(2, -(-LIVENESS_NS // recorded.scenario.period_ns))
-    judged = _expected_to_report(recorded, window)
-    if not judged.any():
+    longest = _longest_silence(recorded, window)
+    if not longest.any():
         return not_exercised("no program reports once a second")
     start_ns = recorded.period_starts_ns()
     rested = np.flatnonzero(start_ns >= recorded.last_heal_ns)
     if len(rested) < window:
         return not_exercised("less than a second is left after the last fault")
     silent: list[dict[str, Any]] = []
-    for node in np.flatnonzero(judged).tolist():
+    for node in np.flatnonzero(longest).tolist():
         for from_ns, until_ns in _times_up(recorded, node):
             mine = rested[(start_ns[rested] >= from_ns) & (start_ns[rested] < until_ns)]
             reports = mine[recorded.reported[mine, node]]
             if not recorded.plan and (len(reports) or len(mine) < START_UP_NS // recorded.scenario.period_ns):
                 mine = mine[mine >= reports.min(initial=recorded.periods)]  # it may take its time at the start
             edges = [int(mine[0]) - 1, *reports.tolist(), int(mine[-1]) + 1] if len(mine) else []
-            gaps = [(before, after) for before, after in pairwise(edges) if after - before > window]
+            gaps = [(before, after) for before, after in pairwise(edges) if after - before > longest[node]]
             if gaps:
                 before, after = gaps[0]
                 silent.append({"node": recorded.node_ids[node], "last_period": before, "next_period": after})
                 break
-    count = int(judged.sum())
-    text = f"{counted(count, 'node')} reported at least once a second after the last fault"
-    if not recorded.plan:
-        text = f"{counted(count, 'node')} reported at least once a second"
+    count, most_s = int(np.count_nonzero(longest)), longest.max() * recorded.scenario.period_ns / NS_PER_S
+    text = (
+        f"{counted(count, 'node')} reported at least once {f'every {most_s:.1f} s' if most_s > 1 else 'a second'}"
+    )
+    if recorded.plan:
+        text += " after the last fault"
     broken_text = f"{len(silent)} of {counted(count, 'node')} silent for over a second, {_where(silent)}"
     return result(len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
 
@@ -239,19 +241,23 @@ def _where(silent: list[dict[str, Any]]) -> str:
     return f"{silent[0]['node']} from period {silent[0]['last_period'] + 1}" if silent else ""
 
 
-def _expected_to_report(recorded: RecordedRun, window: int) -> Mask:
-    """Nodes that report once a second at some time, and nodes taken by a fault whose program does elsewhere."""
-    able = np.zeros(len(recorded.node_ids), dtype=bool)
-    for node in range(len(able)):
-        periods = np.flatnonzero(recorded.reported[:, node])
-        able[node] = len(periods) > 1 and bool((np.diff(periods) <= window).any())
+def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
+    """Periods (N,) that nodes may be silent: `window`, or twice their usual time between reports; 0 for ever.
+
+    Not for ever may nodes that report within `window` at some time, and those taken by a fault whose program does
+    elsewhere.
+    """
+    longest = np.zeros(len(recorded.node_ids), dtype=np.intp)
+    for node in range(len(longest)):
+        apart = np.diff(np.flatnonzero(recorded.reported[:, node]))
+        if len(apart) and apart.min() <= window:
+            longest[node] = max(window, 2 * np.median(apart))
     programs = [recorded.scenario.program.of(node).entry for node in recorded.node_ids]
-    reporting = {programs[node] for node in np.flatnonzero(able)}
-    taken = np.zeros(len(able), dtype=bool)
+    of_program = {program: longest[[each == program for each in programs]].max() for program in programs}
+    taken = np.zeros(len(longest), dtype=bool)
     for planned in recorded.plan:
         taken |= planned.nodes
-    elsewhere = np.array([program in reporting for program in programs], dtype=bool)
-    return np.asarray(able | (taken & elsewhere))
+    return np.where(taken & (longest == 0), [of_program[program] for program in programs], longest)
 
 
 def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:

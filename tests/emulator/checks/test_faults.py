@@ -487,6 +487,21 @@ def test_a_short_silence_and_a_death_are_no_lack_of_liveness() -> None:
     assert verdict(without_reports(dead, "v03", 4.5), "liveness") is Verdict.VALID
 
 
+async def about_once_a_second(node: Node) -> None:
+    """Report every 0.9 to 1.1 s; one vehicle is silent for the last three seconds."""
+    number = int(node.id[1:])
+    async for fix in node.gnss:
+        period = round(fix.time_ns / 1e8)
+        if (period + number) % 30 in (0, 9, 20) and (node.id != "v03" or period < 30):
+            node.report(fix.position_m, fix.covariance_m2)
+
+
+def test_a_program_that_reports_about_once_a_second_is_alive_until_it_falls_silent() -> None:
+    recorded = simulated(program=f"{__name__}:about_once_a_second")
+    found = checked(recorded, "liveness")
+    assert found.verdict is Verdict.INVALID and [row["node"] for row in found.figures["rows"]] == ["v03"]
+
+
 async def starts_late_and_ends(node: Node) -> None:
     """Report from the third second on; one vehicle ends right after a report."""
     async for fix in node.gnss:
