@@ -462,6 +462,7 @@ def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
         for act in (
             lambda: session.put("a", "b", priority=5),
             lambda: session.get("a", target=5),
+            lambda: zenoh.open("a"),
             publisher.undeclare,
             publisher.undeclare,
             lambda: zenoh.ext.declare_advanced_publisher(session, "a").matching_status,
@@ -483,6 +484,7 @@ def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
         "MatchingStatus { matching: true }",
         "TypeError argument 'priority': 'int' object cannot be converted to 'Priority'",
         "TypeError argument 'target': 'int' object cannot be converted to 'QueryTarget'",
+        "TypeError argument 'config': 'str' object cannot be converted to 'Config'",
         "ZError Undeclared publisher",
         "AttributeError 'AdvancedPublisher' object has no such attribute in Zenoh",
         "SampleKind.PUT",

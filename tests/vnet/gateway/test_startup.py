@@ -49,6 +49,10 @@ def test_open_takes_all_that_zenohs_takes() -> None:
     assert done.stdout == SAYS, done.stderr
 
 
+def test_what_is_no_configuration_is_refused_by_zenoh_itself() -> None:
+    assert "argument 'config': 'str' object" in start(code="import zenoh\nzenoh.open('config.json5')").stderr
+
+
 def test_a_configuration_keeps_the_keys_of_tls_that_zenoh_does_not_write() -> None:
     """Without its private key a session cannot listen."""
     router = issue_certificates([], ["127.0.0.1"]).router

@@ -56,6 +56,7 @@ _TYPES: dict[str, type] = {
     "express": bool,
     "timestamp": zenoh.Timestamp,
     "target": zenoh.QueryTarget,
+    "config": zenoh.Config,
 }
 """Types of arguments that are of no other."""
 
@@ -399,6 +400,7 @@ class Session:
     """A session."""
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, config: zenoh.Config) -> None:
+        _check({"config": config})
         self.vehicle, self.outlet = vehicle, outlet
         self._entity_numbers = count(1)
         self._is_closed = False

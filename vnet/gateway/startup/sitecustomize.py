@@ -49,7 +49,8 @@ def open_with_override(zenoh: Any) -> None:
     opened = zenoh.open
 
     def open(config: Any, **options: Any) -> Any:
-        for setting in filter(None, os.environ.get("ZENOH_CONFIG_OVERRIDE", "").split(";")):
+        changes = os.environ.get("ZENOH_CONFIG_OVERRIDE", "") if isinstance(config, zenoh.Config) else ""
+        for setting in filter(None, changes.split(";")):
             config.insert_json5(*setting.split("=", 1))
         return opened(config, **options)
 
