@@ -242,22 +242,22 @@ def _where(silent: list[dict[str, Any]]) -> str:
 
 
 def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
-    """Periods (N,) that nodes may be silent: `window`, or twice their usual time between reports; 0 for ever.
+    """Periods (N,) that nodes may be silent: `window`, or twice their program's usual time between reports.
 
-    Not for ever may nodes that report within `window` at some time, and those taken by a fault whose program does
-    elsewhere.
+    0, for ever, unless a node reports within `window` at some time, or a fault took it and its program does
+    elsewhere. Three of four times between reports are no longer than the usual one.
     """
-    longest = np.zeros(len(recorded.node_ids), dtype=np.intp)
-    for node in range(len(longest)):
-        apart = np.diff(np.flatnonzero(recorded.reported[:, node]))
-        if len(apart) and apart.min() <= window:
-            longest[node] = max(window, 2 * np.median(apart))
     programs = [recorded.scenario.program.of(node).entry for node in recorded.node_ids]
-    of_program = {program: longest[[each == program for each in programs]].max() for program in programs}
-    taken = np.zeros(len(longest), dtype=bool)
+    apart = [np.diff(np.flatnonzero(reported)) for reported in recorded.reported.T]
+    able = np.array([bool((each <= window).any()) for each in apart])
+    longest: dict[str, int] = {}
+    for program in {programs[node] for node in np.flatnonzero(able)}:
+        its_own = [each for each, of in zip(apart, programs, strict=True) if of == program]
+        longest[program] = max(window, int(2 * np.percentile(np.concatenate(its_own), 75)))
+    taken = np.zeros(len(able), dtype=bool)
     for planned in recorded.plan:
         taken |= planned.nodes
-    return np.where(taken & (longest == 0), [of_program[program] for program in programs], longest)
+    return np.where(able | taken, [longest.get(program, 0) for program in programs], 0)
 
 
 def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
