@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from agents.cooperative.cmm.kalman_bound import KalmanBound, LaneModel, lane_axes
+from agents.cooperative.cmm.own_vehicle import INCREMENT_SHARE
 from agents.cooperative.cmm.plausibility import INCREMENT_FACTOR, PRIOR_FACTOR, SELF_SHARE
 from agents.cooperative.hears_all import lane_model
 from agents.cooperative.information_estimator import PASSED_SHARE
@@ -38,13 +39,15 @@ class Rules:
 
     loss: share of the frames that is lost. hops: hops that an increment goes, each takes a period; `FLOODED` for
     all, and then no priors are pooled: each increment counts once, wherever it is heard. hears_all: a vehicle hears
-    all others of its component. passed_share: share of an increment that is passed on which is added. self_share:
-    weight that a vehicle keeps for its own prior. is_cut: increments and priors are cut at some times the own.
+    all others of its component. increment_share: share of what a fix says that is told. passed_share: share of an
+    increment that is passed on which is added. self_share: weight that a vehicle keeps for its own prior. is_cut:
+    increments and priors are cut at some times the own.
     """
 
     loss: float = LOSS
     hops: int = 2
     hears_all: bool = False
+    increment_share: float = INCREMENT_SHARE
     passed_share: float = PASSED_SHARE
     self_share: float = SELF_SHARE
     is_cut: bool = True
@@ -53,7 +56,7 @@ class Rules:
 ORACLES: Mapping[str, Rules] = {
     "the program's rules": Rules(),
     "no frame lost": Rules(loss=0.0),
-    "no share, no cut": Rules(passed_share=1.0, self_share=0.0, is_cut=False),
+    "no share, no cut": Rules(increment_share=1.0, passed_share=1.0, self_share=0.0, is_cut=False),
     "a third hop": Rules(hops=3),
     "all hops, each increment once": Rules(hops=FLOODED),
     "all hops, once, no frame lost": Rules(hops=FLOODED, loss=0.0),
@@ -202,7 +205,7 @@ class Exchange:
         """Take the fixes (S, N, 2) of a period, and exchange what they say."""
         self.filters.predict()
         priors = self.filters.belief
-        increments = self.filters.take(fix_m)
+        increments = self._rules.increment_share * self.filters.take(fix_m)
         heard = self._hears & (self._rng.random(self._known.shape) >= self._rules.loss)
         if self._rules.hops == FLOODED:
             self.filters.absorb(priors + self._flooded(increments, heard))

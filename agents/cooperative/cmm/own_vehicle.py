@@ -18,6 +18,7 @@ from agents.cooperative.cmm.map_matching import candidate_lanes
 from agents.cooperative.cmm.own_kalman import OwnKalman
 from agents.cooperative.cmm.own_rbpf import OwnRbpf
 from agents.cooperative.cmm.own_vehicle_on_map import OwnVehicleOnMap
+from agents.cooperative.cmm.plausibility import scaled_by
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
@@ -31,6 +32,9 @@ LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest three agree."""
 LOST_FIXES = 5
 """Least number of consecutive outliers, where fixes are rare."""
+INCREMENT_SHARE = 0.9
+"""Share of what a fix says about c that is told: c moves between fixes, for all alike, and the part of that which
+filters take for offsets is an error that all increments have in common (Bar-Shalom 1981)."""
 OFF_ROAD_WALK_M = 20.0
 """Random walk (m/√s) of a vehicle that is on no road, across its direction: a fix tells nearly all of its place."""
 SAME_LANE_M = 0.3
@@ -133,7 +137,7 @@ class OwnVehicle:
         return self._filter.sample(count, self._rng)
 
     def step(self, dt_s: float, fix: Observation | None) -> Information:
-        """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
+        """Advance by `dt_s` and take the vehicle's own fix; returns the increment to tell, 0 for an outlier."""
         if fix is not None:
             self._suit(fix.multipath)
         self._filter.predict(dt_s)
@@ -166,7 +170,7 @@ class OwnVehicle:
         self._taken, self._untaken_s = [*self._taken[-1:], (self._untaken_s, fix)], 0.0
         self.took_fix = True
         self._go_on()
-        return increment
+        return Information(scaled_by(increment.numbers, INCREMENT_SHARE))
 
     def _is_likely(self, before: list[tuple[float, Observation]], fix: Observation, since_s: float) -> bool:
         """Tell whether the gate may judge a fix: on no road that allows for any turn, and fixes must lead there."""
