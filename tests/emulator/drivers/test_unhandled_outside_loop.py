@@ -100,9 +100,14 @@ async def ignores_the_end_of_a_generator(node: Node) -> None:
 
 async def fails_in_a_raw_thread(node: Node) -> None:
     await asyncio.sleep(0.5)
-    before = _thread._count()
-    _thread.start_new_thread(int, ("x",))
-    while _thread._count() > before:  # no object to join
+    before, begun = _thread._count(), threading.Event()
+
+    def fails() -> None:
+        begun.set()
+        int("x")
+
+    _thread.start_new_thread(fails, ())
+    while not begun.is_set() or _thread._count() > before:  # no object to join; it counts from its own beginning on
         os.sched_yield()
     await asyncio.sleep(0.1)
     await sends(node)
