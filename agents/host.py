@@ -163,7 +163,6 @@ class _RealTimeAgent:
         self._flush_pending = False
         self._started = False
         self._receipts = wire.Receipts()
-        """Batches with a late packet that the emulator has not been told of, and when they came."""
         self._sends: dict[tuple[str, int], int] = {}
         """Frames to single vehicles without a result, by node and number, and the `seq` with which they went."""
         self._unseen: dict[MessageRef, int] = {}
