@@ -554,8 +554,8 @@ def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str
     if isinstance(source, (str, Path)):
         return load_scenario(Path(source), overrides, checks)
     if isinstance(source, Scenario):
-        # Without defaults: another `kind` of a section has others.
-        source = source.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+        # Without what was not given: another `kind` of a section or program has other defaults.
+        source = source.model_dump(mode="json", exclude_none=True, exclude_unset=True)
     if not isinstance(source, Mapping):
         raise ScenarioError(f"scenario = {shown(source)}: a path, a shipped scenario's name, or a dict is needed")
     return scenario_from(deepcopy(dict(source)), DATA, overrides, checks=checks)

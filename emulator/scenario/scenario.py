@@ -299,12 +299,11 @@ class Scenario(Section):
     @classmethod
     def _zenoh_keeps_its_order(cls, data: Any) -> Any:
         """Fill in no jitter for Zenoh programs: Zenoh delivers what one of them puts in the order of putting."""
-        if not isinstance(data, dict) or not isinstance(program := data.get("program"), dict):
+        if not isinstance(data, dict) or not isinstance(radio := data.get("radio", {}), dict):
             return data
-        radio = data.get("radio", {})
-        if program.get("kind") != "zenoh" or not isinstance(radio, dict):
-            return data
-        return {**data, "radio": {"jitter_ms": 0.0, **radio}}
+        program = data.get("program")
+        kind = program.get("kind") if isinstance(program, dict) else getattr(program, "kind", None)
+        return {**data, "radio": {"jitter_ms": 0.0, **radio}} if kind == "zenoh" else data
 
     @model_validator(mode="after")
     def _faults_start_in_time(self) -> Scenario:

@@ -22,6 +22,16 @@ def test_a_path_a_name_data_and_a_scenario_are_sources() -> None:
     assert data == {"run": {"name": "mine"}}, "what the caller gave stays as it was"
 
 
+@pytest.mark.parametrize("jitter_ms", [None, 0.0, 1.0, 1.5])
+def test_what_was_given_stays_also_if_it_is_the_default_of_others(jitter_ms: float | None) -> None:
+    """Zenoh programs have no jitter by default, others 1 ms."""
+    radio = {} if jitter_ms is None else {"jitter_ms": jitter_ms}
+    data = {"program": {"kind": "zenoh", "command": ["python", "-m", "x"]}, "radio": radio}
+    given = scenario_of(data, {})
+    assert given.radio.jitter_ms == scenario_of(given, {"run.seed": 2}).radio.jitter_ms == (jitter_ms or 0.0)
+    assert scenario_of({"radio": radio}, {}).radio.jitter_ms == (1.0 if jitter_ms is None else jitter_ms)
+
+
 def test_values_of_all_kinds_reach_the_scenario() -> None:
     options = {"a b": [1, True, 'x"y\nz'], "none": {}, "path": Path("a/b"), "ratio": np.float32(0.5)}
     found = scenario_of({}, {"program.options": options, "network.vehicles": np.int64(7)})
