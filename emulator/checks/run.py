@@ -242,10 +242,10 @@ def _where(silent: list[dict[str, Any]]) -> str:
 
 
 def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
-    """Periods (N,) that nodes may be silent: `window`, or twice their program's usual time between reports.
+    """Periods (N,) that nodes may be silent: `window`, or up to twice that by twice their program's usual time.
 
     0, for ever, unless a node reports within `window` at some time, or a fault took it and its program does
-    elsewhere. Three of four times between reports are no longer than the usual one.
+    elsewhere. The usual time is that which three of four times between reports do not exceed.
     """
     programs = [recorded.scenario.program.of(node).entry for node in recorded.node_ids]
     apart = [np.diff(np.flatnonzero(reported)) for reported in recorded.reported.T]
@@ -253,7 +253,8 @@ def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
     longest: dict[str, int] = {}
     for program in {programs[node] for node in np.flatnonzero(able)}:
         its_own = [each for each, of in zip(apart, programs, strict=True) if of == program]
-        longest[program] = max(window, int(2 * np.percentile(np.concatenate(its_own), 75)))
+        usual = np.percentile(np.concatenate(its_own), 75)
+        longest[program] = min(max(window, int(2 * usual)), 2 * window)
     taken = np.zeros(len(able), dtype=bool)
     for planned in recorded.plan:
         taken |= planned.nodes

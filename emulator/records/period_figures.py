@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, make_dataclass
 from functools import cache, partial
 from itertools import starmap
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from emulator.scenario.own_functions import CONSTANT, declared, load_entry
 from emulator.scenario.program import Program
-from emulator.scenario.sections import first_problem
+from emulator.scenario.sections import FAR_M, first_problem
 from emulator.world.world import Instant
 from vnet.errors import ScenarioError, VnetError, printable
 from vnet.types import Array
@@ -113,33 +113,36 @@ class ReportedColumn:
     text: str
 
 
+_Shown = Annotated[str, AfterValidator(partial(printable, longest=LONGEST_SHOWN))]
+_Name = Annotated[str, Field(pattern=r"^[\w.-]{1,64}$")]
+_Length = Annotated[float, Field(gt=0, le=FAR_M)]
+_FEW = Field(max_length=64)
+
+
 @dataclass(frozen=True)
 class Estimate:
     """An estimate of two lengths that a recording shows around the truth: columns of the states by their names."""
 
-    name: str
-    title: str
-    estimate: str
-    covariance: str
-    truth: str
-    rings_m: tuple[float, ...]
-    view_m: float
+    name: _Name
+    title: _Shown
+    estimate: _Name
+    covariance: _Name
+    truth: _Name
+    rings_m: Annotated[tuple[_Length, ...], Field(min_length=1, max_length=64)]
+    view_m: _Length
     """Half of what the view shows at first."""
-    cloud: str = ""
+    cloud: _Name | Literal[""] = ""
     """Column of points, x and y in turns."""
-
-
-_Shown = Annotated[str, AfterValidator(partial(printable, longest=LONGEST_SHOWN))]
 
 
 @dataclass(frozen=True)
 class DeclaredChart:
     """A chart of figures that belong together: `lines` are their names by label."""
 
-    id: Annotated[str, Field(pattern=r"^[\w.-]{1,64}$")]
+    id: _Name
     title: _Shown
     axis: _Shown
-    lines: Annotated[Mapping[_Shown, str], Field(min_length=1)]
+    lines: Annotated[Mapping[_Shown, _Name], Field(min_length=1, max_length=64)]
     text: _Shown
     """Its caption."""
 
@@ -148,11 +151,11 @@ class DeclaredChart:
 class Views:
     """A program's declarations that report, picture and recording show: a run's folder and its scene have them."""
 
-    peers: tuple[str, ...] = ()
+    peers: Annotated[tuple[_Name, ...], _FEW] = ()
     """Names before a dot that stand for one value of each pair of vehicles: they stay in `values`."""
-    charts: tuple[DeclaredChart, ...] = ()
+    charts: Annotated[tuple[DeclaredChart, ...], _FEW] = ()
     """Charts of report, picture and recording."""
-    estimates: tuple[Estimate, ...] = ()
+    estimates: Annotated[tuple[Estimate, ...], _FEW] = ()
     """Estimates that a recording shows around the truth, beside positions."""
 
 

@@ -85,7 +85,9 @@ class PeriodArrays:
 
     def _column(self, name: str, size: int) -> Floats:
         found = self.message.get(name, self.message.get("columns", {}).get(name))
-        return np.full((len(self.node_ids), size), np.nan, np.float32) if found is None else unpack(found, size)
+        if not isinstance(found, bytes) or len(found) != 4 * size * len(self.node_ids):
+            return np.full((len(self.node_ids), size), np.nan, np.float32)
+        return unpack(found, size)
 
     def numbers(self, name: str) -> Floats:
         """One of the (n,) arrays."""

@@ -305,7 +305,13 @@ def check_trust(settings: ZenohSessions) -> None:
     command.check_hostname = False
     command.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # as Zenoh, which takes any certificate for an authority
     try:
-        router.load_cert_chain(settings.certificate, settings.private_key)
+        router.load_cert_chain(settings.certificate, settings.private_key, password="")
+    except OSError as error:
+        raise ProgramError(
+            f"program.zenoh: private_key = {shown(str(settings.private_key))} is encrypted, or not that of "
+            f"certificate = {shown(str(settings.certificate))}: {error}"
+        ) from None
+    try:
         command.load_verify_locations(settings.authority)
         up, down = ssl.MemoryBIO(), ssl.MemoryBIO()
         for side in (command.wrap_bio(down, up), router.wrap_bio(up, down, server_side=True)) * 2:

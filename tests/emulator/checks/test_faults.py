@@ -502,6 +502,18 @@ def test_a_program_that_reports_about_once_a_second_is_alive_until_it_falls_sile
     assert found.verdict is Verdict.INVALID and [row["node"] for row in found.figures["rows"]] == ["v03"]
 
 
+async def nearly_stops(node: Node) -> None:
+    """Report in the first four periods, and every three seconds after them."""
+    async for fix in node.gnss:
+        period = round(fix.time_ns / 1e8)
+        if period < 4 or period % 30 == 0:
+            node.report(fix.position_m, fix.covariance_m2)
+
+
+def test_a_program_that_nearly_stops_is_not_its_own_measure() -> None:
+    assert verdict(simulated(program=f"{__name__}:nearly_stops"), "liveness") is Verdict.INVALID
+
+
 async def starts_late_and_ends(node: Node) -> None:
     """Report from the third second on; one vehicle ends right after a report."""
     async for fix in node.gnss:

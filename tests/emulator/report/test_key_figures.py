@@ -16,7 +16,7 @@ from emulator.api import simulate_into
 from emulator.checks.judge import check_run
 from emulator.drivers.session import Session
 from emulator.drivers.status import Course
-from emulator.records.period_figures import program_figures
+from emulator.records.period_figures import program_figures, views_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.figures import figures_of
@@ -26,9 +26,11 @@ from emulator.report.sweep_page import heading
 from emulator.report.write import report_page
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
+from emulator.stream.messages import pack
 from emulator.stream.playback import messages
 from emulator.terminal import summary
 from emulator.terminal.dashboard import Dashboard
+from emulator.viewer.drawing import PeriodArrays
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from tests.support.recordings import read_back
@@ -124,6 +126,34 @@ def test_views_of_a_folder_that_cannot_be_are_one_line(run: Path, tmp_path: Path
         (folder / "verdict.json").write_text(json.dumps(wrong))
         with pytest.raises(VnetError, match=rf"verdict\.json: views\.charts\.0\.{change}"):
             _ = RecordedRun.open(folder).record
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "../../a b"},
+        {"rings_m": []},
+        {"rings_m": [float("nan")]},
+        {"view_m": 0.0},
+        {"covariance": "x" * 65},
+    ],
+    ids=str,
+)
+def test_estimates_of_a_folder_are_bounded(change: dict[str, Any]) -> None:
+    declared = {"name": "common", "title": "common error", "estimate": "a_m", "covariance": "b_m2", "truth": "c_m"}
+    good = {**declared, "rings_m": [1.0], "view_m": 2.0}
+    assert views_of({"estimates": [good], "peers": ["weight"] * 64}).estimates[0].cloud == ""
+    with pytest.raises(VnetError, match=r"^views: estimates\.0\."):
+        views_of({"estimates": [{**good, **change}]})
+    with pytest.raises(VnetError, match=r"^views: peers"):
+        views_of({"peers": ["weight"] * 65})
+
+
+def test_a_column_of_another_size_is_as_good_as_none() -> None:
+    """A folder may name any column as an estimate."""
+    period = PeriodArrays({"a": pack(np.ones((2, 4))), "node_ids": ["v1"]}, ["v1", "v2"])
+    assert np.isnan(period.points("a")).all() and np.isnan(period.covariances("node_ids")).all()
+    assert (period.covariances("a") == 1).all()
 
 
 class Wrong:

@@ -3,18 +3,26 @@
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 import zenoh
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
 
-from emulator.drivers.live.gateway import Gateway
+from emulator.drivers.live.gateway import Gateway, check_trust
 from emulator.scenario.program import ZenohSessions
 from vnet.errors import ProgramError
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments
 from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY, check_keys
 from vnet.gateway.ros2 import ROS2_KEYS, Ros2
+from vnet.transport.authority import issue_certificates
 from vnet.transport.wire import WireFix
 from vnet.units import NS_PER_S
 
@@ -424,3 +432,16 @@ def test_an_exception_on_a_thread_of_zenohs_is_told(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("emulator.drivers.live.gateway.crossing_sample", lambda *_: 1 / 0)
     assert isinstance(asyncio.run(first_bug()), ZeroDivisionError)
+
+
+def test_an_encrypted_private_key_is_named_and_no_password_is_asked_for(tmp_path: Path) -> None:
+    issued = issue_certificates([], ["127.0.0.1"])
+    key = load_pem_private_key(issued.router.private_key.encode(), None)
+    locked = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
+    files = {"certificate": issued.router.certificate.encode(), "private_key": locked}
+    files["authority"] = issued.authority.encode()
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    settings = ZenohSessions(listen="tls/127.0.0.1:0", **{name: tmp_path / name for name in files})
+    with pytest.raises(ProgramError, match="private_key' is encrypted"):
+        check_trust(settings)
