@@ -60,6 +60,8 @@ ZENOH_ENTRY = "vnet.gateway.emulated:main"
 _ENTRY = "agents.beacon:main"
 PYTHON = ("python", "python3")
 """First words of a command that stand for the interpreter of vnet."""
+PYTHON_NAME = re.compile(r"python(3(\.\d+)?)?")
+"""Names of interpreters, all of which stand for that of vnet on virtual time: a folder may come from elsewhere."""
 PLACEHOLDER = re.compile(r"\{[a-z_]+\}", re.IGNORECASE)
 """A word that is meant to be filled in. Within a word braces may be a program's own."""
 

@@ -6,7 +6,6 @@ One frozen model a section. What is wrong becomes a `ScenarioError` of one line:
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,7 @@ from pydantic import Field, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.network import Driven, Map, Network
-from emulator.scenario.program import PYTHON, Backbone, Program, RoadsideUnit, Ros2Topics, with_names
+from emulator.scenario.program import PYTHON_NAME, Backbone, Program, RoadsideUnit, Ros2Topics, with_names
 from emulator.scenario.radio import (
     RATES_MBPS,
     Buildings,
@@ -329,7 +328,7 @@ class Scenario(Section):
             if not self.program.commands:
                 raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
             for words in self.program.all_commands:
-                if words[0] not in (*PYTHON, sys.executable) or not python_words(words):
+                if not PYTHON_NAME.fullmatch(Path(words[0]).name) or not python_words(words):
                     raise ValueError(
                         f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT … "
                         f"or python -m MODULE …, perhaps with {' '.join(sorted(PYTHON_FLAGS))}; any other needs "

@@ -45,7 +45,7 @@ def run(found: Worlds, rules: Rules) -> Exchange:
 
 def test_alone_a_vehicle_is_the_bound() -> None:
     found = world(np.ones((1, 1), dtype=bool))
-    exchange, bound = run(found, Rules()), KalmanBound(np.zeros((1, 2)), np.zeros(1))
+    exchange, bound = run(found, Rules(increment_share=1.0)), KalmanBound(np.zeros((1, 2)), np.zeros(1))
     for period, fix_m in enumerate(found.fix_m[:, 1]):
         bound.step(0.1 if period else 0.0, fix_m, np.eye(2))
     np.testing.assert_allclose(exchange.filters.mean[1, 0, :2], bound.common_m, atol=0.05)

@@ -127,7 +127,8 @@ def test_what_is_served_is_served_here_only_and_nothing_of_it_outlives_an_emulat
 
 def test_the_server_of_web_pages_ends_with_an_observer_that_is_killed(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    with started(write(tmp_path, [], **LONG), folder, "--rerun", "serve", after="started") as process:
+    long = {**LONG, "run": {**LONG["run"], "duration_s": 150.0}}
+    with started(write(tmp_path, [], **long), folder, "--rerun", "serve", after="started") as process:
         wait_for_recording(folder, process)
         observer = observer_of(folder)
         (pages,) = descendants(observer) - {observer}

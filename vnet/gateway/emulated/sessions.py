@@ -64,7 +64,7 @@ _TYPES: dict[str, type] = {
 def _check(options: Mapping[str, object]) -> None:
     """Raise TypeError for an option of another type, and ZError for one that virtual time does not have."""
     for name, value in options.items():
-        if value is None:
+        if value is None and name != "config":
             continue
         if name == "timestamp_instrumentation":
             raise zenoh.ZError(f"{name} is not available on virtual time: sessions have no transport")
@@ -360,6 +360,7 @@ class Querier(Sending):
         self._matches = partial(session.vehicle.matches_queryable, self.key_expr, all_complete)
         self.accept_replies = accept_replies or zenoh.ReplyKeyExpr.DEFAULT
         self._options = {**options, "target": target, "accept_replies": accept_replies}
+        _check(self._options)
 
     accept_replies: zenoh.ReplyKeyExpr
 
