@@ -84,7 +84,7 @@ class Source(OpenedRun):
         """(periods,) a column of the metrics; NaN where nobody reported. Raises VnetError if nobody ever did."""
         if name not in self.metrics.column_names:
             raise NothingToShow("no program reported what it needs")
-        if not pa.types.is_floating(self.metrics[name].type):
+        if not (pa.types.is_floating(kind := self.metrics[name].type) or pa.types.is_integer(kind)):
             raise VnetError(f"{name} is no number a period")
         column = np.asarray(self.metrics[name].cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=float)
         if not np.isfinite(column).any():

@@ -16,6 +16,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial, wraps
 from typing import Any
 
@@ -62,6 +63,8 @@ _objects = 0
 _found_frozen = 0
 """Blocks since others were last found to have frozen objects, with that one; 0 if they were found to have none."""
 _takers: weakref.WeakKeyDictionary[Node, weakref.WeakMethod[Taker]] = weakref.WeakKeyDictionary()
+is_nobodys: ContextVar[bool] = ContextVar("is_nobodys", default=False)
+"""True where threads are started that serve all nodes of a process, whichever asks first."""
 _started_by: weakref.WeakKeyDictionary[threading.Thread, Node] = weakref.WeakKeyDictionary()
 _watchers = 0
 _before: tuple[Any, Any] = (sys.unraisablehook, threading.excepthook)
@@ -170,7 +173,7 @@ def detach() -> None:
 
 @wraps(_start_thread)
 def _start_noted(thread: threading.Thread) -> None:
-    owner = present_node()
+    owner = None if is_nobodys.get() else present_node()
     if owner is not None:
         _started_by[thread] = owner
     _start_thread(thread)

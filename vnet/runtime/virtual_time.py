@@ -30,7 +30,7 @@ from weakref import WeakKeyDictionary
 from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NodeHandle, NumberedTimer
-from vnet.runtime.outside_loop import collected_by_schedule, collector
+from vnet.runtime.outside_loop import collected_by_schedule, collector, is_nobodys
 from vnet.runtime.own_asyncio import Future, Task, current_node, present_node
 from vnet.runtime.ready_queue import CpuMeter, EventChooser, OrderedQueue, ReadyQueue
 from vnet.transport.wire import ClockError, Deviation
@@ -56,6 +56,13 @@ class SpinError(VirtualTimeError):
 
 class LoopAbandonedError(VirtualTimeError):
     """A loop that was told to end, but whose tasks still wait for something."""
+
+
+def _submitting(executor: Executor | None) -> Context:
+    """Return the context in which a job is submitted: the default executor's threads are nobody's."""
+    context = Context() if executor is None else copy_context()
+    context.run(is_nobodys.set, executor is None)
+    return context
 
 
 class SkewedLoop(asyncio.SelectorEventLoop):
@@ -193,8 +200,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         self, executor: Executor | None, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
         """Run a job as asyncio does; the future knows on whose behalf."""
-        context = Context() if executor is None else copy_context()  # the default executor's threads are nobody's
-        outer = context.run(super().run_in_executor, executor, func, *args)
+        outer = _submitting(executor).run(super().run_in_executor, executor, func, *args)
         if isinstance(outer, Future):
             outer.job_context = copy_context()
         return outer
@@ -466,10 +472,9 @@ class VirtualTimeLoop(SkewedLoop):
     ) -> asyncio.Future[Any]:
         """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
         self.before_job()
+        context = _submitting(executor)
         if executor is None:
-            executor, context = asyncio_internals.default_executor(self, "vnet"), Context()  # as above
-        else:
-            context = copy_context()
+            executor = asyncio_internals.default_executor(self, "vnet")
         job = context.run(executor.submit, func, *args)
         outer = Future(loop=self)
         outer.job_context = copy_context()

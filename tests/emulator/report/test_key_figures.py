@@ -108,6 +108,7 @@ def test_a_folder_shows_declared_charts_where_the_program_is_not_installed(run: 
     (folder / "scenario.toml").write_text(text.replace(__name__, "not_installed"))
     assert "Middle of all vehicles" in report_page(Source(folder))
     assert figures_of(Source(folder))["middle"][0] == "Middle of all vehicles"  # those of the picture
+    assert Source(folder).metric("reporting").max() > 0, "whole numbers are drawn, too"
     with Recorder(Sinks(save=tmp_path / "run.rrd"), "run") as recorder:
         for stream, message in messages(folder):
             recorder.take(stream, message)
