@@ -388,7 +388,8 @@ class Kill(ProcessFault):
 class Restart(ProcessFault):
     """The programs are ended in order, so that their `finally` blocks run; else as `kill`.
 
-    Zenoh programs are ended by SIGTERM, at which Python runs nothing more unless the program handles it.
+    Zenoh programs are ended by SIGTERM, at which Python runs nothing more, unless in real time the program
+    handles it.
     """
 
     ends: ClassVar[bool] = True

@@ -554,8 +554,11 @@ def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str
     if isinstance(source, (str, Path)):
         return load_scenario(Path(source), overrides, checks)
     if isinstance(source, Scenario):
-        # Without what was not given: another `kind` of a section or program has other defaults.
-        source = source.model_dump(mode="json", exclude_none=True, exclude_unset=True)
+        # Without defaults: another `kind` of a section has others. What is the default for some programs stays.
+        data = source.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+        if source.program.kind == "zenoh":
+            data.setdefault("radio", {})["jitter_ms"] = source.radio.jitter_ms
+        source = data
     if not isinstance(source, Mapping):
         raise ScenarioError(f"scenario = {shown(source)}: a path, a shipped scenario's name, or a dict is needed")
     return scenario_from(deepcopy(dict(source)), DATA, overrides, checks=checks)

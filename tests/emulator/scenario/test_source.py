@@ -32,6 +32,15 @@ def test_what_was_given_stays_also_if_it_is_the_default_of_others(jitter_ms: flo
     assert scenario_of({"radio": radio}, {}).radio.jitter_ms == (1.0 if jitter_ms is None else jitter_ms)
 
 
+def test_a_resolved_scenario_may_have_another_kind_of_radio() -> None:
+    """It has all keys of its own kind, which another kind does not have."""
+    whole = scenario_of(
+        scenario_of({"radio": {"mac": {"kind": "lte-mode4"}}}, {}).model_dump(mode="json", exclude_none=True), {}
+    )
+    other = scenario_of(whole, {"radio.mac.kind": "80211p"})
+    assert other.radio.sidelink is None and other.radio.mac is not None
+
+
 def test_values_of_all_kinds_reach_the_scenario() -> None:
     options = {"a b": [1, True, 'x"y\nz'], "none": {}, "path": Path("a/b"), "ratio": np.float32(0.5)}
     found = scenario_of({}, {"program.options": options, "network.vehicles": np.int64(7)})
