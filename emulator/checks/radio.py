@@ -324,7 +324,10 @@ def _audible(air: _Air, rows: NDArray[np.intp]) -> Mask:
 
 
 def _collided_alone(air: _Air) -> NDArray[np.intp]:
-    """Rows that collided with nothing; a receiver out of whose range all were may have sent what has no row."""
+    """Return the rows of frames that collided though their receiver could hear no other transmission.
+
+    A frame that nobody is in range of has no row: receivers that sent such frames may have collided with their own.
+    """
     recorded = air.recorded
     seen = recorded.places.always_in_range[recorded.receiver]
     rows = np.flatnonzero(recorded.outcome_is("collided") & recorded.placed & seen)

@@ -657,7 +657,7 @@ class Emulation:
         self._log_changes(time_ns, active)
         absent = self._absent(time_ns // self.world.period_ns)
         killed = self._nodes_under(active, lambda fault: fault.forced)
-        # SIGTERM ends a Zenoh program in real time, and so does what stands for it: no `finally` block runs.
+        # In real time SIGTERM ends a Zenoh program without its `finally` blocks; virtual time does the same.
         goes_hard = self.scenario.program.kind == "zenoh" and not self.scenario.has_gateways
         changes = self.presence.change(self._nodes_under(active, lambda fault: fault.ends), absent)
         for node in changes.stopped:
