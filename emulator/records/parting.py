@@ -20,7 +20,6 @@ from vnet.units import NS_PER_S
 
 FRAME = ("sent_ns", "sender", "seq", "size_bytes", "payload_digest")
 RECEPTION = ("sent_ns", "sender", "seq", "copy", "receiver", "outcome", "cause", "arrival_ns")
-EITHER = tuple(dict.fromkeys((*FRAME, *RECEPTION)))
 MOST_BEFORE = 8
 """Events and frames that are told of before a parting."""
 
@@ -44,7 +43,8 @@ def partings(first: OpenedRun, second: OpenedRun) -> list[Parting]:
     """
     found = [
         _first_entry("decision", _decisions(first), _decisions(second)),
-        *_first_in_traces(first, second),
+        first_frame(first, second),
+        _first_reception(first, second),
         _first_entry("event", _events(first), _events(second)),
         _first_vehicle(first, second),
         _first_value(first.states, second.states),
@@ -125,38 +125,41 @@ Row = dict[str, Any]
 
 def first_frame(first: OpenedRun, second: OpenedRun) -> Parting | None:
     """Return the first frame in which two runs differ."""
-    return next((each for each in _first_in_traces(first, second) if each and each.kind == "frame"), None)
+    frames = [_distinct(run.trace.select(FRAME)) for run in (first, second)]
+    return _first_row("frame", frames, [each["sent_ns"] for each in frames], _frame)
 
 
-def _first_in_traces(first: OpenedRun, second: OpenedRun) -> Iterator[Parting | None]:
-    """Yield the first frame and the first reception that differ."""
-    traces = first.trace.select(EITHER), second.trace.select(EITHER)
-    row = first_difference(*traces)
-    if row is not None:
-        sent_ns = [trace["sent_ns"] for trace in traces]
-        known_ns = [pc.coalesce(trace["arrival_ns"], trace["sent_ns"]) for trace in traces]
-        yield _first_row("frame", traces, sent_ns, row, _frames)
-        yield _first_row("reception", traces, known_ns, row, _receptions)
+def _first_reception(first: OpenedRun, second: OpenedRun) -> Parting | None:
+    """Return the first reception in which two runs differ."""
+    traces = [run.trace.select(RECEPTION) for run in (first, second)]
+    known_ns = [pc.coalesce(trace["arrival_ns"], trace["sent_ns"]) for trace in traces]
+    return _first_row("reception", traces, known_ns, _reception)
+
+
+def _distinct(table: pa.Table) -> pa.Table:
+    """Return the rows of a table, each once, in the order of their values."""
+    place = table.column_names.index("sender")
+    table = table.set_column(place, "sender", table["sender"].cast(pa.string()))
+    names = table.column_names
+    return table.group_by(names).aggregate([]).select(names).sort_by([(name, "ascending") for name in names])
 
 
 def _first_row(
-    kind: str,
-    traces: Sequence[pa.Table],
-    times: Sequence[pa.ChunkedArray],
-    row: int,
-    entries: Callable[[Sequence[Row]], Sequence[Entry]],
+    kind: str, tables: Sequence[pa.Table], times: Sequence[pa.ChunkedArray], entry: Callable[[Row], Entry]
 ) -> Parting | None:
-    """Return the first entry in which two traces differ, whose rows before `row` are the same and have these times.
+    """Return the first entry in which two tables differ, whose rows are known at these times.
 
-    Traces may have millions of rows, so entries are made an instant at a time, of those that later rows are of.
+    Tables may have millions of rows, so entries are made an instant at a time, of those that rows from the first
+    difference on are of: the rows before it are the same.
     """
+    row = first_difference(*tables)
     times_ns = [each.to_numpy() for each in times]
     orders = [np.argsort(each, kind="stable") for each in times_ns]
-    for instant in np.unique(np.concatenate([each[row:] for each in times_ns])):
+    for instant in () if row is None else np.unique(np.concatenate([each[row:] for each in times_ns])):
         found = []
-        for trace, time_ns, order in zip(traces, times_ns, orders, strict=True):
+        for table, time_ns, order in zip(tables, times_ns, orders, strict=True):
             start, end = (np.searchsorted(time_ns, instant, side, sorter=order) for side in ("left", "right"))
-            found.append(entries(trace.take(order[start:end]).to_pylist()))
+            found.append(sorted(map(entry, table.take(order[start:end]).to_pylist())))
         if (parting := _first_entry(kind, *found)) is not None:
             return parting
     return None
@@ -185,14 +188,6 @@ def _first_differing(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> int | No
         return index if index >= 0 else None
     pairs = zip_longest(ours.to_pylist(), theirs.to_pylist())
     return next((number for number, (a, b) in enumerate(pairs) if a != b and str(a) != str(b)), None)
-
-
-def _frames(rows: Sequence[Row]) -> list[Entry]:
-    return sorted({_frame(row) for row in rows})
-
-
-def _receptions(rows: Sequence[Row]) -> list[Entry]:
-    return sorted(_reception(row) for row in rows)
 
 
 def _frame(row: Row) -> Entry:

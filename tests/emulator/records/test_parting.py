@@ -13,14 +13,16 @@ from typer.testing import CliRunner
 from emulator.api import simulate_into
 from emulator.cli.commands import app
 from emulator.records.parting import (
-    EITHER,
+    FRAME,
+    RECEPTION,
     Entry,
     Parting,
     _first_entry,
-    _first_in_traces,
-    _frames,
-    _receptions,
+    _first_reception,
+    _frame,
+    _reception,
     before,
+    first_frame,
     partings,
 )
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -142,16 +144,18 @@ rows = st.lists(
 @given(rows, rows, rows)
 def test_traces_part_where_all_their_entries_do(same: list[Any], first: list[Any], second: list[Any]) -> None:
     """In whatever order their rows are: a damaged trace is not sorted by time."""
-    schema = pa.schema([TRACE.schema.field(name) for name in EITHER])
+    schema = pa.schema([TRACE.schema.field(name) for name in dict.fromkeys((*FRAME, *RECEPTION))])
     ours, theirs = same + first, same + second
-    runs = [SimpleNamespace(trace=pa.Table.from_pylist(rows, schema)) for rows in (ours, theirs)]
-    found = [each for each in _first_in_traces(*runs) if each is not None]  # type: ignore[arg-type]
-    whole = [
-        _first_entry(kind, entries(ours), entries(theirs))
-        for kind, entries in (("frame", _frames), ("reception", _receptions))
-    ]
-    places = [(each.time_ns, each.kind, each.node) for each in whole if each is not None]
-    assert [(each.time_ns, each.kind, each.node) for each in found] == places
+    runs: list[Any] = [SimpleNamespace(trace=pa.Table.from_pylist(rows, schema)) for rows in (ours, theirs)]
+    frames = [sorted({*map(_frame, rows)}) for rows in (ours, theirs)]
+    receptions = [sorted(map(_reception, rows)) for rows in (ours, theirs)]
+    for found, kind, entries in (
+        (first_frame(*runs), "frame", frames),
+        (_first_reception(*runs), "reception", receptions),
+    ):
+        whole = _first_entry(kind, *entries)
+        places = [each and (each.time_ns, each.kind, each.node) for each in (found, whole)]
+        assert places[0] == places[1]
 
 
 @pytest.mark.slow
