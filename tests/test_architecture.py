@@ -210,7 +210,7 @@ EXAMPLES = re.compile(
 )
 NAMING_EXAMPLES = {"vnet/cmm.py", "vnet/runtime/programs.py"}
 """The former place of the mathematics, and the former name of a program."""
-MEAN_OF_FIXES = "emulator/checks/senders.py"
+MEAN_OF_FIXES = "emulator/checks/faults.py"
 """A check whose figure, the mean of the fixes' errors, has the name of the program's mean."""
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from docs.generate.markdown import page as whole_page
 from docs.generate.markdown import table
 from emulator.checks.folder import FOLDER_CHECKS, VERDICT_FILE_CHECK
-from emulator.checks.registry import CHECKS, Check, Subject
+from emulator.checks.judge import CHECKS, Check, Subject
 
 INTRODUCTION = """
 Every check of a run. [checks.md](../checks.md) explains verdicts and classes, and has checks of your own. LABEL is

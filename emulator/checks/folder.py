@@ -2,6 +2,9 @@
 
 A folder of an earlier format has no manifest, and was written without these checks: where one of them finds
 something there, the run is *unknown* and not *invalid*.
+
+Some compute again what the folder holds: metrics from states, truth from the world, outcomes from frames. They need
+no program, and find what no other check speaks of, because no law of the radio or of a fault is broken by it.
 """
 
 from __future__ import annotations
@@ -10,26 +13,31 @@ import math
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.checks.channel import received_twice
 from emulator.checks.own import PREFIX
-from emulator.checks.recomputed import check_metrics, check_outcomes, checked_world
+from emulator.radio.engine import Engine
 from emulator.records.code_digest import vnet_digest
 from emulator.records.costs import Costs, PayloadSizes, RunCost, run_cost
 from emulator.records.driven_table import driving_figures
-from emulator.records.events import EventKind
+from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, EventKind, kinds_with
 from emulator.records.manifest import differing_files, read_manifest
-from emulator.records.metrics import rows_of, summarize
+from emulator.records.metrics import rows_of, sha256_of_rows, summarize
+from emulator.records.period_figures import Period, figures_of
 from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.recorded_world import ARRAYS, RecordedWorld
 from emulator.records.reported import reported_figures
-from emulator.records.run_folder import MANIFEST_FILE, SCENARIO_FILE, VERDICT_FILE
-from emulator.records.tables import BACKBONE, DRIVEN, PAYLOADS, backbone_figures
+from emulator.records.run_folder import MANIFEST_FILE, SCENARIO_FILE, VERDICT_FILE, WORLD_FILE
+from emulator.records.tables import BACKBONE, BUSY, DRIVEN, PAYLOADS, STATES, backbone_figures
 from emulator.records.verdicts import (
     MOST_ROWS,
     CheckResult,
@@ -43,11 +51,33 @@ from emulator.records.verdicts import (
     result,
     unknown,
 )
-from emulator.scenario.faults import Corrupt, OwnRule, SenderFault
-from emulator.scenario.loading import parse_toml
+from emulator.scenario.faults import Corrupt, OwnRule, SenderFault, StaleMessages
+from emulator.scenario.loading import input_files_of, parse_toml
 from emulator.scenario.own_functions import are_here, declared_checks
+from emulator.scenario.scenario import Scenario
+from emulator.world.gnss_faults import FaultyGnss
+from emulator.world.world import Instant, build_world, components, periods_of
 from vnet.counted import counted
+from vnet.errors import ScenarioError, first_names, printable
+from vnet.radio import SentFrame
+from vnet.transport.wire import LARGEST_MESSAGE_BYTES
+from vnet.types import Array, IntArray, Mask
 
+TOLERANCE_M = 1e-6
+"""Difference of a recomputed position that is none; headings in rad have the same."""
+RELATIVE, ABSOLUTE = 1e-9, 1e-9
+"""Difference of a recomputed figure that is none: sums in another order differ in their last bits."""
+POWER_STEP_DB = 0.011
+"""Difference of a recomputed power that is none: one step of its rounding."""
+SPARE_ROWS = 1_000_000
+"""States that a world may have beyond those of the run, which was cut short, and is still built for it."""
+MOST_RECEPTIONS = 20_000_000
+"""Receptions that are decided again; more take minutes."""
+MOST_BYTES = 1 << 32
+"""Bytes of frames that are sent again: each is hashed."""
+KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
+"""Columns that name a row of the trace, in the order of its rows."""
+UNCOMPARED = (*KEY, "payload_digest", "size_bytes")
 FIRST_WITH_MANIFEST = 3
 """Format of the first folders that have a manifest."""
 FILES = "files"
@@ -56,9 +86,317 @@ NOT_OF_THE_RUN = (FILES, "replay", "trace_sha256")
 """Checks that compare files, and have other findings once the run is over."""
 
 
+def same_numbers(ours: Array, theirs: Array, tolerance: float = ABSOLUTE) -> Mask:
+    """Return which numbers are equal but for rounding; NaN equals NaN."""
+    return np.isclose(ours, theirs, rtol=RELATIVE, atol=tolerance, equal_nan=True)
+
+
+def check_metrics(recorded: OpenedRun) -> Finding:
+    """Check that the metrics are those of the states, and that verdict.json has their hash."""
+    if not len(recorded.metrics) and not recorded.periods:
+        return not_exercised("no period was completed")
+    rows = rows_of(recorded.metrics)
+    wrong = list(_wrong_metrics(recorded, rows))
+    if (told := recorded.record.metrics_sha256) and told != sha256_of_rows(rows):
+        wrong.append({"period": None, "figure": "metrics_sha256", "kept": told[:12], "computed": "another"})
+    text = f"{counted(len(rows), 'period')}, all figures as the states give them"
+    first = f", first {wrong[0]['figure']}" if wrong else ""
+    broken_text = f"{counted(len(wrong), 'figure')} other than the states give{first}"
+    return result(len(wrong), text, broken_text, wrong)
+
+
+def _wrong_metrics(recorded: RecordedRun, rows: list[Any]) -> Iterator[dict[str, Any]]:
+    if len(rows) != recorded.periods:
+        yield {"period": None, "figure": "periods", "kept": len(rows), "computed": recorded.periods}
+    for kept, computed in zip(rows, _computed_figures(recorded), strict=False):
+        for field in fields(computed):  # a folder may have more, of a program that is not installed
+            ours, theirs = getattr(kept, field.name), getattr(computed, field.name)
+            # The states have the last report of a period only, and no empty one.
+            counts_reports = field.name in ("reporting", "not_finite")
+            if ours < theirs if counts_reports else not _alike(ours, theirs):
+                yield {"period": computed.period, "figure": field.name, "kept": ours, "computed": theirs}
+
+
+def _alike(ours: Any, theirs: Any) -> bool:
+    if isinstance(ours, list) and isinstance(theirs, list):
+        return len(ours) == len(theirs) and all(map(_alike, ours, theirs))
+    if ours is None or theirs is None:
+        return ours is theirs
+    return bool(same_numbers(np.asarray(ours, float), np.asarray(theirs, float)))
+
+
+def _computed_figures(recorded: RecordedRun) -> list[Any]:
+    """Return the figures of all periods, from the states alone."""
+    position_m, heading = recorded.vectors("position_m"), np.zeros(0)
+    fix_m, common_m = recorded.vectors("fix_m"), recorded.vectors("common_error_m")
+    columns = {name: recorded.by_period(name).reshape(-1, size) for name, size in recorded.declared.vectors.items()}
+    period_ns, component = recorded.scenario.period_ns, None
+    periods = []
+    for period in range(recorded.periods):
+        if component is None or recorded.topology_changes:
+            links = recorded.places.links(period * period_ns)
+            component = components(recorded.places.position_m(period), recorded.scenario.radio.range_m, links)
+        instant = Instant(
+            period, period * period_ns, position_m[period], heading, common_m[period, 0], fix_m[period], heading
+        )
+        periods.append(Period(instant, component, int(recorded.reported[period].sum()), not_finite=0))
+    return figures_of(periods, columns, recorded.declared) if periods else []
+
+
+def input_of(scenario: Scenario) -> str:
+    """Return why a world cannot be built from the scenario alone; "" if it can."""
+    if scenario.network.programs_drive:
+        return "programs drive the vehicles"
+    if scenario.network.function is not None:
+        return f"vehicles are where {scenario.network.function} says"
+    named = [str(path) for path in input_files_of(scenario)]
+    return f"the world comes from files: {first_names(named, 2)}" if named else ""
+
+
+def check_truth(recorded: OpenedRun) -> Finding:
+    """Check that positions, headings, common errors and fixes are those that the scenario and its seed give."""
+    scenario = recorded.scenario
+    if why := input_of(scenario):
+        return not_exercised(why)
+    vehicles = len(recorded.world.node_ids)
+    if vehicles != scenario.network.vehicles + len(scenario.roadside):
+        text = f"{WORLD_FILE} has {counted(vehicles, 'node')}, the scenario {scenario.network.vehicles}"
+        return invalid(text)
+    if periods_of(scenario) * vehicles > len(recorded.states) + SPARE_ROWS:
+        return not_exercised("the run was cut short")
+    world = build_world(scenario)
+    ours, theirs = recorded.world, RecordedWorld.of(world)
+    wrong = [{"file": WORLD_FILE, "column": each} for each in ARRAYS if not _same_array(ours, theirs, each)]
+    if recorded.node_ids and list(world.node_ids) != recorded.node_ids:
+        wrong.append({"file": STATES.file, "column": "node"})
+    else:
+        wrong += _wrong_states(recorded, FaultyGnss(world, recorded.plan, scenario.run.seed), recorded.periods)
+    text = f"{counted(recorded.periods, 'period')} of {counted(vehicles, 'node')} as the scenario gives them"
+    first = f"{wrong[0]['column']} of {wrong[0]['file']}" if wrong else ""
+    broken_text = f"other truth or fixes than the scenario gives, first in {first}"
+    return result(len(wrong), text, broken_text, wrong)
+
+
+def _same_array(ours: RecordedWorld, theirs: RecordedWorld, name: str) -> bool:
+    mine, other = getattr(ours, name), getattr(theirs, name)
+    if mine is None or other is None or np.shape(mine) != np.shape(other):
+        return mine is other
+    if name == "area_m":  # of a test that ended the run early it is that of the whole
+        return bool((mine[0] <= other[0] + TOLERANCE_M).all() and (mine[1] >= other[1] - TOLERANCE_M).all())
+    if np.asarray(mine).dtype.kind != "f":
+        return bool(np.array_equal(mine, other))
+    return bool(same_numbers(mine, other, TOLERANCE_M).all())
+
+
+def _wrong_states(recorded: RecordedRun, gnss: FaultyGnss, periods: int) -> list[dict[str, Any]]:
+    wrong: list[dict[str, Any]] = []
+    vectors = {name: recorded.vectors(name) for name in ("position_m", "fix_m", "common_error_m")}
+    heading = recorded.scalars("heading_rad")
+    for period in range(periods):
+        instant = gnss.at(period)
+        for name, array in (*vectors.items(), ("heading_rad", heading)):
+            ours = array[period]
+            theirs = np.broadcast_to(getattr(instant, name), ours.shape)
+            same = same_numbers(ours, theirs, TOLERANCE_M).reshape(len(ours), -1).all(axis=1)
+            for node in np.flatnonzero(~same)[: MOST_ROWS - len(wrong)].tolist():
+                row = {"file": STATES.file, "column": name, "period": period, "node": recorded.node_ids[node]}
+                wrong.append({**row, "kept": ours[node].tolist(), "computed": theirs[node].tolist()})
+        if len(wrong) >= MOST_ROWS:
+            break
+    return wrong
+
+
+# The radio.
+
+
+def check_outcomes(recorded: OpenedRun) -> Finding:
+    """Check that each reception has the outcome, cause and arrival that the radio gives the frames of the trace."""
+    if why := _why_not_decided_again(recorded):
+        return not_exercised(why)
+    size = recorded.column("size_bytes")
+    if int(size.min()) < 0 or int(size.max()) > LARGEST_MESSAGE_BYTES:
+        return invalid(f"frames of {int(size.min())} to {int(size.max())} bytes")
+    try:
+        engine = _decided_again(recorded)
+    except (AssertionError, IndexError, OverflowError, ValueError) as error:  # no run has such frames
+        return invalid(f"the radio cannot send these frames: {printable(str(error))}")
+    computed = engine.trace.to_table()
+    order = np.lexsort([_codes(recorded, each) for each in reversed(KEY)])
+    kept = recorded.trace.take(pa.array(order))
+    wrong = _first_difference(recorded, kept, computed) + _wrong_busy_ratios(recorded, engine)
+    counts = {outcome.name: count for outcome, count in engine.counts.items()}
+    text = f"{counted(len(kept), 'reception')} decided again as they were"
+    broken_text = f"{counted(len(wrong), 'reception')} other than the radio decides" if wrong else ""
+    return result(len(wrong), text, broken_text, wrong, out_of_range=counts["out_of_range"])
+
+
+def _wrong_busy_ratios(recorded: RecordedRun, engine: Engine) -> list[dict[str, Any]]:
+    """Return the first channel busy ratio that is not the one of these frames."""
+    kept = recorded.busy_ratio
+    computed = np.array(engine.busy_ratios(recorded.periods * recorded.scenario.period_ns)).reshape(
+        -1, kept.shape[1]
+    )
+    if recorded.table(BUSY) is None or (len(kept) == len(computed) and same_numbers(kept, computed).all()):
+        return []
+    shared = min(len(kept), len(computed))
+    windows = np.flatnonzero(~same_numbers(kept[:shared], computed[:shared]).all(axis=1))
+    return [{"trace": BUSY.file, "window": int(windows[0]) if len(windows) else shared}]
+
+
+def _why_not_decided_again(recorded: OpenedRun) -> str:
+    run, faults = recorded.scenario.run, [planned.fault for planned in recorded.plan]
+    reasons = {
+        "no frame was sent": not len(recorded.trace),
+        "in real time the machine has a part in it": run.pacing == "realtime",
+        "the order of events was not FIFO": run.order != "fifo" or run.tape is not None,
+        "the run was cut short": bool(recorded.event(*kinds_with(CUTS_RUN), EventKind.spun, EventKind.died)),
+        f"receptions: more than {MOST_RECEPTIONS:,}": len(recorded.trace) > MOST_RECEPTIONS,
+        f"more than {MOST_BYTES:,} bytes": _payload_bytes(recorded) > MOST_BYTES,
+        "programs send to single vehicles": bool((recorded.attempt > 0).any()),
+        "programs choose power or bit rate": "gain_db" in recorded.trace.column_names,
+        "a rule of your own changes frames": any(isinstance(fault, OwnRule) for fault in faults),
+        "a fault replaces frames": any(isinstance(fault, StaleMessages) for fault in faults),
+        "frames that nobody was in range of are not in the trace": bool(_unseen(recorded))
+        and (recorded.shares_air or any(isinstance(fault, SenderFault) for fault in faults)),
+    }
+    return next((why for why, holds in reasons.items() if holds), "")
+
+
+def _originals(recorded: RecordedRun) -> NDArray[np.intp]:
+    """Return a row of each frame that programs sent, in the order of sending."""
+    first = np.unique(recorded.emission[recorded.copy == 0], return_index=True)[1]
+    rows = np.flatnonzero(recorded.copy == 0)[first]
+    return np.asarray(rows[np.lexsort((recorded.seq[rows], recorded.sender[rows], recorded.sent_ns[rows]))])
+
+
+def _payload_bytes(recorded: RecordedRun) -> int:
+    return int(np.maximum(recorded.column("size_bytes")[_originals(recorded)], 0).sum())
+
+
+def _unseen(recorded: OpenedRun) -> int:
+    """Return how many frames are not in the trace, by the numbers of those that are and by the verdict file."""
+    rows = _originals(recorded)
+    last = np.full(len(recorded.node_ids), -1)
+    np.maximum.at(last, recorded.sender[rows], recorded.seq[rows])
+    cost = recorded.record.cost if recorded.has_record else None
+    return max(int((last + 1).sum()), 0 if cost is None else cost.payload.frames) - len(rows)
+
+
+def _decided_again(recorded: RecordedRun) -> Engine:
+    """Return an engine that has been given the frames of the trace, and all that happened besides."""
+    scenario, places = recorded.scenario, recorded.places
+    engine = Engine(
+        recorded.node_ids,
+        scenario.radio,
+        scenario.run.seed,
+        places.position_m(0),
+        recorded.radio_inputs,
+        arrivals=scenario.run.order_grid,
+    )
+    rows = _originals(recorded)
+    sent_ns, size_bytes = recorded.sent_ns[rows], recorded.column("size_bytes")[rows].tolist()
+    sender, seq, period_ms = (each[rows].tolist() for each in (recorded.sender, recorded.seq, recorded.period_ms))
+    changes_ns = _changes_ns(recorded)
+    endings = {event.time_ns for event in recorded.event(*kinds_with(ENDS_PROGRAM))}
+    everybody = np.arange(len(recorded.node_ids))
+    up = np.ones(len(everybody), dtype=bool)
+
+    def set_up(time_ns: int) -> None:
+        now_up = ~recorded.is_down(everybody, np.full(len(everybody), time_ns))
+        for node in np.flatnonzero(up != now_up).tolist():
+            engine.set_up(node, bool(now_up[node]))
+        up[:] = now_up
+
+    starts = np.flatnonzero(np.diff(sent_ns, prepend=-1))
+    frames = dict(zip(sent_ns[starts].tolist(), pairwise([*starts.tolist(), len(sent_ns)]), strict=True))
+    placed = 0
+    for time_ns in sorted({*changes_ns, *endings, *frames}):
+        if time_ns in changes_ns:
+            engine.look_ahead(time_ns, ())
+            engine.advance(time_ns - 1)
+            engine.set_faults([] if recorded.fault_plan is None else recorded.fault_plan.active(time_ns), time_ns)
+            if time_ns not in endings:
+                set_up(time_ns)
+        if time_ns in endings:
+            engine.advance(time_ns)
+        period = time_ns // scenario.period_ns
+        if recorded.moves and period != placed and time_ns in frames:
+            engine.set_positions(places.position_m(period))
+            placed = period
+        for index in range(*frames.get(time_ns, (0, 0))):
+            engine.number_next(sender[index], seq[index])
+            frame = SentFrame("", bytes(size_bytes[index]), period_ms=period_ms[index] or None)
+            engine.transmit(time_ns, sender[index], [frame])
+        if time_ns in endings:
+            set_up(time_ns)
+    engine.look_ahead(recorded.closed_ns, ())
+    engine.drain()
+    return engine
+
+
+def _changes_ns(recorded: RecordedRun) -> set[int]:
+    """Return the instants at which faults or vehicles come and go."""
+    changes = {0} | {edge for span in recorded.down for edge in (span.start_ns, span.end_ns)}
+    time_ns: int | None = -1
+    while recorded.fault_plan is not None and time_ns is not None:
+        time_ns = recorded.fault_plan.next_change_ns(time_ns)
+        changes |= set() if time_ns is None else {time_ns}
+    return {change_ns for change_ns in changes if 0 <= change_ns < recorded.closed_ns}
+
+
+def _codes(recorded: RecordedRun, name: str) -> IntArray:
+    if name in ("sender", "receiver"):
+        return np.asarray(recorded.nodes(name), dtype=np.int64)
+    return recorded.column(name)
+
+
+def _first_difference(recorded: RecordedRun, kept: pa.Table, computed: pa.Table) -> list[dict[str, Any]]:
+    """Return the first rows in which two traces in canonical order differ."""
+    shared = min(len(kept), len(computed))
+    ours, theirs = kept.slice(0, shared), computed.slice(0, shared)
+    differs = np.zeros(shared, dtype=bool)
+    for column in KEY:
+        differs |= _differs(ours[column], theirs[column])
+    if differs.any() or len(kept) != len(computed):  # all that follows has moved up or down
+        row = int(np.flatnonzero(differs)[0]) if differs.any() else shared
+        return [_shown(table, row, whose) for whose, table in (("kept", kept), ("computed", computed))]
+    for column in (name for name in kept.column_names if name not in UNCOMPARED):
+        if column in theirs.column_names:
+            differs |= _differs(ours[column], theirs[column])
+    unsure = recorded.is_unsure(np.asarray(ours["sent_ns"].to_numpy()))
+    unsure |= recorded.is_unsure(np.asarray(pc.fill_null(ours["arrival_ns"], -1).to_numpy()))
+    rows = np.flatnonzero(differs & ~unsure)[:MOST_ROWS].tolist()
+    tables = (("kept", kept), ("computed", computed))
+    return [_shown(table, row, whose) for row in rows for whose, table in tables]
+
+
+def _differs(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> Mask:
+    if pa.types.is_floating(ours.type):
+        mine, other = (np.asarray(each.to_numpy(), dtype=float) for each in (ours, theirs))
+        return np.asarray(~np.isclose(mine, other, rtol=0, atol=POWER_STEP_DB, equal_nan=True))
+    if pa.types.is_dictionary(ours.type) or pa.types.is_string(ours.type):
+        ours, theirs = (pc.fill_null(each.cast(pa.string()), "") for each in (ours, theirs))
+    else:
+        ours, theirs = (pc.fill_null(each.cast(pa.int64()), -1) for each in (ours, theirs))
+    return np.asarray(pc.not_equal(ours, theirs).to_numpy())
+
+
+def _shown(table: pa.Table, row: int, whose: str) -> dict[str, Any]:
+    values: Mapping[str, Any] = table.slice(row, 1).to_pylist()[0] if row < len(table) else {}
+    return {"trace": whose, **{name: value for name, value in values.items() if name != "payload_digest"}}
+
+
+def checked_world(recorded: OpenedRun) -> Finding:
+    """Return `check_truth`, or that a scenario whose world cannot be built is none of a run."""
+    try:
+        return check_truth(recorded)
+    except ScenarioError as error:
+        return CheckResult("truth", Verdict.INVALID, f"the scenario has no world: {error}")
+
+
 @dataclass(frozen=True)
 class FolderCheck:
-    """One check of a folder, and its row of the reference page; fields as those of `registry.Check`."""
+    """One check of a folder, and its row of the reference page; fields as those of `judge.Check`."""
 
     name: str
     function: Callable[[OpenedRun], Finding]

@@ -75,7 +75,7 @@ late | run | if at_least <= LATE_SHARE_LIMIT else Verdict.UNKNOWN | if at_least 
 states | run |  or len(recorded.states) != due * len(recorded.node_ids): | :
 band | radio | not expected - away <= seen <= expected + away | not seen <= expected + away
 arrival | channel | there & (recorded.arrival_ns <= recorded.sent_ns) | there & (recorded.arrival_ns < 0)
-misbehaviour | senders | originals[times_sent != _due( | originals[times_sent < _due(
+misbehaviour | faults | originals[times_sent != _due( | originals[times_sent < _due(
 agents/cooperative
 gate | estimator | np.einsum("nii->n", covariances_m2) / 2 | np.einsum("nii->n", covariances_m2)
 agents/cooperative/cmm

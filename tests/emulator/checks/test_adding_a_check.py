@@ -8,9 +8,18 @@ from pathlib import Path
 import pytest
 
 from docs.generate import checks as check_page
-from emulator.checks import registry
-from emulator.checks.judge import RecordedRun, Verdict, check_run, judge
-from emulator.checks.registry import CHECKS, Check, Subject, WithoutPositions
+from emulator.checks.judge import (
+    CHECKS,
+    MACHINE,
+    RADIO,
+    Check,
+    RecordedRun,
+    Subject,
+    Verdict,
+    WithoutPositions,
+    check_run,
+    judge,
+)
 from emulator.records.verdicts import CheckResult, Finding, invalid, not_exercised, result, unknown
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import count_verdicts
@@ -33,7 +42,7 @@ def check_frame_size(recorded: RecordedRun) -> Finding:
 
 FRAME_SIZE = Check(
     check_frame_size,
-    registry.RADIO,
+    RADIO,
     f"No frame is longer than {LIMIT_BYTES} bytes.",
     invalid="a longer frame",
     unknown="no frame was sent",
@@ -134,4 +143,4 @@ def test_a_check_of_the_machine_is_never_invalid(tmp_path: Path) -> None:
         assert [finding.verdict for finding in found if isinstance(finding, CheckResult)] == [expected]
         assert not (check.subject is Subject.MACHINE and check.invalid)
     with pytest.raises(AssertionError):
-        Check(check_frame_size, registry.MACHINE, "", invalid="too long", subject=Subject.MACHINE)
+        Check(check_frame_size, MACHINE, "", invalid="too long", subject=Subject.MACHINE)
