@@ -21,7 +21,7 @@ PACKAGES = ("vnet", "agents", "emulator", "studies")
 LAYERS = (
     ("vnet",),
     ("emulator.scenario",),
-    ("emulator.faults",),
+    ("emulator.fault_plan",),
     ("emulator.world",),
     ("emulator.radio",),
     ("emulator.records",),

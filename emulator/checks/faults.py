@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emulator.checks.channel import binomial_band, frame_digests, received_twice
 from emulator.checks.latency import bounds
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import SLOT_NS
 from emulator.records.distributions import chi2_cdf, chi2_sf

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from emulator.checks.channel import nothing_seen, received_twice
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.radio.own_rules import LONGEST_DELAY_S, MOST_COPIES
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result

@@ -21,9 +21,8 @@ from emulator.records.distributions import chi2_sf
 from emulator.records.recorded_run import ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, not_exercised, result
 from emulator.scenario.faults import Throttle
-from emulator.scenario.radio import Edca, EtsiReactive, Limeric, Receiver
+from emulator.scenario.radio import Edca, EtsiReactive, Limeric, Receiver, Sidelink
 from emulator.scenario.scenario import Radio
-from emulator.scenario.sidelink import Sidelink
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 

@@ -26,7 +26,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.drivers.backbone import BackboneNetwork, NewsFeed
-from emulator.faults.plan import FaultPlan, Nodes, PlannedFault
+from emulator.fault_plan import FaultPlan, Nodes, PlannedFault
 from emulator.radio.dot11p import abilities_of
 from emulator.radio.engine import Deliveries, Delivery, Engine
 from emulator.radio.medium import SLICE_NS

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.usage import resident_kb
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import MEASURED, SAID, Event, merged
 from emulator.records.period_figures import POSITION_FIGURES

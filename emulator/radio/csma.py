@@ -61,10 +61,9 @@ from emulator.radio.unicast import (
     address,
     retry_of,
 )
-from emulator.scenario.radio import Edca, EtsiReactive, Limeric, Receiver
+from emulator.scenario.radio import CrLimit, Edca, EtsiReactive, Limeric, Receiver
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio, least_latency_ns
-from emulator.scenario.sidelink import CrLimit
 from vnet.types import Array
 from vnet.units import NS_PER_MS
 

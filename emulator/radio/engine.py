@@ -24,7 +24,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.radio.csma import Csma
 from emulator.radio.faults import LinkFaults, SenderFaults
 from emulator.radio.frames import (

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from emulator.faults.plan import PlannedFault, swizzle_times_ns
+from emulator.fault_plan import PlannedFault, swizzle_times_ns
 from emulator.radio.frames import Copied, CopyNumbers, Frame, Receptions, Transmission, random_flips
 from emulator.radio.mac import Mac
 from emulator.radio.outcomes import PENDING

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.reception import milliwatts
-from emulator.scenario.sidelink import Sidelink
+from emulator.scenario.radio import Sidelink
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.radio.frames import (
     NO_CAUSE,
     Answered,
@@ -35,7 +35,7 @@ from emulator.radio.frames import (
 from emulator.radio.outcomes import PENDING
 from emulator.radio.propagation import DIGITS
 from emulator.radio.topology import TopologySnapshot
-from emulator.scenario import rule_watch
+from emulator.scenario import own_functions
 from emulator.scenario.faults import OwnRule
 from emulator.scenario.own_functions import NonsenseError, load_function
 from emulator.scenario.program import Program
@@ -247,11 +247,11 @@ class OwnRules:
         assert isinstance(fault, OwnRule)
         state = self._states.setdefault(planned.number, {})
         try:
-            answer = rule_watch.call_bounded(self._functions[fault.rule], seen, state)
+            answer = own_functions.call_bounded(self._functions[fault.rule], seen, state)
             return None if answer is None else understood(answer)
-        except (Exception, SystemExit, rule_watch.NoAnswerError) as error:
+        except (Exception, SystemExit, own_functions.NoAnswerError) as error:
             self._failed.add(planned.number)
-            said, where = rule_watch.told(error, __file__)
+            said, where = own_functions.told(error, __file__)
             self.on_failure(RuleFailure(planned.label, fault.rule, seen.time_ns, seen.sender, said, where))
             return None
 

@@ -32,10 +32,9 @@ from emulator.radio.mac import Mac, ThrottledQueue
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.reception import JITTER, Signals, milliwatts, reception_draws, sender_draw
-from emulator.scenario.radio import Receiver
+from emulator.scenario.radio import CrLimit, LteMode4, NrMode2, Receiver
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio, least_transit_ns
-from emulator.scenario.sidelink import CrLimit, LteMode4, NrMode2
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS
 

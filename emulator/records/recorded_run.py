@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from emulator.faults.plan import FaultPlan, Nodes, PlannedFault, swizzle_times_ns
+from emulator.fault_plan import FaultPlan, Nodes, PlannedFault, swizzle_times_ns
 from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Outcome, Stage, decided_at
 from emulator.radio.topology import connectivity_of

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 import pyarrow as pa
 
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.records.events import Event
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun

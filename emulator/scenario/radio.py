@@ -7,16 +7,205 @@ Each section adds a stage to the channel: without any of them the radio is the d
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from emulator.scenario.network import OriginDeg
-from emulator.scenario.sections import Section, Switch, must_grow
-from emulator.scenario.sidelink import CrLimit, LteMode4, NrMode2
+from emulator.scenario.sections import Section, Switch, must_grow, must_not_grow
+from vnet.units import NS_PER_MS
 
+QPSK_07_SINR_DB = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 20.0, 20.001)
+"""SINR in dB of `QPSK_07_BLER`."""
+QPSK_07_BLER = (1.0, 0.9, 0.7, 0.4, 0.13, 0.045, 0.017, 0.007, 1e-3, 1e-3, 1e-4)
+"""Block error rates of 190 bytes at QPSK 0.7 and 280 km/h (3GPP R1-160284, from Gonzalez-Martin et al. 2019)."""
+LONG_PERIODS_MS = tuple(range(100, 1001, 100))
+"""Reservation intervals of both standards from 100 ms on."""
+MOST_SUBCHANNELS = 27
+"""Most subchannels of a carrier (3GPP TS 38.331)."""
+
+Db = Annotated[float, Field(ge=-100, le=200)]
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
 """The bit rates of 802.11p in 10 MHz (802.11-2020, table 17-4)."""
+
+
+class Sidelink(Section):
+    """A grid of slots and subchannels, in which every vehicle reserves its resources by what it has sensed."""
+
+    periods_ms: ClassVar[tuple[int, ...]] = LONG_PERIODS_MS
+    """Reservation intervals that the standard has."""
+    ranks_power: ClassVar[bool] = True
+    """True if the quietest of the candidates are taken, and not any of them."""
+    most_t1: ClassVar[int] = 4
+
+    subchannels: int = Field(4, ge=1, le=MOST_SUBCHANNELS)
+    """Subchannels, side by side in frequency."""
+    subchannel_bytes: int = Field(190, ge=1, le=65_000)
+    """Bytes that one subchannel carries in a slot; a longer frame takes several."""
+    data_blocks: int = Field(10, ge=1, le=275)
+    """Resource blocks of data in a subchannel: the bandwidth of the noise."""
+    sensing_dbm: float = Field(-90.5, ge=-300, le=100)
+    """Least received power at which a frame is detected (`below_sensing`)."""
+    exclusion_dbm: float = Field(-110.0, ge=-300, le=100)
+    """Received power from which a reserved resource is excluded, before it is raised in steps of 3 dB."""
+    keep_probability: float = Field(0.0, ge=0, le=0.8)
+    """Probability of keeping a resource as its counter ends."""
+    reservation_ms: int = 100
+    """Reservation interval until a sender's period is told, or learned from its frames.
+
+    The standards have 100, 200, … 1000 ms; mode 4 also 20 and 50 ms, mode 2 also 1 to 99 ms.
+    """
+    t1_slots: int = Field(4, ge=1)
+    """Slots from a frame to its selection window, to process it: in mode 4 at most 4, in mode 2 at most 9."""
+    t2_ms: int = Field(100, ge=10, le=100)
+    """End of the selection window, and the delay beyond which a frame gets a resource of its own."""
+    retransmit: Switch = False
+    """True if each frame is transmitted twice within 16 slots, wherever candidates for that are left."""
+    in_band_emission_db: float = Field(30.0, ge=0, le=300)
+    """Attenuation of a signal in the subchannels that it does not use."""
+    busy_dbm: float = Field(-94.0, ge=-300, le=100)
+    """Received power from which a subchannel is busy; with less it counts as silent where candidates are ranked."""
+    bler_sinr_db: tuple[Db, ...] = QPSK_07_SINR_DB
+    """Ratios of signal to noise and interference at which `bler` is given, increasing."""
+    bler: tuple[Annotated[float, Field(ge=0, le=1)], ...] = QPSK_07_BLER
+    """Block error rates at them, linear in between; below the first and above the last they stay as there."""
+
+    @property
+    def slot_ns(self) -> int:
+        """Length of a slot in nanoseconds."""
+        return NS_PER_MS
+
+    @property
+    def sensing_slots(self) -> int:
+        """Length of the sensing window in slots."""
+        return 1000
+
+    @property
+    def block_khz(self) -> int:
+        """Width of a resource block."""
+        return 180
+
+    @property
+    def most_blocks(self) -> int:
+        """Resource blocks of the widest carrier (TS 36.101, TS 38.101-1)."""
+        return 100
+
+    @property
+    def candidate_share(self) -> float:
+        """The share of resources that must remain as candidates."""
+        return 0.2
+
+    def counters(self, period_ms: int) -> tuple[int, int]:
+        """Return the least and the largest value of a new reselection counter (TS 36.321, TS 38.321)."""
+        times = -(-100 // max(20, min(period_ms, 100)))
+        return 5 * times, 15 * times
+
+    @model_validator(mode="after")
+    def _fits_the_standard(self) -> Sidelink:
+        if self.reservation_ms not in self.periods_ms:
+            raise ValueError(f"reservation_ms = {self.reservation_ms}: {allowed_periods(self.periods_ms)}")
+        if self.t1_slots > self.most_t1:
+            raise ValueError(f"t1_slots = {self.t1_slots}: must be less than or equal to {self.most_t1}")
+        if self.t1_slots * self.slot_ns >= self.t2_ms * NS_PER_MS:
+            raise ValueError(f"t2_ms = {self.t2_ms}: must be later than t1_slots = {self.t1_slots}")
+        if len(self.bler) != len(self.bler_sinr_db) or not self.bler:
+            raise ValueError(
+                f"bler has {len(self.bler)} values, bler_sinr_db {len(self.bler_sinr_db)}: need as many, at least 1"
+            )
+        must_grow("bler_sinr_db", self.bler_sinr_db)
+        must_not_grow("bler", self.bler)
+        if (blocks := self.subchannels * self.data_blocks) > self.most_blocks:
+            raise ValueError(
+                f"subchannels = {self.subchannels}: with data_blocks = {self.data_blocks} these are {blocks} "
+                f"resource blocks; at most {self.most_blocks} are allowed"
+            )
+        return self
+
+
+class LteMode4(Sidelink):
+    """LTE-V2X mode 4 (3GPP release 14): subframes of 1 ms, semi-persistent reservations, ranking by power."""
+
+    periods_ms: ClassVar[tuple[int, ...]] = (20, 50, *LONG_PERIODS_MS)
+
+    kind: Literal["lte-mode4"]
+    """This MAC."""
+    one_shot: Switch = False
+    """True if every second to sixth frame is sent on a resource of its own, once (SAE J3161/1)."""
+
+
+class NrMode2(Sidelink):
+    """NR-V2X mode 2 (3GPP release 16): slots of 1, 0.5 or 0.25 ms, without feedback channel."""
+
+    periods_ms: ClassVar[tuple[int, ...]] = (*range(1, 100), *LONG_PERIODS_MS)
+    ranks_power: ClassVar[bool] = False
+    most_t1: ClassVar[int] = 9
+
+    kind: Literal["nr-mode2"]
+    """This MAC."""
+    scs_khz: Literal[15, 30, 60] = 30
+    """Subcarrier spacing: slots of 1, 0.5 and 0.25 ms."""
+    sensing_ms: Literal[100, 1100] = 1100
+    """Length of the sensing window."""
+    share_percent: Literal[20, 35, 50] = 20
+    """Percentage of the resources that must remain as candidates."""
+    scheduling: Literal["sps", "dynamic"] = "sps"
+    """`sps` reserves a resource for the frames to come; `dynamic` selects one for each frame."""
+    re_evaluation: Switch = True
+    """True if a new resource is checked once more, `t1_slots` before it is used, and replaced if it is taken."""
+
+    @property
+    def slot_ns(self) -> int:
+        """Length of a slot in nanoseconds."""
+        return NS_PER_MS * 15 // self.scs_khz
+
+    @property
+    def sensing_slots(self) -> int:
+        """Length of the sensing window in slots."""
+        return self.sensing_ms * NS_PER_MS // self.slot_ns
+
+    @property
+    def block_khz(self) -> int:
+        """Width of a resource block."""
+        return 12 * self.scs_khz
+
+    @property
+    def most_blocks(self) -> int:
+        """Resource blocks of the widest carrier (TS 38.101-1, table 5.3.2-1)."""
+        return {15: 270, 30: 273, 60: 135}[self.scs_khz]
+
+    @property
+    def candidate_share(self) -> float:
+        """The share of resources that must remain as candidates."""
+        return self.share_percent / 100
+
+
+class CrLimit(Section):
+    """Congestion control of a sidelink: the busier the channel, the smaller a sender's share of its resources.
+
+    The limits are set by regions and priorities (for Europe ETSI TS 103 574), so none is a default.
+    """
+
+    kind: Literal["cr_limit"]
+    """This control."""
+    busy: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(min_length=1)
+    """Channel busy ratios from which the limits hold, increasing."""
+    most: tuple[Annotated[float, Field(gt=0, le=1)], ...]
+    """Largest channel occupancy ratio of a sender over 1000 ms; a frame beyond it is `no_grant`."""
+
+    @model_validator(mode="after")
+    def _a_limit_for_each_busy_ratio(self) -> CrLimit:
+        if len(self.busy) != len(self.most):
+            raise ValueError(f"{len(self.busy)} busy ratios need as many limits most, not {len(self.most)}")
+        must_grow("busy", self.busy)
+        must_not_grow("most", self.most)
+        return self
+
+
+def allowed_periods(periods_ms: tuple[int, ...]) -> str:
+    """Return the reservation intervals of a MAC in words."""
+    short = [str(each) for each in periods_ms if each < 100]
+    text = "1 to 99" if len(short) > 2 else ", ".join(short)
+    return f"allowed are {text}{' and ' if len(short) > 2 else ', '}{', '.join(map(str, LONG_PERIODS_MS))} ms"
 
 
 class _PathLoss(Section):

@@ -18,15 +18,16 @@ from emulator.scenario.radio import (
     RATES_MBPS,
     Buildings,
     Congestion,
+    CrLimit,
     Edca,
     Fading,
     Mac,
     PathLoss,
     Receiver,
     Shadowing,
+    Sidelink,
 )
 from emulator.scenario.sections import DAY_S, FAR_M, Section, Switch
-from emulator.scenario.sidelink import CrLimit, Sidelink
 from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
 from vnet.errors import ProgramError, ScenarioError, shown
 from vnet.extras import require

@@ -26,7 +26,7 @@ from emulator.checks.own import PREFIX, Result, finding_of, load_checks
 from emulator.checks.properties import ANY, PERIOD, Effect, Predicate, always, eventually, leads_to, never
 from emulator.drivers.conclude import judge_further
 from emulator.drivers.session import Local, Session, over_zenoh
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.events import Event
 from emulator.records.run import Run

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from emulator.faults.plan import PlannedFault, stream
+from emulator.fault_plan import PlannedFault, stream
 from emulator.scenario.faults import Drift, GnssFault, GnssFreeze, GnssOutage, RandomPos, Skew
 from emulator.world.world import Instant, World
 from vnet.node import Fix

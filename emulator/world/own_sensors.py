@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scenario import rule_watch
+from emulator.scenario import own_functions
 from emulator.scenario.own_functions import NonsenseError, load_function
 from emulator.scenario.program import Program
 from emulator.scenario.random_streams import frame_stream
@@ -152,11 +152,11 @@ class OwnSensors:
             rng=frame_stream(self._seed, f"sensor {name}", 0, period),
         )
         try:
-            answer = rule_watch.call_bounded(self._functions[name], seen, self._states[name])
+            answer = own_functions.call_bounded(self._functions[name], seen, self._states[name])
             return _understood(answer, frozenset(truth.node_ids))
-        except (Exception, SystemExit, rule_watch.NoAnswerError) as error:
+        except (Exception, SystemExit, own_functions.NoAnswerError) as error:
             self._failed.add(name)
-            self.on_failure(SensorFailure(name, sensor.model, truth.time_ns, *rule_watch.told(error, __file__)))
+            self.on_failure(SensorFailure(name, sensor.model, truth.time_ns, *own_functions.told(error, __file__)))
             return {}
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.faults.plan import FaultPlan, Nodes
+from emulator.fault_plan import FaultPlan, Nodes
 from emulator.radio.engine import Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.scenario.scenario import Scenario

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from emulator import Answer, RadioFrame
-from emulator.scenario import rule_watch
+from emulator.scenario import own_functions
 
 State = dict[str, Any]
 
@@ -109,7 +109,7 @@ def locks_up(frame: RadioFrame, state: State) -> Answer:
 
 def alarms(frame: RadioFrame, state: State) -> None:
     """Send the process the signal that interrupts rules which wait."""
-    signal.raise_signal(rule_watch.WAKE_UP)
+    signal.raise_signal(own_functions.WAKE_UP)
 
 
 def silences(frame: RadioFrame, state: State) -> list[bytes] | None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.radio.dot11p import AIFSN_AND_CW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.radio.grid import BusyMeter, Candidates, Heard, Places, SensedGrid, Wanted
-from emulator.scenario.sidelink import LteMode4, NrMode2, Sidelink
+from emulator.scenario.radio import LteMode4, NrMode2, Sidelink
 
 QUIET_DBM, LOUD_DBM = -100.0, -60.0
 

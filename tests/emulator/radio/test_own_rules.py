@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from emulator.drivers.signals import signals_handled
 from emulator.radio.own_rules import OwnRules
-from emulator.scenario import rule_watch
+from emulator.scenario import own_functions
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from tests.support import rules
@@ -243,7 +243,7 @@ def test_a_rule_that_ends_the_process_fails_like_any_other() -> None:
 
 
 def test_a_rule_that_never_answers_is_interrupted_after_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    monkeypatch.setattr(own_functions, "LIMIT_S", 0.05)
     air, free = chatted(rule("loops"), periods=3), chatted(periods=3)
     (failure,) = air.failures
     assert failure.error.startswith("does not answer within 0.05 s of processor time (rules.py:")
@@ -258,11 +258,11 @@ def handled(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     def handler(number: int, frame: FrameType | None) -> None:
         given.append(number)
 
-    monkeypatch.setattr(rule_watch, "WAIT_LIMIT_S", 0.0)
-    monkeypatch.setattr(rule_watch, "LOOK_EVERY_S", 0.01)
-    with signals_handled(handler, rule_watch.WAKE_UP):
+    monkeypatch.setattr(own_functions, "WAIT_LIMIT_S", 0.0)
+    monkeypatch.setattr(own_functions, "LOOK_EVERY_S", 0.01)
+    with signals_handled(handler, own_functions.WAKE_UP):
         yield given
-        assert signal.getsignal(rule_watch.WAKE_UP) is handler
+        assert signal.getsignal(own_functions.WAKE_UP) is handler
 
 
 @pytest.mark.parametrize("name", ["sleeps", "locks_up"])
@@ -277,10 +277,10 @@ def test_a_rule_that_waits_is_interrupted_and_handlers_stay(name: str, handled: 
 def test_other_signals_of_the_kind_reach_the_handler_of_before(
     handled: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rule_watch, "WAIT_LIMIT_S", 1e9)
+    monkeypatch.setattr(own_functions, "WAIT_LIMIT_S", 1e9)
     air = chatted(rule("alarms"), periods=2)
     assert air.failures == []
-    assert handled == [rule_watch.WAKE_UP] * 10
+    assert handled == [own_functions.WAKE_UP] * 10
 
 
 @pytest.mark.parametrize("name", ["sleeps", "locks_up"])
@@ -293,7 +293,7 @@ def test_a_rule_that_waits_on_another_thread_is_left_behind(name: str, handled: 
 
 
 def test_a_rule_that_computes_on_another_thread_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    monkeypatch.setattr(own_functions, "LIMIT_S", 0.05)
     try:
         with ThreadPoolExecutor(1) as pool:
             air = pool.submit(chatted, rule("loops_for_now"), periods=3).result()
@@ -305,7 +305,7 @@ def test_a_rule_that_computes_on_another_thread_is_left_behind(monkeypatch: pyte
 
 
 def test_a_rule_that_catches_everything_is_interrupted_until_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    monkeypatch.setattr(own_functions, "LIMIT_S", 0.05)
     caught = []
 
     def stubborn() -> None:
@@ -318,24 +318,24 @@ def test_a_rule_that_catches_everything_is_interrupted_until_it_ends(monkeypatch
                 if len(caught) == 2:
                     raise
 
-    with pytest.raises(rule_watch.NoAnswerError):
-        rule_watch.call_bounded(stubborn)
+    with pytest.raises(own_functions.NoAnswerError):
+        own_functions.call_bounded(stubborn)
     assert len(caught) == 2
 
 
 def test_on_another_thread_no_handler_is_set(handled: list[int]) -> None:
     with ThreadPoolExecutor(1) as pool:
-        during = pool.submit(rule_watch.call_bounded, signal.getsignal, rule_watch.WAKE_UP).result()
-    assert during is signal.getsignal(rule_watch.WAKE_UP)
-    assert rule_watch.call_bounded(signal.getsignal, rule_watch.WAKE_UP) is not during
+        during = pool.submit(own_functions.call_bounded, signal.getsignal, own_functions.WAKE_UP).result()
+    assert during is signal.getsignal(own_functions.WAKE_UP)
+    assert own_functions.call_bounded(signal.getsignal, own_functions.WAKE_UP) is not during
 
 
 def test_calls_are_bounded_one_by_one_and_not_in_sum(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    monkeypatch.setattr(own_functions, "LIMIT_S", 0.05)
     for _ in range(3):
-        with pytest.raises(rule_watch.NoAnswerError):
-            rule_watch.call_bounded(rules.loops, None, {})
-        assert rule_watch.call_bounded(np.add, 1, 2) == 3
+        with pytest.raises(own_functions.NoAnswerError):
+            own_functions.call_bounded(rules.loops, None, {})
+        assert own_functions.call_bounded(np.add, 1, 2) == 3
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from emulator.faults.plan import FaultPlan, Nodes
+from emulator.fault_plan import FaultPlan, Nodes
 from emulator.scenario import faults
 from emulator.scenario.faults import KINDS, Fault, parse_fault
 from emulator.scenario.loading import dump_scenario, load_scenario, parse_recorded_scenario

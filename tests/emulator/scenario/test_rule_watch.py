@@ -9,9 +9,9 @@ pytestmark = pytest.mark.slow
 
 PROGRAM = """
 import sys
-from emulator.scenario import rule_watch
+from emulator.scenario import own_functions
 
-rule_watch.LIMIT_S = rule_watch.LOOK_EVERY_S = 0.01
+own_functions.LIMIT_S = own_functions.LOOK_EVERY_S = 0.01
 
 def loops():
     while True:
@@ -19,8 +19,8 @@ def loops():
 
 for _ in range(3):
     try:
-        rule_watch.call_bounded(loops)
-    except rule_watch.NoAnswerError:
+        own_functions.call_bounded(loops)
+    except own_functions.NoAnswerError:
         print("interrupted")
 
 def trace(frame, event, argument):

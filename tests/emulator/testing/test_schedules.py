@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, find, given, settings
 from hypothesis.errors import NoSuchExample
 
-from emulator.faults.plan import FaultPlan, Nodes
+from emulator.fault_plan import FaultPlan, Nodes
 from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause, Selector
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import schedule_toml

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.faults.plan import FaultPlan, Nodes
+from emulator.fault_plan import FaultPlan, Nodes
 from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss
 from emulator.world.world import World, build_world

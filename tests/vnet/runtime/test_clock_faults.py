@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.faults.plan import PlannedFault
+from emulator.fault_plan import PlannedFault
 from emulator.scenario.faults import parse_fault
 from emulator.world.gnss_faults import clock_of
 from tests.vnet.runtime.test_host import Over, welcome

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.faults.plan import FaultPlan, Nodes, PlannedFault, partitioned_links, select, stream, swizzle_times_ns
+from emulator.fault_plan import FaultPlan, Nodes, PlannedFault, partitioned_links, select, stream, swizzle_times_ns
 from emulator.scenario.faults import Partition, Selector
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
