@@ -18,6 +18,7 @@ from emulator.analyze import (
     FASTEST,
     NO_CVXPY,
     Links,
+    convergence_factor,
     fastest_mixing_matrix,
     has_cvxpy,
     hears_matrix,
@@ -28,7 +29,6 @@ from emulator.analyze import (
     ratio_matrix,
 )
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
-from emulator.linear_model import convergence_factor
 from emulator.pages.palette import PALETTE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world

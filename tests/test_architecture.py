@@ -25,7 +25,7 @@ LAYERS = (
     ("emulator.world",),
     ("emulator.radio",),
     ("emulator.records",),
-    ("emulator.pages", "emulator.linear_model"),
+    ("emulator.pages",),
     ("emulator.checks", "emulator.stream", "emulator.export"),
     ("emulator.viewer", "emulator.report"),
     ("emulator.drivers",),

@@ -23,8 +23,7 @@ from emulator.cells.cells import Cell, has_result, read_result, run_cells
 from emulator.cells.programs import checked_function, entry_of, require_importable, with_folder_of
 from emulator.records.atomic import atomically, write_atomically
 from emulator.records.run_folder import RUNS
-from emulator.records.studies import SWEEP_PAGE, SWEEP_TABLE
-from emulator.report.index import write_index
+from emulator.report.index import SWEEP_PAGE, SWEEP_TABLE, write_index
 from emulator.report.sweep_page import PROGRAM, sweep_page
 from emulator.scenario.loading import Source, hinting, scenario_of
 from emulator.scenario.program import from_here

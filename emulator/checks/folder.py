@@ -27,7 +27,6 @@ from emulator.checks.own import PREFIX
 from emulator.radio.engine import Engine
 from emulator.records.code_digest import vnet_digest
 from emulator.records.costs import Costs, PayloadSizes, RunCost, run_cost
-from emulator.records.driven_table import driving_figures
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, EventKind, kinds_with
 from emulator.records.manifest import differing_files, read_manifest
 from emulator.records.metrics import rows_of, sha256_of_rows, summarize
@@ -37,7 +36,7 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.recorded_world import ARRAYS, RecordedWorld
 from emulator.records.reported import reported_figures
 from emulator.records.run_folder import MANIFEST_FILE, SCENARIO_FILE, VERDICT_FILE, WORLD_FILE
-from emulator.records.tables import BACKBONE, BUSY, DRIVEN, PAYLOADS, STATES, backbone_figures
+from emulator.records.tables import BACKBONE, BUSY, DRIVEN, PAYLOADS, STATES, backbone_figures, driving_figures
 from emulator.records.verdicts import (
     MOST_ROWS,
     CheckResult,

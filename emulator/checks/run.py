@@ -15,8 +15,7 @@ from emulator.records.distributions import lowest_share
 from emulator.records.events import Event, EventKind, in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
-from emulator.records.run_tables import VALUES_AS_LIST
-from emulator.records.tables import STATES
+from emulator.records.tables import STATES, VALUES_AS_LIST
 from emulator.records.verdicts import (
     MOST_ROWS,
     NO_FAULTS,

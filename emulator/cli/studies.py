@@ -73,8 +73,7 @@ def sweep(
     set or varied. Finished runs are kept: after Ctrl-C the same command goes on. Ends with status 0 when all runs
     are there, whatever their verdicts, which the table has.
     """
-    from emulator.cells.cells import run_cells
-    from emulator.cells.executors import open_executor
+    from emulator.cells.cells import open_executor, run_cells
     from emulator.cells.sweep import (
         NETWORK_SEED,
         SweepPlan,
@@ -83,7 +82,7 @@ def sweep(
         parse_shard,
         write_sweep,
     )
-    from emulator.records.studies import SWEEP_PAGE, SWEEP_TABLE
+    from emulator.report.index import SWEEP_PAGE, SWEEP_TABLE
     from emulator.report.sweep_page import PROGRAM, too_few
 
     with one_line_errors():
@@ -195,7 +194,7 @@ def campaign(
     ] = 300.0,
 ) -> None:
     """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
-    from emulator.cells.executors import open_executor
+    from emulator.cells.cells import open_executor
     from emulator.testing.campaign import run_campaign
     from emulator.testing.campaign_plan import Plan, parse_ranges
 

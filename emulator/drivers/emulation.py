@@ -33,12 +33,11 @@ from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.radio.topology import connectivity_of
 from emulator.records.costs import Costs
-from emulator.records.driven_table import driven_table
 from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
 from emulator.records.run_folder import RunFolder
 from emulator.records.samples import SampleRecorder
-from emulator.records.tables import PayloadRecorder, background_table
+from emulator.records.tables import PayloadRecorder, background_table, driven_table
 from emulator.records.tape import MediumOrder, TapeEntry, first_left, parse_tape, read_tape
 from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.program import Program, RoadsideUnit

@@ -27,8 +27,7 @@ from emulator.radio.topology import connectivity_of
 from emulator.radio.trace import ACKNOWLEDGED, LATE
 from emulator.records.events import CUTS_RUN, ENDS_PROGRAM, Event, EventKind, kinds_with, parse_events
 from emulator.records.period_figures import ProgramFigures, Views, figures_if_here
-from emulator.records.positions import Places
-from emulator.records.recorded_world import RecordedWorld
+from emulator.records.recorded_world import Places, RecordedWorld
 from emulator.records.reported import numbers_of, reported_columns, value_columns
 from emulator.records.run_folder import (
     EVENTS_FILE,
@@ -41,13 +40,13 @@ from emulator.records.run_folder import (
     is_run_folder,
     not_finished,
 )
-from emulator.records.run_tables import VALUES_AS_LIST, open_table
 from emulator.records.tables import (
     BUSY,
     METRICS,
     PAYLOADS,
     STATES,
     TRACE,
+    VALUES_AS_LIST,
     Column,
     Condition,
     KeptPayloads,
@@ -55,6 +54,7 @@ from emulator.records.tables import (
     always,
     busy_windows,
     columns_of,
+    open_table,
 )
 from emulator.records.verdicts import MOST_ROWS, Record, read_record
 from emulator.scenario.faults import ProcessFault, Range, SenderFault, Swizzle

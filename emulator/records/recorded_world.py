@@ -1,7 +1,11 @@
-"""The world as a run's folder keeps it beside the states, so that no input file has to be there: `world.npz`."""
+"""The world as a run's folder keeps it, in `world.npz` and the states, so that no input file has to be there.
+
+`Places` has the positions of vehicles when a frame was sent, and who was then in range of whom.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.radio.topology import Connectivity, distances_m
 from emulator.world.buildings import LEAST_CORNERS, Buildings
 from emulator.world.input_files import read_arrays
+from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import LinkTable, RadioInputs
 from emulator.world.world import World
 from vnet.bounded import open_regular
@@ -43,6 +49,8 @@ BUILDINGS = ("building_corner_m", "building_first", "building_number")
 LINKS = ("link_time_ns", "link_sender", "link_receiver", "link_loss")
 OPTIONAL = ("links", *LINKS, *BUILDINGS, "receiver_m")
 """Arrays that may be missing."""
+MOST_KEPT = 1_000_000
+"""Links of epochs that are kept, in all (24 MB): several checks ask for them, and buildings make them expensive."""
 
 
 @dataclass(frozen=True)
@@ -174,3 +182,167 @@ def _has(path: Path, what: str, names: tuple[str, ...], arrays: dict[str, NDArra
     if len(present) not in (0, len(names)):
         raise VnetError(f"{path}: of the arrays of {what} only {', '.join(present)}")
     return bool(present)
+
+
+class Places:
+    """Positions (K, N, 2) of K periods, or of one (K = 1) where nobody moves; NaN where a vehicle was not there.
+
+    `connectivity` says who is in range of whom. That is constant within each of the E *epochs*, which begin with
+    periods where vehicles move, and where links are given over time. The last one ends at `end_ns`.
+    """
+
+    def __init__(
+        self, position_m: Array, moves: bool, period_ns: int, connectivity: Connectivity, end_ns: int
+    ) -> None:
+        self._position_m = position_m
+        self._moves = moves
+        self._period_ns = period_ns
+        self._connectivity = connectivity
+        periods_ns = np.arange(len(position_m)) * period_ns
+        self._end_ns = len(position_m) * period_ns if moves else end_ns
+        changes_ns = connectivity.changes_ns
+        known = changes_ns < (self._end_ns if len(position_m) else 0)
+        self.starts_ns = np.union1d(periods_ns, changes_ns[known])
+        """Times at which epochs begin."""
+        self._kept: dict[int, Links] = {}
+        self._room = MOST_KEPT
+
+    def index(self, time_ns: IntArray) -> IntArray:
+        """Index of the position, of the K, at each of these instants."""
+        return np.asarray(time_ns // self._period_ns if self._moves else np.zeros_like(time_ns))
+
+    def known(self, time_ns: IntArray) -> Mask:
+        """Mask of the instants at which positions are known: those of the periods that the run completed."""
+        return np.asarray(self.index(time_ns) < len(self._position_m))
+
+    def present(self) -> Mask:
+        """(K, N), who was there."""
+        return np.isfinite(self._position_m[..., 0])
+
+    def position_m(self, index: int) -> Array:
+        """(N, 2) of one of the K; the last of them for all later ones. Raises VnetError if K is 0."""
+        if not len(self._position_m):
+            raise VnetError("no period was completed, and no position is known")
+        return np.asarray(self._position_m[min(index, len(self._position_m) - 1)])
+
+    def distance_m(self, index: int) -> Array:
+        """(N, N) between vehicles."""
+        return distances_m(self.position_m(index))
+
+    def links(self, time_ns: int) -> Links:
+        """Links of a sender and a receiver in its range."""
+        epoch = int(self._epoch(np.array([time_ns]))[0])
+        if epoch not in self._kept:
+            links = self._connectivity_at(time_ns).links(self._position_at(time_ns))
+            if len(links.sender) > self._room:
+                return links
+            self._kept[epoch], self._room = links, self._room - len(links.sender)
+        return self._kept[epoch]
+
+    def _connectivity_at(self, time_ns: int) -> Connectivity:
+        self._connectivity = self._connectivity.at(time_ns)  # the next time is often a later one
+        return self._connectivity
+
+    def _position_at(self, time_ns: int) -> Array:
+        return self.position_m(int(self.index(np.array([time_ns]))[0]))
+
+    def power_mw(self, time_ns: int) -> Array:
+        """(N, N), rows are senders: the mean power of signals, 0 out of range."""
+        position_m = self._position_at(time_ns)
+        return self._connectivity_at(time_ns).power_mw(position_m, distances_m(position_m))
+
+    def pair_distances_m(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
+        """Distances (n,) in m from senders to receivers at these instants; NaN where they are not known."""
+        there = self.known(time_ns)
+        index, sender, receiver = self.index(time_ns)[there], sender[there], receiver[there]
+        offset = self._position_m[index, sender] - self._position_m[index, receiver]
+        distance_m = np.full(len(there), np.nan)
+        distance_m[there] = np.hypot(offset[:, 0], offset[:, 1])
+        return distance_m
+
+    def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Mask:
+        """Mask (n,) of the senders and receivers in range at these instants; False where that is not known."""
+        found = np.zeros(len(time_ns), dtype=bool)
+        for start_ns, rows in self._rows_by_epoch(time_ns):
+            found[rows] = self.links(start_ns).contain(sender[rows], receiver[rows])
+        return found
+
+    def pair_losses(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array | None:
+        """Loss probabilities (n,) of pairs in range at these instants; None if they are `radio.loss`."""
+        if not len(self._connectivity.changes_ns):
+            return None
+        found = np.full(len(time_ns), np.nan)
+        for start_ns, rows in self._rows_by_epoch(time_ns):
+            losses = self._connectivity_at(start_ns).losses(sender[rows], receiver[rows])
+            assert losses is not None
+            found[rows] = losses
+        return found
+
+    def pair_powers_mw(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
+        """With which mean power signals arrive at these instants; 0 out of range, or where that is not known."""
+        found = np.zeros(len(time_ns))
+        for start_ns, rows in self._rows_by_epoch(time_ns):
+            found[rows] = self.power_mw(start_ns)[sender[rows], receiver[rows]]
+        return found
+
+    def _epoch(self, time_ns: IntArray) -> NDArray[np.intp]:
+        """Number of the epoch at each of these instants; the last one goes on."""
+        return np.maximum(np.searchsorted(self.starts_ns, time_ns, side="right") - 1, 0)
+
+    def _rows_by_epoch(self, time_ns: IntArray) -> Iterator[tuple[int, NDArray[np.intp]]]:
+        """Yield the start of each epoch and the instants (of n) that are in it, if their positions are known."""
+        rows = np.flatnonzero(self.known(time_ns))
+        epoch = self._epoch(time_ns[rows])
+        order = np.argsort(epoch, kind="stable")
+        rows, epoch = rows[order], epoch[order]
+        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(epoch)) + 1):
+            if len(some):
+                yield int(self.starts_ns[epoch[some[0]]]), rows[some]
+
+    @cached_property
+    def _degrees(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """(E, N) each: how many are in range of a sender, and how many a receiver has in range."""
+        all_pairs = (self.links(start_ns) for start_ns in self.starts_ns.tolist())
+        both = [(pairs.out_degrees(), pairs.in_degrees()) for pairs in all_pairs]
+        out, into = zip(*both, strict=True) if both else ((), ())
+        shape = len(self.starts_ns), self._position_m.shape[1]
+        return np.array(out, np.intp).reshape(shape), np.array(into, np.intp).reshape(shape)
+
+    def receivers_in_range(self, sender: NDArray[np.intp], time_ns: IntArray) -> NDArray[np.intp]:
+        """Number of vehicles in range of each of these senders at these instants; -1 where that is not known."""
+        count = np.full(len(sender), -1, dtype=np.intp)
+        there = self.known(time_ns)
+        count[there] = self._degrees[0][self._epoch(time_ns[there]), sender[there]]
+        return count
+
+    def senders_in_range(self, index: int) -> NDArray[np.intp]:
+        """(N,), how many each receiver has in range at the start of a period."""
+        return np.asarray(self._degrees[1][self._epoch(np.array([index * self._period_ns]))[0]])
+
+    def mean_senders_in_range(self) -> Array:
+        """(N,), how many each receiver has in range, in the mean over the time in which it is there."""
+        epoch_ns = np.diff(self.starts_ns, append=self._end_ns)
+        present = self.present()[self.index(self.starts_ns)]
+        return np.asarray(epoch_ns @ self._degrees[1] / np.maximum(epoch_ns @ present, 1))
+
+    @property
+    def most_in_range(self) -> int:
+        """Largest number of senders that any receiver ever had in range."""
+        return int(self._degrees[1].max(initial=0))
+
+    @cached_property
+    def ever_lonely(self) -> Mask:
+        """(N,), who had nobody in range, or was not there itself, at some time, and somebody at another."""
+        lonely = self._degrees[0] == 0
+        return np.asarray(lonely.any(axis=0) & ~lonely.all(axis=0))
+
+    @cached_property
+    def always_in_range(self) -> Mask:
+        """(N,), who had somebody in range throughout: each of its frames has rows."""
+        return np.asarray((self._degrees[0] > 0).all(axis=0))
+
+    def were_lonely(self, sender: NDArray[np.intp], start_ns: IntArray, end_ns: IntArray) -> Mask:
+        """(n,), whether each of these senders had nobody in range at some time from one instant to another."""
+        lonely = np.cumsum(self._degrees[0] == 0, axis=0)
+        before = np.vstack([np.zeros_like(lonely[:1]), lonely])
+        return np.asarray(lonely[self._epoch(end_ns), sender] > before[self._epoch(start_ns), sender])

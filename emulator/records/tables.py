@@ -6,22 +6,38 @@ the code that fills it (`emulator.drivers.conclude.gather`); `recorded.table(…
 
 from __future__ import annotations
 
+import os
+import resource
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.trace import payload_digest
+from emulator.records.events import Event, EventKind
 from emulator.records.period_figures import NUMBER, NUMBERS, PeriodFigures, ProgramFigures
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.stepped import Background
+from emulator.world.driven.vehicles import Log
+from vnet.bounded import open_regular
 from vnet.errors import VnetError
 from vnet.types import Array
+
+BYTES_A_VALUE = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "BYTE_ARRAY": 4}
+"""Memory of a value by its type in the file; texts are kept once, and have a number of 4 bytes each."""
+LARGEST_RATIO = 1000
+"""Bytes of memory for a byte of a file; runs have written 15 at most."""
+LEAST_BOUND_BYTES = 1 << 26
+"""Memory that every table may take."""
+VALUES_AS_LIST = pa.list_(pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))]))
+"""The type of the states' column `values` as a list, which more functions of Arrow know than maps."""
 
 
 class _NoPandas:
@@ -407,3 +423,78 @@ class KeptPayloads:
         """Return the payload of a frame; None if no digest is its own, as where a fault has altered it."""
         payload = self._payload.get((sender, seq))
         return payload if payload is not None and payload_digest(payload) in digests else None
+
+
+def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
+    """Open a Parquet file that others may have written, before memory is taken for its rows.
+
+    Raises OSError, ArrowException, and ValueError for a pipe or a device, and for a file whose rows, or those of
+    its `columns`, would take more memory than it has contents for, or than this machine has.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+    table = pq.ParquetFile(path.absolute())
+    metadata = table.metadata
+    needed = 0
+    for group in range(metadata.num_row_groups):
+        for number in range(metadata.num_columns):
+            column = metadata.row_group(group).column(number)
+            if columns is None or any(f"{column.path_in_schema}.".startswith(f"{name}.") for name in columns):
+                needed += column.num_values * BYTES_A_VALUE.get(column.physical_type, 16)
+    for bound, why in (
+        (max(LEAST_BOUND_BYTES, LARGEST_RATIO * size), f"and it has {size:,} bytes itself"),
+        (max(LEAST_BOUND_BYTES, available_bytes() // 2), "and half of the memory that is available is less"),
+    ):
+        if needed > bound:
+            raise ValueError(f"{metadata.num_rows:,} rows need {needed / 1e6:,.0f} MB, {why}")
+    return table
+
+
+def available_bytes() -> int:
+    """Return the memory that this process may still take: the machine's, or what its limit leaves."""
+    try:
+        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        available = int(lines["MemAvailable"].split()[0]) * 1024
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except (OSError, KeyError, ValueError):
+        return sys.maxsize
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return available if limit == resource.RLIM_INFINITY else max(0, min(available, limit - taken))
+
+
+_TIME, _NODE, *QUANTITIES = DRIVEN.columns
+"""The columns besides time and vehicle are in the order of the log's rows."""
+
+
+def driven_table(log: Log, node_ids: Sequence[str]) -> pa.Table:
+    """Return a row for each control instant and vehicle; NaN for a vehicle that has left."""
+    count, instants = len(node_ids), len(log.time_ns)
+    node = pa.array(np.tile(np.arange(count, dtype=np.int32), instants))
+    rows = np.array(log.rows).reshape(instants, len(QUANTITIES), count)
+    columns = {name: pa.array(rows[:, index].ravel()) for index, name in enumerate(QUANTITIES)}
+    return pa.table(
+        {
+            "time_ns": pa.array(np.repeat(np.array(log.time_ns, dtype=np.int64), count)),
+            "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
+            **columns,
+        },
+        DRIVEN.schema,
+    )
+
+
+def of_vehicles(table: pa.Table, name: str, count: int) -> tuple[Array, Array]:
+    """Return times (K,) in s and one quantity of all `count` vehicles (K, N) of such a table."""
+    time_s = table["time_ns"].to_numpy()[::count] / 1e9
+    return time_s, np.asarray(table[name].to_numpy()).reshape(len(time_s), count)
+
+
+def driving_figures(table: pa.Table | None, events: Sequence[Event]) -> dict[str, float | None]:
+    """Return the figures of a run in which programs drive: collisions, limited actions, hardest braking (m/s²)."""
+    if table is None:
+        return {}
+    lowest = pc.min(pc.if_else(pc.is_nan(table["acceleration_m_s2"]), None, table["acceleration_m_s2"])).as_py()
+    return {
+        "collisions": sum(event.kind == EventKind.collision for event in events),
+        "limited_actions": sum(event.kind == EventKind.drive_limited for event in events),
+        "hardest_braking_m_s2": None if lowest is None else max(0.0, -lowest),
+    }

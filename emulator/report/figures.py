@@ -29,12 +29,11 @@ from emulator.pages.canvas import (
 from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.radio.topology import component_links
 from emulator.records.distributions import binomial_interval
-from emulator.records.driven_table import of_vehicles
 from emulator.records.events import EventKind
 from emulator.records.metrics import anees_band
 from emulator.records.period_figures import DeclaredChart
 from emulator.records.radio_metrics import BIN_M
-from emulator.records.tables import DRIVEN
+from emulator.records.tables import DRIVEN, of_vehicles
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, faults_note, time_figure
 from emulator.report.map_figures import map_charts
 from emulator.report.program_figures import Drawers, program_charts

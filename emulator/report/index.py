@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -12,25 +13,83 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import pyarrow as pa
+from pydantic import TypeAdapter, ValidationError
+
 from emulator.pages.page import put_page, render
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE, is_run_folder
-from emulator.records.studies import (
-    CAMPAIGN_FILE,
-    CAMPAIGN_PAGE,
-    SWEEP_PAGE,
-    SWEEP_TABLE,
-    read_campaign,
-    read_sweep,
-)
-from emulator.records.verdicts import Record
-from vnet.errors import VnetError, first_names
+from emulator.records.tables import open_table
+from emulator.records.verdicts import Record, Verdict
+from emulator.scenario.sections import first_problem
+from vnet.bounded import read_bounded
+from vnet.errors import VnetError, first_names, printable
 
+CAMPAIGN_FILE, CAMPAIGN_PAGE = "campaign.json", "campaign.html"
+SWEEP_TABLE, SWEEP_PAGE = "sweep.parquet", "sweep.html"
+LARGEST_BYTES = 256 * 2**20
 MOST_REPORTED = 6
 """Values of programs' own that have a column: those that most runs report."""
 Number = tuple[str, str, str]
 """A number in a row: the key by which its column is sorted, its text, and a smaller text below."""
 NONE: Number = ("", "–", "")
+
+
+@dataclass(frozen=True)
+class CampaignRecord:
+    """The fields of campaign.json that a list of campaigns needs."""
+
+    seed: int
+    runs: int
+    kinds: list[str]
+    results: list[dict[str, Any]]
+    drawn_from: str = ""
+    """Digest of what decides which runs can be drawn; "" in campaigns of earlier versions."""
+
+    @property
+    def failed(self) -> int:
+        """Number of runs that have failed."""
+        return sum("failed" in result for result in self.results)
+
+
+_RECORD = TypeAdapter(CampaignRecord)
+
+
+def read_campaign(folder: Path) -> CampaignRecord:
+    """Read the campaign.json of a folder. Raises VnetError where it is not what vnet writes."""
+    path = folder / CAMPAIGN_FILE
+    try:
+        return _RECORD.validate_python(json.loads(read_bounded(path, LARGEST_BYTES)))
+    except OSError as error:
+        raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except ValidationError as error:
+        raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
+    except (ValueError, RecursionError) as error:
+        raise VnetError(f"{path}: not JSON: {error}") from None
+
+
+@dataclass(frozen=True)
+class SweepRecord:
+    """The contents of sweep.parquet that a list of sweeps needs."""
+
+    varied: list[str]
+    runs: int
+    not_valid: int
+
+
+def read_sweep(folder: Path) -> SweepRecord:
+    """Read the sweep.parquet of a folder. Raises VnetError where it is not what vnet writes."""
+    path = folder / SWEEP_TABLE
+    try:
+        file = open_table(path, ["verdict"])
+        names = file.schema_arrow.names
+        varied = names[: names.index("seed")]
+        verdicts = file.read(["verdict"])["verdict"].to_pylist()
+    except OSError as error:
+        raise VnetError(f"{path}: cannot be read: {error.strerror or printable(str(error), 200)}") from None
+    except (ValueError, KeyError, pa.ArrowException) as error:
+        raise VnetError(f"{path}: not the table of a sweep: {printable(str(error), 200)}") from None
+    return SweepRecord(varied, len(verdicts), sum(verdict != Verdict.VALID for verdict in verdicts))
 
 
 @dataclass(frozen=True)

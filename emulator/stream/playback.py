@@ -18,8 +18,16 @@ from emulator.records.metrics import rows_of
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import is_text, numbers_of
 from emulator.records.run_folder import WORLD_FILE, check_is_run
-from emulator.records.run_tables import VALUES_AS_LIST
-from emulator.records.tables import BACKGROUND, BUSY, METRICS, STATES, busy_windows, mean_busy, positions_by_time
+from emulator.records.tables import (
+    BACKGROUND,
+    BUSY,
+    METRICS,
+    STATES,
+    VALUES_AS_LIST,
+    busy_windows,
+    mean_busy,
+    positions_by_time,
+)
 from emulator.stream.messages import Beliefs, event_message, period_message, scene_message
 from emulator.world.world import Instant
 from vnet.errors import VnetError

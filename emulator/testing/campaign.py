@@ -43,9 +43,8 @@ from emulator.records.distributions import lowest_share
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
-from emulator.records.studies import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.verdicts import Verdict
-from emulator.report.index import write_index
+from emulator.report.index import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign, write_index
 from emulator.report.source import Source, maybe
 from emulator.report.timeline import timeline
 from emulator.scenario.loading import dump_scenario, load_scenario

@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from emulator.cells.executors import WorkerPool, worker_died
+from emulator.cells.cells import WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
 from emulator.checks.replay import compare_tables, first_call

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomli_w
 
-from emulator.cells.executors import each_done
+from emulator.cells.cells import each_done
 from emulator.drivers.session import Local, Session, with_order_steps
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import scenario_of

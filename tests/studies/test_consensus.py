@@ -6,9 +6,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.analyze import FASTEST, is_connected, mutual
+from emulator.analyze import FASTEST, convergence_factor, is_connected, mutual
 from emulator.cells.cells import Cell, compute, keep
-from emulator.linear_model import convergence_factor
 from studies import consensus as subject
 from studies.consensus import (
     LATENCIES_MS,

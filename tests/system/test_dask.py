@@ -13,8 +13,7 @@ from distributed import Client, LocalCluster
 
 import emulator
 from emulator.cells import cells
-from emulator.cells.cells import WALL_CLOCK
-from emulator.cells.executors import open_executor
+from emulator.cells.cells import WALL_CLOCK, open_executor
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from unittest.mock import patch
 
 import pytest
 
-from emulator.cells.executors import WorkerPool, each_done, open_executor
+from emulator.cells.cells import WorkerPool, each_done, open_executor
 from emulator.cells.worker import Place, Worker, WorkerDiedError, WorkerTimeoutError, call_fitly, is_fit
 from emulator.scenario.scenario import Scenario
 from tests.support.paths import ROOT
@@ -134,7 +134,7 @@ def try_it(work: Work) -> int:
 def test_a_job_whose_worker_dies_is_run_again_but_not_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("emulator.cells.executors.MOST_TRIES", 2)
+    monkeypatch.setattr("emulator.cells.cells.MOST_TRIES", 2)
     works = [Work(Scenario(), {"seed": deaths}, tmp_path / str(deaths), deaths) for deaths in (1, 2)]
     done = each_done(works, try_it, most=1)
     assert next(done) == (works[0], 2)
@@ -161,6 +161,6 @@ def test_a_pool_that_is_closed_gives_up_what_it_does() -> None:
     ],
 )
 def test_an_executor_that_is_none_is_one_line(address: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.cells.executors.DASK_PATIENCE_S", 0.2)
+    monkeypatch.setattr("emulator.cells.cells.DASK_PATIENCE_S", 0.2)
     with pytest.raises(VnetError, match=f"^--executor {address}: {message}"), open_executor(address):
         pass

@@ -54,7 +54,7 @@ def typed(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(options, "_at_a_terminal", lambda: True)
-    monkeypatch.setattr("emulator.cells.executors.DASK_PATIENCE_S", 0.2)
+    monkeypatch.setattr("emulator.cells.cells.DASK_PATIENCE_S", 0.2)
     monkeypatch.setenv("PYTHONHASHSEED", "0")  # or commands would start again
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from emulator.checks.judge import check_run
-from emulator.records import run_tables
+from emulator.records import tables
 from emulator.scenario.scenario import Scenario
 from emulator.stream.playback import messages
 from tests.support.recorded import recorded
@@ -110,18 +110,18 @@ def test_a_table_of_many_more_rows_than_the_verdict_speaks_of_is_refused(copy: P
 def test_a_table_is_bounded_by_its_contents_and_by_the_memory_that_there_is(
     copy: Path, bound: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_tables, "LEAST_BOUND_BYTES", 1)
-    monkeypatch.setattr(run_tables, bound, (lambda: 1000) if bound == "available_bytes" else 0)
+    monkeypatch.setattr(tables, "LEAST_BOUND_BYTES", 1)
+    monkeypatch.setattr(tables, bound, (lambda: 1000) if bound == "available_bytes" else 0)
     for read in (lambda: check_run(copy), lambda: list(messages(copy))):
         with pytest.raises(VnetError, match=r"rows need \d+ MB"):
             read()
 
 
 def test_the_memory_that_there_is_counts_the_limit_of_the_process() -> None:
-    unlimited = run_tables.available_bytes()
+    unlimited = tables.available_bytes()
     limits = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (1 << 40, limits[1]))
     try:
-        assert run_tables.available_bytes() <= max(unlimited, 1 << 40)
+        assert tables.available_bytes() <= max(unlimited, 1 << 40)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, limits)
