@@ -31,8 +31,8 @@ from rerun.experimental import ViewerClient
 from emulator.records.period_figures import program_figures
 from emulator.records.run_folder import RECORDING
 from emulator.scenario.program import Program
-from emulator.viewer.blueprints import Content, blueprint
 from emulator.viewer.drawing import POSITION
+from emulator.viewer.recorder import Content, blueprint
 from emulator.viewer.sinks import place_to_serve, viewer_command
 
 SCENARIO = Path(__file__).parent / "pictures" / "pictures.toml"

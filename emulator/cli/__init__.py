@@ -33,13 +33,13 @@ def main() -> None:
         fix_hash_seed("emulator.cli")  # before any import that takes long, because it starts this process again
     from emulator.cli.application import build_app
     from emulator.cli.own_child import leave, this_process_is_a_command
-    from emulator.terminal import console, standard_output
+    from emulator.terminal import console
 
-    standard_output.tolerate_failures()
+    console.tolerate_failures()
     this_process_is_a_command()
     status = console.run_app(build_app([] if command is None else [command]), arguments)
     interrupts.finish(status)
-    if failure := standard_output.failure():
+    if failure := console.failure():
         status = console.say_output_failed(failure, arguments)
     leave(status)
 

@@ -19,8 +19,8 @@ import typer
 
 from emulator.checks.own import load_checks
 from emulator.cli.access import create_access, load_or_create_access
+from emulator.cli.folders import report_at_end
 from emulator.cli.options import DEFAULT_ADDRESS, DEFAULT_LISTEN, OutputOptions
-from emulator.cli.report import report_at_end
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.determinism import calls_recorded, run_again
 from emulator.drivers.emulation import Emulation
@@ -35,10 +35,9 @@ from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import recorded_code
 from emulator.scenario.scenario import Scenario
-from emulator.terminal.console import LogFormat, say_first, tell
+from emulator.terminal.console import LogFormat, StandardOutput, say_first, tell
 from emulator.terminal.live import SafeConsole
 from emulator.terminal.progress import Progress, show_progress
-from emulator.terminal.standard_output import StandardOutput
 from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import World

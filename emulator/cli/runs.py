@@ -33,8 +33,7 @@ from emulator.cli.own_child import OwnChild, may_fork
 from emulator.scenario.faults import refuse_router_restart
 from emulator.scenario.loading import find_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.terminal.console import one_line_errors, say_first
-from emulator.terminal.standard_output import result_only
+from emulator.terminal.console import one_line_errors, result_only, say_first
 from emulator.viewer.sinks import choose_sinks
 from vnet.errors import VnetError
 from vnet.extras import require

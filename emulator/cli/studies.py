@@ -23,9 +23,8 @@ from emulator.cli.options import (
     load,
 )
 from emulator.scenario.loading import parse_values
-from emulator.terminal.console import one_line_errors, tell
+from emulator.terminal.console import one_line_errors, result_only, tell
 from emulator.terminal.live import SafeConsole
-from emulator.terminal.standard_output import result_only
 from vnet.errors import VnetError, printable
 from vnet.extras import require
 

@@ -66,8 +66,8 @@ COMMANDS = (
     Command("access", Panel.RUN, "access", "access", "Write the users and rules of a separate router (zenohd)."),
     Command("status", Panel.LOOK, "fault", "status", "Show how a run that is on is getting on."),
     Command("check", Panel.LOOK, "folders", "check", "Judge a finished run again."),
-    Command("report", Panel.LOOK, "report", "report", "Write a run's report, or a list of runs, as a page."),
-    Command("compare", Panel.LOOK, "report", "compare", "Set two runs side by side, and show where they part."),
+    Command("report", Panel.LOOK, "folders", "report", "Write a run's report, or a list of runs, as a page."),
+    Command("compare", Panel.LOOK, "folders", "compare", "Set two runs side by side, and show where they part."),
     Command(
         "radio", Panel.LOOK, "export", "radio", "Show delivery by distance, latency, age, and the worst links."
     ),
@@ -107,7 +107,7 @@ COMMANDS = (
         "record", Panel.FILES, "viewing", "record", "Watch a run from outside, and write a Rerun recording of it."
     ),
     Command("render", Panel.FILES, "viewing", "render", "Write a finished run's recording again from its files."),
-    Command("docs", Panel.FILES, "docs", "docs", "Read the documentation: list its pages, or print one."),
+    Command("docs", Panel.FILES, "new", "docs", "Read the documentation: list its pages, or print one."),
     Command("map", Panel.FILES, "map", "app", "Look at maps, and convert them."),
 )
 

@@ -50,10 +50,15 @@ from emulator.report.timeline import timeline
 from emulator.scenario.loading import dump_scenario, load_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import Plan, with_seed
-from emulator.testing.shrinking import (
+from emulator.testing.trial import (
+    EMULATOR,
+    HUNG,
     MOST_ORDER_STEPS,
     MOST_STEPS,
+    REPLAY,
     Schedule,
+    Trial,
+    TrialPool,
     order_text,
     shrink,
     shrink_order,
@@ -61,7 +66,6 @@ from emulator.testing.shrinking import (
     with_faults,
     with_tape,
 )
-from emulator.testing.trial import EMULATOR, HUNG, REPLAY, Trial, TrialPool
 from vnet.counted import counted
 from vnet.errors import VnetError, printable
 from vnet.units import NS_PER_S

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli import report as report_cli
+from emulator.cli import folders as report_cli
 from emulator.cli.commands import app
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun

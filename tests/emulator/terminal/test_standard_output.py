@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from emulator.records.run_folder import PROGRAMS_LOG
-from emulator.terminal.standard_output import result_only
+from emulator.terminal.console import result_only
 from tests.support.paths import ROOT
 
 TALKATIVE = """

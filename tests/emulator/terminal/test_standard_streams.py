@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.terminal.standard_output import Tolerant
+from emulator.terminal.console import Tolerant
 from tests.support.paths import ROOT
 
 VNET = [sys.executable, "-P", "-m", "emulator"]

@@ -12,8 +12,8 @@ from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause, Select
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import schedule_toml
 from emulator.testing.campaign_plan import Plan, ScheduleConstraints, known_kinds, simulated_kinds
-from emulator.testing.shrinking import Schedule, shrink
 from emulator.testing.strategies import faults
+from emulator.testing.trial import Schedule, shrink
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError
 

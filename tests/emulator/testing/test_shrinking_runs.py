@@ -14,7 +14,7 @@ from emulator.records.tape import tape_lines
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import FAILURE_PAGE, PARTING_FILE, TEST_FILE, run_campaign
 from emulator.testing.campaign_plan import Plan
-from emulator.testing.shrinking import fewest, order_text
+from emulator.testing.trial import fewest, order_text
 from tests.emulator.testing.test_campaign import said_by_pytest
 from vnet.transport.wire import Deviation
 
