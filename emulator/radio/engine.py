@@ -43,18 +43,19 @@ from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
 from emulator.radio.propagation import transmit_powers_dbm
-from emulator.radio.reception import Reception, Signals
-from emulator.radio.sidelink import Sidelink, SidelinkReception
-from emulator.radio.stages import (
+from emulator.radio.reception import (
     LatencyStage,
     LossStage,
+    Reception,
     RoundedUp,
+    Signals,
     change_by_faults,
     in_range,
     lose_by_faults,
     peer_cap,
     sender_side,
 )
+from emulator.radio.sidelink import Sidelink, SidelinkReception
 from emulator.radio.topology import Topology, connectivity_of
 from emulator.radio.trace import CHOSEN, PERIOD, Trace, payload_digest
 from emulator.radio.unicast import Unicasts

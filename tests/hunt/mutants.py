@@ -58,7 +58,7 @@ interference | reception | others_mw = np.maximum(total_mw - own_mw, 0.0) | othe
 tail bits | dot11p | (SERVICE_AND_TAIL_BITS + 8 * size_bytes) | (8 * size_bytes)
 smoothing | csma | + 0.25 * both_ratios | + 0.5 * self._meter.busy_ratio[over]
 window | csma | (self.window + 1 << attempts) - 1, self | self.window + 1 << attempts, self
-tick | stages | -(-arrival_ns // self._tick_ns) | (arrival_ns // self._tick_ns)
+tick | reception | -(-arrival_ns // self._tick_ns) | (arrival_ns // self._tick_ns)
 peer cap | topology | candidate & (rank < self._max_peers) | candidate & (rank <= self._max_peers)
 nav | unicast | max(idle_ns, int(self._nav_ns[node]), int( | max(idle_ns, int(
 emulator/drivers

@@ -44,7 +44,7 @@ def add_to(name: str, before: str, added: str) -> None:
 def jam_every_second_frame() -> None:
     """Give the outcome to every reception of every second frame that comes as far as random loss."""
     from emulator.radio.outcomes import PENDING, Outcome
-    from emulator.radio.stages import LossStage
+    from emulator.radio.reception import LossStage
 
     lose = LossStage.__call__
 

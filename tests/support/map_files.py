@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from emulator.world.maps.graph import write_graph
+from emulator.world.maps.formats import write_graph
 from emulator.world.maps.roads import Roads, RoadsBuilder
 
 Point = tuple[float, float]

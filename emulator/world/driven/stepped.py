@@ -16,10 +16,9 @@ from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.road import Start, start_on_single_road
 from emulator.world.driven.vehicles import DrivenVehicles, Happening, Log
-from emulator.world.gnss import MotionSensors
 from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion
-from emulator.world.truth import World, periods_of, refuse_shared_processes
+from emulator.world.truth import MotionSensors, World, periods_of, refuse_shared_processes
 from vnet.driving import Action
 from vnet.errors import ScenarioError
 from vnet.node import Fix

@@ -20,10 +20,17 @@ import numpy as np
 from emulator.scenario.network import Map
 from emulator.world.buildings import LEAST_CORNERS, Buildings
 from emulator.world.input_files import check_columns, number_within, open_csv
-from emulator.world.maps.geojson import check_on_earth, read_collection, read_geojson, write_geojson
-from emulator.world.maps.graph import read_graph, write_graph
+from emulator.world.maps.formats import (
+    check_on_earth,
+    read_collection,
+    read_geojson,
+    read_graph,
+    read_sumo,
+    read_sumo_polygons,
+    write_geojson,
+    write_graph,
+)
 from emulator.world.maps.roads import MAX_POINTS, Roads, RoadsBuilder, street
-from emulator.world.maps.sumo import read_sumo, read_sumo_polygons
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import CoordinateFrame
 from vnet.counted import counted

@@ -19,8 +19,7 @@ from emulator.world.maps.files import lanes_around, notes_of, read_roads
 from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.files import drive_sumo, read_csv, read_fcd, read_npz, read_parquet
 from emulator.world.trips.generate import RIGHT, Side, generate_motion
-from emulator.world.trips.motion import Motion, Rules, Selection, motion_of
-from emulator.world.trips.samples import MOST_SAMPLES, Samples
+from emulator.world.trips.motion import MOST_SAMPLES, Motion, Rules, Samples, Selection, motion_of
 from vnet.errors import ScenarioError, shown
 from vnet.roads.road_map import RoadMap
 from vnet.runtime.programs import search_programs_in

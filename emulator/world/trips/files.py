@@ -34,8 +34,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from emulator.world.input_files import open_csv, read_arrays
-from emulator.world.trips.motion import Motion
-from emulator.world.trips.samples import DEGREES, METRES, MOST_SAMPLES, OPTIONAL, Samples
+from emulator.world.trips.motion import DEGREES, METRES, MOST_SAMPLES, OPTIONAL, Motion, Samples
 from vnet.errors import ScenarioError, printable, shown
 from vnet.types import Array
 

@@ -14,7 +14,7 @@ from emulator.radio.faults import ActiveLinkFaults
 from emulator.radio.frames import Frame, Receptions, Stage, Transmission
 from emulator.radio.mac import TransmitQueue
 from emulator.radio.outcomes import Outcome
-from emulator.radio.stages import LatencyStage, LossStage, in_range, peer_cap, sender_side
+from emulator.radio.reception import LatencyStage, LossStage, in_range, peer_cap, sender_side
 from emulator.radio.topology import Disc, Topology
 from emulator.records.distributions import binomial_interval
 from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.scenario.scenario import Scenario
-from emulator.world.trips import samples as samples_module
+from emulator.world.trips import motion as samples_module
 from emulator.world.trips.drive import READERS
-from emulator.world.trips.samples import Samples, Trip
+from emulator.world.trips.motion import Samples, Trip
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from emulator.world.trips.motion import Motion, Rules, Selection, clean, motion_of
-from emulator.world.trips.samples import Trip
+from emulator.world.trips.motion import Motion, Rules, Selection, Trip, clean, motion_of
 from vnet.errors import ScenarioError
 
 RULES = Rules(fastest_mps=70.0, longest_gap_s=10.0)
