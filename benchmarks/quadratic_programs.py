@@ -1,6 +1,6 @@
 """The quadratic program of the fusion weights with other solvers: is OSQP's `update` worth it, do all agree?
 
-min ‖Σ a_j x_j − x̄‖² + Σ λ_j a_j² with Σ a = 1, 0 ≤ a ≤ 1, as in `cmm.weights`, for 10, 20 and 30 neighbours.
+min ‖Σ a_j x_j − x̄‖² + Σ λ_j a_j² with Σ a = 1, 0 ≤ a ≤ 1, as in `cmm.fusion`, for 10, 20 and 30 neighbours.
 Timed is the whole way from estimates to weights, which is the same for all but for the solver: checking the
 covariances, the Hessian, the solver, clipping. `_update` sets the solver up once and gives it each new Hessian,
 `_fresh` sets it up again for every problem. All take turns problem by problem. Needs the extra `bench`.
@@ -17,7 +17,7 @@ import numpy as np
 import piqp
 import scipy.sparse as sp
 
-from agents.cooperative.cmm.weights import RIDGE_FLOOR_M2, OptimizedWeights, check_covariances
+from agents.cooperative.cmm.fusion import RIDGE_FLOOR_M2, OptimizedWeights, check_covariances
 from vnet.types import Array
 
 NEIGHBOURS = (10, 20, 30)

@@ -20,8 +20,17 @@ from studies.comparisons import COOPERATIVE
 from studies.measure import study_cell
 from studies.paper import Labels
 from studies.paper_values import PAPER_RANGE_M
-from studies.reports import Result, column, select, unique
-from studies.tables import MISSING, markdown_table, paired_ratio, shown_interval, with_error
+from studies.reports import (
+    MISSING,
+    Result,
+    column,
+    markdown_table,
+    paired_ratio,
+    select,
+    shown_interval,
+    unique,
+    with_error,
+)
 from vnet.counted import counted
 
 ATTACKER = "agents.cooperative.attacker:main"

@@ -23,7 +23,7 @@ from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.radio import LogDistance, Receiver
 from emulator.scenario.scenario import Radio
-from studies.style import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
+from studies.figures import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
 
 PAPER_PEERS = 30
 SIGNIFICANT = 0.9

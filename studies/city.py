@@ -21,13 +21,11 @@ from emulator.cells.cells import Cell, has_result, has_states, read_series, read
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
+from studies.figures import against_time, save, styled
 from studies.measure import study_cell
 from studies.paper import SETTLED_S, everybody
 from studies.paper_values import PAPER_RANGE_M
-from studies.reports import Result, column, select, unique
-from studies.result_figures import against_time
-from studies.style import save, styled
-from studies.tables import MISSING, in_seeds, markdown_table, mean_and_error
+from studies.reports import MISSING, Result, column, in_seeds, markdown_table, mean_and_error, select, unique
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array
 

@@ -52,7 +52,7 @@ def table1(
     seeds: SeedsOption = 20, out: OutOption = None, only: OnlyOption = None, live: LiveOption = False
 ) -> None:
     """Table I: four vehicles on a directed ring, constant α against optimized weights."""
-    from studies import reports, result_figures
+    from studies import figures, reports
 
     with one_line_errors():
         folder = _folder(out, "table1")
@@ -60,7 +60,7 @@ def table1(
         cells = paper.table1_cells(range(1, seeds + 1), folder / "crossing.csv")
         results = _run(cells, folder, "table1", only, live)
         if only is None:
-            result_figures.alpha_curve(results, reports.PAPER_TABLE1, folder / "table1")
+            figures.alpha_curve(results, reports.PAPER_TABLE1, folder / "table1")
             _show(reports.table1(results), folder / "table1.md")
 
 
@@ -360,13 +360,13 @@ def _select(cells: Sequence[Cell], only: Sequence[str]) -> list[Cell]:
 
 
 def _draw_against_time(cells: Sequence[Cell], cells_from: Path, folder: Path) -> None:
-    from studies import result_figures
+    from studies import figures
 
     for network in ("n2", "n3"):
         title = f"{network.upper()}, the paper's profile, lanes bounded on one side"
         references = {f"the paper's {m}": rmse[network] for m, rmse in PAPER_RMSE_M.items()}
         series = _series(cells, cells_from, network)
-        print(result_figures.against_time(series, folder / f"{network}_against_time", title, references))
+        print(figures.against_time(series, folder / f"{network}_against_time", title, references))
 
 
 def _series(cells: Sequence[Cell], folder: Path, network: str) -> dict[str, list[pa.Table]]:

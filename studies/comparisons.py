@@ -18,12 +18,21 @@ import pyarrow as pa
 from emulator.cells.cells import Cell, has_result, read_series
 from emulator.scenario.loading import scenario_of
 from emulator.scenario.scenario import Scenario
+from studies.figures import against_time
 from studies.measure import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS, study_cell
 from studies.paper import BOUND, BOUND_POSITION, Labels, counted_from
 from studies.paper_values import PAPER_RANGE_M
-from studies.reports import Result, column, select, unique
-from studies.result_figures import against_time
-from studies.tables import MISSING, markdown_table, paired_ratio, paired_tests, shown_interval
+from studies.reports import (
+    MISSING,
+    Result,
+    column,
+    markdown_table,
+    paired_ratio,
+    paired_tests,
+    select,
+    shown_interval,
+    unique,
+)
 from vnet.counted import counted
 from vnet.errors import VnetError
 

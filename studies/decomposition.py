@@ -24,8 +24,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.paper import counted_from
 from studies.paper_values import PAPER_RANGE_M
-from studies.reports import Result, select, unique
-from studies.tables import markdown_table, mean_and_error, paired_ratio
+from studies.reports import Result, markdown_table, mean_and_error, paired_ratio, select, unique
 from vnet.types import Array, Mask
 
 LOSS = 0.1

@@ -10,8 +10,7 @@ import numpy as np
 from emulator.cells.cells import Cell
 from studies.measure import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS, study_cell
 from studies.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
-from studies.reports import Result, column, select, unique
-from studies.tables import MISSING, markdown_table
+from studies.reports import MISSING, Result, column, markdown_table, select, unique
 
 LENGTH_S = 30.0
 """Length of a run: a vehicle that diverges does so at first, before any vehicle knows the common error."""

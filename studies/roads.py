@@ -26,8 +26,7 @@ from emulator.world.world import World
 from studies.city import city_scenario
 from studies.measure import measure, normalized
 from studies.paper import SETTLED_S
-from studies.reports import Result, column, select, unique
-from studies.tables import markdown_table, mean_and_error, paired_ratio, with_error
+from studies.reports import Result, column, markdown_table, mean_and_error, paired_ratio, select, unique, with_error
 from vnet.types import Array
 
 CITIES = (101, 102, 103)

@@ -1,10 +1,17 @@
-"""The frame that a cooperative vehicle broadcasts each period, as bytes and back (MODEL 3).
+"""The frame that a cooperative vehicle broadcasts each period, as bytes and back (MODEL 3), and who is heard.
 
 It holds the fix, the estimate, the state of the consensus, the names of the vehicles heard, a sample of the
 particles of the common error in steps of 1 cm, and relayed fixes. Vehicles are named by 4-byte hashes of their
 ids. A frame names its sender, so that no other can send it again as its own, and ends with a CRC-32. Bytes that do
 not decode, or decode to absurd values, raise a `FrameError` with a reason of one word: the radio delivers
 anything.
+
+Admission decides which frames a vehicle reads, and for which reasons it rejects the others. A frame is judged here
+by itself, and against what its sender has sent before. Whether it agrees with what others send is judged where it
+is used.
+
+A process of one vehicle decodes each frame once, so a large cache would only take memory there. In a process of
+many vehicles all that hear a frame share what it holds (`VehicleCache`): each vehicle adds to its size.
 """
 
 from __future__ import annotations
@@ -13,14 +20,30 @@ import hashlib
 import math
 import struct
 import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Generic, ParamSpec, Protocol, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cooperative.vehicle_cache import VehicleCache
+from vnet import Packet
 from vnet.types import Array
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+LEAST_ENTRIES = 64
+"""Entries for one vehicle: what is heard in a period, by twice the default peer cap."""
+ENTRIES_PER_VEHICLE = 4
+"""Entries for each further vehicle: what it sends in two periods with two frames a period."""
+
+_vehicles: WeakSet[object] = WeakSet()
+_caches: list[VehicleCache[..., object]] = []
+_entries = LEAST_ENTRIES
 
 VERSION = 3
 """Version of the layout; a receiver refuses any other."""
@@ -50,6 +73,56 @@ RELAYED = np.dtype([("name", "<u4"), ("age", "u1"), ("heading", "<u2"), ("x_cm",
 """A relayed fix: vehicle, age in periods relative to the frame's own fix, heading code, position in cm."""
 RELAY_LIMIT = 255
 """Number of relayed fixes in a frame: their number is one byte."""
+STALE_PERIODS = 3
+"""Age in periods beyond which a frame is stale: the radio takes less than one, a late vehicle another."""
+EPOCH_MARGIN = 10
+"""Epochs by which a frame may be ahead of one a period since the start, the most that a network begins. A frame
+that claims more is absurd, and its epoch would spread."""
+MAX_SENDERS = 255
+"""Number of senders that are read: a frame can name no more as heard. Known senders go before new ones."""
+FORGET_PERIODS = 10
+"""Periods between two times at which senders are forgotten: it need not be exact."""
+
+
+class VehicleCache(Generic[P, R]):
+    """A function whose latest results are kept, as many as the vehicles of the process need.
+
+    cached: the function with the present cache, for loops: a call of it is a tenth of one of this object.
+    """
+
+    def __init__(self, function: Callable[P, R]) -> None:
+        self._function = function
+        self.__wrapped__ = function
+        self.__doc__ = function.__doc__
+        self.resize()
+        _caches.append(self)  # type: ignore[arg-type]  # invariant in P
+
+    def resize(self) -> None:
+        """Begin a cache of the present size; what was kept is forgotten."""
+        self.cached = lru_cache(maxsize=_entries)(self._function)
+
+    @property
+    def entries(self) -> int:
+        """Most results that are kept."""
+        return int(self.cached.cache_parameters()["maxsize"])
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Return the function's result, from the cache if it is there."""
+        return self.cached(*args, **kwargs)  # type: ignore[arg-type]  # all arguments are hashable
+
+
+def add_vehicle(vehicle: object) -> None:
+    """Count `vehicle` among those of the process for as long as it exists.
+
+    Sizes double, so that vehicles that enter one by one do not empty the caches each time.
+    """
+    global _entries
+    _vehicles.add(vehicle)
+    needed = LEAST_ENTRIES + ENTRIES_PER_VEHICLE * (len(_vehicles) - 1)
+    if needed > _entries:
+        _entries = max(needed, 2 * _entries)
+        for cache in _caches:
+            cache.resize()
 
 
 class FrameError(ValueError):
@@ -225,3 +298,107 @@ def _check_numbers(x: float, y: float, c_xx: float, c_xy: float, c_yy: float, ru
         raise FrameError("absurd")
     if not (c_xx > 0 and c_yy > 0 and c_xx * c_yy > c_xy * c_xy):
         raise FrameError("covariance")
+
+
+class JudgedFrame(Protocol):
+    """The part of a frame that is judged, whatever its layout."""
+
+    @property
+    def name(self) -> str:
+        """The sender's short name."""
+        ...
+
+    @property
+    def fix_time_ns(self) -> int:
+        """Time of the sender's fix."""
+        ...
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of the consensus."""
+        ...
+
+    @property
+    def fingerprint(self) -> bytes:
+        """Bytes that come from the noise of the sender's receiver."""
+        ...
+
+
+F = TypeVar("F", bound=JudgedFrame)
+
+
+class Admission(Generic[F]):
+    """The frames that the vehicle `name` admits.
+
+    rejected: number of rejected frames by reason: those of `FrameError`, and replayed, stale, absurd,
+        too_many_senders, duplicate.
+    ids: node ids of the senders by short name.
+    """
+
+    def __init__(self, name: str, period_ns: int, decode: VehicleCache[[bytes], F], several: bool = False) -> None:
+        """Frames are decoded by `decode`; with `several`, a sender may send several with the same fix."""
+        add_vehicle(self)
+        self._decode = decode
+        self.rejected: Counter[str] = Counter()
+        self.ids: dict[str, str] = {}
+        self._name = name
+        self._period_ns = period_ns
+        self._several = several
+        self._newest_ns: dict[str, int] = {}
+        self._first_sender: dict[tuple[int, bytes], str] = {}
+        self._early: dict[tuple[str, int], tuple[str, F]] = {}
+        self._forgotten_ns = 0
+
+    def admit(self, packets: Iterable[Packet], now_ns: int) -> list[tuple[str, F]]:
+        """Return the frames to read, with their senders' short names, in the order of their arrival.
+
+        In real time a vehicle that is late with its work finds frames of the next period: they wait for it.
+        """
+        if now_ns - self._forgotten_ns >= FORGET_PERIODS * self._period_ns:
+            self._forget(now_ns)
+        waiting, self._early = self._early, {}
+        frames, decode = list(waiting.values()), self._decode.cached
+        for packet in packets:
+            try:
+                frames.append((packet.sender, decode(packet.payload)))
+            except FrameError as error:
+                self.rejected[str(error)] += 1
+        admitted = []
+        newest_ns, first_sender = self._newest_ns, self._first_sender
+        period_ns, late_ns = now_ns - now_ns % self._period_ns, STALE_PERIODS * self._period_ns
+        largest_epoch = EPOCH_MARGIN + now_ns // self._period_ns
+        for node, frame in frames:
+            sender, time_ns = short_name(node), frame.fix_time_ns
+            if frame.name != sender or sender == self._name:
+                self.rejected["replayed"] += 1
+            elif not -late_ns <= now_ns - time_ns <= late_ns:
+                self.rejected["stale"] += 1
+            elif frame.epoch > largest_epoch:
+                self.rejected["absurd"] += 1
+            elif sender not in newest_ns and len(newest_ns) + len(self._early) >= MAX_SENDERS:
+                self.rejected["too_many_senders"] += 1
+            elif not self._several and (
+                newest_ns.get(sender, -1) >= time_ns or (self._early and (sender, time_ns) in self._early)
+            ):
+                self.rejected["duplicate"] += 1
+            elif first_sender.setdefault((time_ns, frame.fingerprint), sender) != sender:
+                self.rejected["replayed"] += 1
+            elif time_ns > period_ns:
+                self._early[sender, time_ns] = node, frame
+            else:
+                self.ids[sender] = node
+                newest_ns[sender] = time_ns
+                admitted.append((sender, frame))
+        return admitted
+
+    def claim(self, sender: str, time_ns: int, fingerprint: bytes) -> None:
+        """Note that `sender` is the first with what comes from a fix: no two receivers' noise is the same."""
+        self._first_sender.setdefault((time_ns, fingerprint), sender)
+
+    def _forget(self, now_ns: int) -> None:
+        """Forget senders and fixes that no frame can concern that is not stale."""
+        self._forgotten_ns = now_ns
+        oldest_ns = now_ns - (STALE_PERIODS + 1) * self._period_ns
+        self._first_sender = {key: sender for key, sender in self._first_sender.items() if key[0] >= oldest_ns}
+        self._newest_ns = {name: time_ns for name, time_ns in self._newest_ns.items() if time_ns >= oldest_ns}
+        self.ids = {name: node for name, node in self.ids.items() if name in self._newest_ns}

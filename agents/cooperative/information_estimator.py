@@ -18,7 +18,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cooperative.admission import Admission
 from agents.cooperative.cmm.consensus import Share, tracked_mean
 from agents.cooperative.cmm.information import Five, Information, plain_moments
 from agents.cooperative.cmm.lane_exchange import LaneExchange
@@ -42,9 +41,8 @@ from agents.cooperative.cmm.plausibility import (
     unless_most_disagree,
 )
 from agents.cooperative.cmm.rbpf import Observation
-from agents.cooperative.estimator import mean_consensus, usable
-from agents.cooperative.frame import MAX_DEGREE, NAME_BYTES, short_name
-from agents.cooperative.fusion_rule import FusionRule
+from agents.cooperative.estimator import FusionRule, mean_consensus, usable
+from agents.cooperative.frame import MAX_DEGREE, NAME_BYTES, Admission, VehicleCache, short_name
 from agents.cooperative.information_frame import (
     INCREMENT_LIMIT,
     MAX_HEARD,
@@ -58,7 +56,6 @@ from agents.cooperative.information_frame import (
     room,
 )
 from agents.cooperative.options import Options
-from agents.cooperative.vehicle_cache import VehicleCache
 from vnet import Fix, Packet
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from agents.cooperative.cmm.consensus import Share
 from agents.cooperative.cmm.information import Five, plain_moments
 from agents.cooperative.cmm.lane_memory import ALL_KINDS, MAX_AGE, information_of
-from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
-from agents.cooperative.vehicle_cache import VehicleCache
+from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, VehicleCache, name_of_code
 from vnet.types import Array
 
 VERSION = 5

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.ns3.ground import BIN_M, Curve, ScheduleConstraints
 from benchmarks.ns3.simulators import ns3, ours
-from studies.style import BLUE, DPI, ORANGE, styled
+from studies.figures import BLUE, DPI, ORANGE, styled
 
 LEAST_PAIRS = 1000
 FARTHEST_M = 500.0

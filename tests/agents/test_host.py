@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from agents.attachment import Attachment
-from agents.host import UNSEEN_NS, _RealTimeAgent
+from agents.host import UNSEEN_NS, Attachment, _RealTimeAgent
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import TransportError
 from vnet.transport import wire

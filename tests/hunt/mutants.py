@@ -81,7 +81,7 @@ gate | estimator | np.einsum("nii->n", covariances_m2) / 2 | np.einsum("nii->n",
 agents/cooperative/cmm
 walk | rbpf | config.common_sigma_m * np.sqrt(1 - keep**2) | config.common_sigma_m * np.sqrt(1 - keep)
 acceleration | tracks | half = elapsed_s**2 / 2 | half = elapsed_s**2
-metropolis | weights | weights[0] = 1 - (count - 1) / (1 + max_degree) | weights[0] = 1 / (1 + max_degree)
+metropolis | fusion | weights[0] = 1 - (count - 1) / (1 + max_degree) | weights[0] = 1 / (1 + max_degree)
 offset | own_kalman | (stays * offset, s + dt_s * v, v) | (offset, s + dt_s * v, v)
 evidence | map_matching | np.maximum(0.0, 1 - since_s / self._lateral_tau_s) | 1 - 0 * since_s
 """

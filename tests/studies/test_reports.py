@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from studies import reports, result_figures
+from studies import figures, reports
 from studies.paper import ALPHAS
 from studies.paper_values import PAPER_VEHICLES
 
@@ -36,9 +36,7 @@ def series(seed: int, missing: bool = False) -> pa.Table:
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_time_courses_are_drawn_for_one_seed_or_many(tmp_path: Path, seeds: int) -> None:
     found = {name: [series(s, missing=name == "none") for s in range(seeds)] for name in ("optimized", "none")}
-    assert is_picture(
-        result_figures.against_time(found, tmp_path / "course", "N2", {"the paper's optimized": 0.72})
-    )
+    assert is_picture(figures.against_time(found, tmp_path / "course", "N2", {"the paper's optimized": 0.72}))
 
 
 def table1_results() -> list[dict[str, object]]:
@@ -56,7 +54,7 @@ def test_table_one_says_where_the_minimum_is_and_how_far_below_optimized_weights
     text = reports.table1(table1_results())
     assert "smallest at α = 0.5 and largest at α = 0.95" in text
     assert "0.50 ± 0.00 times that of the best constant" in text
-    assert is_picture(result_figures.alpha_curve(table1_results(), reports.PAPER_TABLE1, tmp_path / "table1"))
+    assert is_picture(figures.alpha_curve(table1_results(), reports.PAPER_TABLE1, tmp_path / "table1"))
 
 
 def test_table_two_puts_the_papers_figures_beside() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.tables import holm, interval_95, paired_tests, shown_interval
+from studies.reports import holm, interval_95, paired_tests, shown_interval
 
 pytestmark = pytest.mark.slow
 

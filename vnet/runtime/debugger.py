@@ -28,7 +28,6 @@ from vnet.runtime.programs import error_line
 from vnet.units import NS_PER_S
 
 _NOT_STEPPED_INTO = (
-    "agents.attachment",
     "agents.host",
     "emulator.",
     "namedtuple_",  # what Python generates for named tuples

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from agents.cooperative.cmm.consensus import DirectMean as DirectMean
     from agents.cooperative.cmm.consensus import RatioConsensus as RatioConsensus
     from agents.cooperative.cmm.consensus import Share as Share
+    from agents.cooperative.cmm.fusion import OptimizedWeights as OptimizedWeights
+    from agents.cooperative.cmm.fusion import constant_weights as constant_weights
+    from agents.cooperative.cmm.fusion import max_degree_weights as max_degree_weights
+    from agents.cooperative.cmm.fusion import metropolis_weights as metropolis_weights
+    from agents.cooperative.cmm.fusion import no_fusion_weights as no_fusion_weights
+    from agents.cooperative.cmm.fusion import random_weights as random_weights
     from agents.cooperative.cmm.rbpf import Observation as Observation
     from agents.cooperative.cmm.rbpf import Rbpf as Rbpf
     from agents.cooperative.cmm.rbpf import RbpfConfig as RbpfConfig
-    from agents.cooperative.cmm.weights import OptimizedWeights as OptimizedWeights
-    from agents.cooperative.cmm.weights import constant_weights as constant_weights
-    from agents.cooperative.cmm.weights import max_degree_weights as max_degree_weights
-    from agents.cooperative.cmm.weights import metropolis_weights as metropolis_weights
-    from agents.cooperative.cmm.weights import no_fusion_weights as no_fusion_weights
-    from agents.cooperative.cmm.weights import random_weights as random_weights
 
 _MODULES = {
     "agents.cooperative.cmm.consensus": (
@@ -39,7 +39,7 @@ _MODULES = {
         "Share",
     ),
     "agents.cooperative.cmm.rbpf": ("Observation", "Rbpf", "RbpfConfig"),
-    "agents.cooperative.cmm.weights": (
+    "agents.cooperative.cmm.fusion": (
         "OptimizedWeights",
         "constant_weights",
         "max_degree_weights",

@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from agents.cooperative.admission import FORGET_PERIODS, MAX_SENDERS, Admission
 from agents.cooperative.attacker import Attack, Attacker
 from agents.cooperative.estimator import CAPACITY, Estimator, FixTable, usable
-from agents.cooperative.frame import RELAYED, CooperativeFrame, decode, encode, short_name
+from agents.cooperative.frame import (
+    FORGET_PERIODS,
+    MAX_SENDERS,
+    RELAYED,
+    Admission,
+    CooperativeFrame,
+    decode,
+    encode,
+    short_name,
+)
 from agents.cooperative.options import Options
 from emulator.drivers.simulate import simulate
 from emulator.scenario.scenario import Scenario

@@ -5,18 +5,17 @@ from functools import partial
 
 import pytest
 
-from agents.cooperative import frame, information_frame, vehicle_cache
-from agents.cooperative.admission import Admission
-from agents.cooperative.vehicle_cache import ENTRIES_PER_VEHICLE, LEAST_ENTRIES, VehicleCache
+from agents.cooperative import frame, information_frame
+from agents.cooperative.frame import ENTRIES_PER_VEHICLE, LEAST_ENTRIES, Admission, VehicleCache
 
 
 @pytest.fixture(autouse=True)
 def _few_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Start as a new process does, whatever other tests have hosted in this one."""
     gc.collect()
-    monkeypatch.setattr(vehicle_cache, "_vehicles", type(vehicle_cache._vehicles)())
-    monkeypatch.setattr(vehicle_cache, "_entries", LEAST_ENTRIES)
-    for cache in vehicle_cache._caches:
+    monkeypatch.setattr(frame, "_vehicles", type(frame._vehicles)())
+    monkeypatch.setattr(frame, "_entries", LEAST_ENTRIES)
+    for cache in frame._caches:
         cache.resize()
 
 
@@ -43,7 +42,7 @@ def test_vehicles_that_are_gone_do_not_count() -> None:
 def test_results_are_kept_and_the_oldest_forgotten() -> None:
     calls: list[int] = []
     cached = VehicleCache(partial(lambda seen, value: seen.append(value) or -value, calls))
-    vehicle_cache._caches.pop()
+    frame._caches.pop()
     numbers = [*range(LEAST_ENTRIES), *range(LEAST_ENTRIES), LEAST_ENTRIES, 0]
     assert [cached(number) for number in numbers] == [-number for number in numbers]
     assert calls == [*range(LEAST_ENTRIES + 1), 0]

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.cooperative.cmm.weights import (
+from agents.cooperative.cmm.fusion import (
     ExactWeights,
     OptimizedWeights,
     constant_weights,
