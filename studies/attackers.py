@@ -31,7 +31,7 @@ from studies.reports import (
     unique,
     with_error,
 )
-from vnet.counted import counted
+from vnet.errors import counted
 
 ATTACKER = "agents.cooperative.attacker:main"
 LENGTH_S = 30.0

@@ -33,8 +33,7 @@ from studies.reports import (
     shown_interval,
     unique,
 )
-from vnet.counted import counted
-from vnet.errors import VnetError
+from vnet.errors import VnetError, counted
 
 COOPERATIVE, BASELINES = "agents.cooperative:main", "agents.baselines:main"
 REFERENCE_OPTIONS: dict[str, Any] = {"exchange": "information", "particles": 1000}

@@ -1,4 +1,4 @@
-"""The errors that vnet raises for its callers, rooted at `VnetError`.
+"""The errors that vnet raises for its callers, rooted at `VnetError`, and the wording of their messages.
 
 Each message is one line that names the subject, the value and what is allowed. Errors in vnet itself are
 assertions, not members of this family.
@@ -98,3 +98,8 @@ class DeadlockError(VnetError):
 
 class ProgramError(VnetError):
     """A vehicle program that cannot be imported, or whose entry is not a coroutine function of one node."""
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Return `number` with its noun: "1 frame", "2,000 frames"; `plural` is for those that take no plain "s"."""
+    return f"{number:,} {noun if number == 1 else plural or noun + 's'}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vnet.counted import counted
+from vnet.errors import counted
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 

@@ -16,8 +16,7 @@ from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, Recor
 from emulator.records.verdicts import Finding, not_exercised, result, unknown
 from emulator.scenario.faults import Custom, CustomSender, SenderFault, StaleMessages
 from emulator.world.radio_inputs import LinkTable
-from vnet.counted import counted
-from vnet.errors import first_names
+from vnet.errors import counted, first_names
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 

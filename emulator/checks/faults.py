@@ -58,7 +58,7 @@ from emulator.scenario.faults import (
 )
 from emulator.scenario.radio import Edca
 from emulator.world.truth import further_error_m
-from vnet.counted import counted
+from vnet.errors import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS, NS_PER_S
 

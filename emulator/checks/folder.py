@@ -56,8 +56,7 @@ from emulator.scenario.own_functions import are_here, declared_checks
 from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss
 from emulator.world.world import Instant, build_world, components, periods_of
-from vnet.counted import counted
-from vnet.errors import ScenarioError, first_names, printable
+from vnet.errors import ScenarioError, counted, first_names, printable
 from vnet.radio import SentFrame
 from vnet.transport.wire import LARGEST_MESSAGE_BYTES
 from vnet.types import Array, IntArray, Mask

@@ -16,7 +16,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result
 from emulator.scenario.faults import Custom, DelayFault, Duplicate, Throttle
 from emulator.scenario.scenario import Scenario
-from vnet.counted import counted
+from vnet.errors import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS, NS_PER_S
 

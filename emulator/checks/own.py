@@ -35,8 +35,7 @@ from emulator.records.verdicts import (
 from emulator.scenario.faults import OwnRule
 from emulator.scenario.own_functions import declared_checks, in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
-from vnet.counted import counted
-from vnet.errors import VnetError, printable, shown
+from vnet.errors import VnetError, counted, printable, shown
 from vnet.runtime.programs import search_programs_in
 from vnet.units import NS_PER_S
 

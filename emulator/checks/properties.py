@@ -19,8 +19,7 @@ from emulator.checks.own import Result
 from emulator.records.events import EventKind
 from emulator.records.parting import before
 from emulator.records.run import Run
-from vnet.counted import counted
-from vnet.errors import VnetError
+from vnet.errors import VnetError, counted
 from vnet.units import NS_PER_S
 
 MOST_TOLD = 10

@@ -23,7 +23,7 @@ from emulator.records.verdicts import Finding, not_exercised, result
 from emulator.scenario.faults import Throttle
 from emulator.scenario.radio import Edca, EtsiReactive, Limeric, Receiver, Sidelink
 from emulator.scenario.scenario import Radio
-from vnet.counted import counted
+from vnet.errors import counted
 from vnet.types import Array, IntArray, Mask
 
 SIGMAS = 4.9

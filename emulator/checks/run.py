@@ -29,8 +29,7 @@ from emulator.records.verdicts import (
     valid,
 )
 from emulator.scenario.faults import ProcessFault
-from vnet.counted import counted
-from vnet.errors import first_names, printable
+from vnet.errors import counted, first_names, printable
 from vnet.reports import COVARIANCE_TOLERANCE, LONGEST_TEXT, check_name
 from vnet.types import IntArray, Mask
 from vnet.units import NS_PER_S

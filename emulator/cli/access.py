@@ -22,8 +22,7 @@ from emulator.drivers.join import split_into_processes
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import one_line_errors
 from emulator.world.world import World, build_world
-from vnet.counted import counted
-from vnet.errors import TransportError
+from vnet.errors import TransportError, counted
 from vnet.transport.access import Access, certifier, is_tls
 
 TlsNameOption = Annotated[

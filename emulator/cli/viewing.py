@@ -24,7 +24,7 @@ from emulator.cli.options import (
 )
 from emulator.drivers.control import read_control_file
 from emulator.records.run_folder import RECORDING, RunFolder, check_is_finished, check_is_run
-from emulator.stream.playback import Message, messages
+from emulator.stream import Message, messages
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.live import SafeConsole
 from emulator.viewer.sinks import (

@@ -14,7 +14,7 @@ from emulator.records.events import Event
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.tables import mean_busy
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import beliefs_of, event_message, period_message, scene_message
+from emulator.stream import beliefs_of, event_message, period_message, scene_message
 
 
 class Messages:

@@ -1,7 +1,7 @@
 """The programs of a run as the loops of both pacings see them, wherever they are, and the rules for what they say.
 
 `Processes` is the one interface to programs. Those of a simulation are in the emulator's event loop (`local.py`) or
-in processes forked from it (`pipes.py`); those of a live run are processes on this machine or on others (`live/`).
+in processes forked from it; those of a live run are processes on this machine or on others (`live/`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The simulated driver: the same programs and the same engine on one machine, without Zenoh.
 
 One virtual-time loop hosts all nodes, and its yields go straight to the barrier; or some processes, forked from
-this one, host a part of the nodes each (`pipes.py`). In lockstep a live run and its simulation give the
+this one, host a part of the nodes each (`local.py`). In lockstep a live run and its simulation give the
 same trace, and a test holds them to it.
 """
 
@@ -20,9 +20,8 @@ from operator import index
 from typing import Literal
 
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.local import InLoop, LocalProcesses
+from emulator.drivers.local import InLoop, LocalProcesses, Pipes
 from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
-from emulator.drivers.pipes import Pipes
 from emulator.drivers.signals import tell_from_handler
 from emulator.records.events import EventKind
 from vnet.errors import VnetError, shown

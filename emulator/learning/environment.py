@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gymnasium.spaces import Space
     from pettingzoo import ParallelEnv
 
-    from emulator.learning.radio_environment import PositionM, Receive, Send
+    from emulator.learning.environment_classes import PositionM, Receive, Send
 
 
 @hinting
@@ -52,7 +52,7 @@ def environment(
     require("an environment", "pettingzoo", "gymnasium")
     from gymnasium import spaces
 
-    from emulator.learning.vehicle_environment import VehicleEnvironment
+    from emulator.learning.environment_classes import VehicleEnvironment
 
     for name, given in {"observe": observe, "act": act, "reward": reward}.items():
         _check(name, given, callable(given), "a function is needed")
@@ -95,7 +95,7 @@ def radio_for(
     from gymnasium import spaces
     from pettingzoo import ParallelEnv
 
-    from emulator.learning.radio_environment import RadioEnvironment
+    from emulator.learning.environment_classes import RadioEnvironment
 
     _check("env", env, isinstance(env, ParallelEnv), "a ParallelEnv of pettingzoo is needed", "radio_for")
     has_agents = bool(getattr(env, "possible_agents", None))

@@ -17,8 +17,7 @@ from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
 from emulator.report.source import NothingToShow, Source
 from emulator.world.buildings import Buildings
-from vnet.counted import counted
-from vnet.errors import printable
+from vnet.errors import counted, printable
 from vnet.types import Array, Mask
 from vnet.units import title_of
 

@@ -22,7 +22,7 @@ from emulator.records.verdicts import Verdict
 from emulator.report.drawing import DASHES, Drawing, draw_charts
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Run
-from vnet.counted import counted
+from vnet.errors import counted
 from vnet.units import title_of, unit_of
 
 CONFIDENCE = 0.95

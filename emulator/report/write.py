@@ -25,8 +25,7 @@ from emulator.report.index import write_index
 from emulator.report.radio_figures import radio_section
 from emulator.report.source import Source, maybe, why_not
 from emulator.report.timeline import timeline
-from vnet.counted import counted
-from vnet.errors import VnetError, first_names
+from vnet.errors import VnetError, counted, first_names
 
 MOST_EVENTS = 200
 MOST_SAID = 2000

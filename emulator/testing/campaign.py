@@ -66,8 +66,7 @@ from emulator.testing.trial import (
     with_faults,
     with_tape,
 )
-from vnet.counted import counted
-from vnet.errors import VnetError, printable
+from vnet.errors import VnetError, counted, printable
 from vnet.units import NS_PER_S
 
 PARTING_FILE = "parting.txt"

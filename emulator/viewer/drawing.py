@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.records.period_figures import Estimate
-from emulator.stream.messages import unpack, unpack_pairs
+from emulator.stream import unpack, unpack_pairs
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
 Floats = NDArray[np.float32]

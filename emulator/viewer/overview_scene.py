@@ -19,7 +19,7 @@ from emulator.records.run_folder import SCENARIO_FILE
 from emulator.records.tables import STATES, columns_of
 from emulator.scenario.loading import parse_recorded_scenario
 from emulator.scenario.own_functions import declared, load_entry
-from emulator.stream.messages import unpack
+from emulator.stream import unpack
 from emulator.viewer.drawing import (
     BLUE,
     DARK,

@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from emulator.stream.messages import LATENCY_BIN_NS
+from emulator.stream import LATENCY_BIN_NS
 from emulator.viewer.drawing import (
     BLUE,
     GREEN,

@@ -17,7 +17,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.report.comparison import Comparison, print_comparison
 from emulator.report.source import Source
 from emulator.report.write import report_page
-from emulator.stream.playback import messages
+from emulator.stream import messages
 from tests.support.recordings import Entity, read_back
 
 READERS = ("check", "report", "play", "compare", "pcapng", "mcap", "csv", "radio")

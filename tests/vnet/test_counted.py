@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tests.support.paths import ROOT
-from vnet.counted import counted
+from vnet.errors import counted
 
 PLURALS = "frames|receptions|vehicles|nodes|deliveries|reports|fixes|processes|events|gaps|arrivals|transmissions"
 

@@ -21,7 +21,7 @@ from functools import partial, wraps
 from typing import Any
 
 from vnet.node import Node
-from vnet.runtime import own_asyncio, stand_ins
+from vnet.runtime import own_asyncio
 
 Taker = Callable[[Node, BaseException, str, "ExecutorJob | None"], bool]
 """Takes an exception of a node, the place where it was raised, and the job that failed with it, if it was one.
@@ -139,7 +139,7 @@ def watch(node: Node, taker: Taker) -> None:
 def attach() -> None:
     """Take the hooks of Python and of the collector; each call is followed by one of `detach`."""
     global _watchers, _before
-    stand_ins.attach()
+    own_asyncio.attach()
     if collector not in gc.callbacks:
         gc.callbacks.append(collector)
     if threading.Thread.start is _start_thread:
@@ -162,7 +162,7 @@ def attach() -> None:
 def detach() -> None:
     """Give the hooks back when nobody watches any more, unless a program has put others in their place."""
     global _watchers
-    stand_ins.detach()
+    own_asyncio.detach()
     _watchers -= 1
     if _watchers == 0:
         if sys.unraisablehook is _unraisable:

@@ -47,15 +47,15 @@ def given_programs(programs: Mapping[str, Program]) -> Iterator[None]:
 
 def load_program(entry: str) -> Program:
     """Import `package.module:function`, if it is not given. Raises ProgramError with the reason in one line."""
-    from vnet.runtime import stand_ins  # asyncio, which the checks of a scenario do without
+    from vnet.runtime import own_asyncio  # asyncio, which the checks of a scenario do without
 
     if entry in (given := _given.get()):
-        stand_ins.use_stand_ins(given[entry])
+        own_asyncio.use_stand_ins(given[entry])
         return given[entry]
     module_name, _, name = entry.partition(":")
     if module_name in RENAMED_MODULES:
         raise ProgramError(f"program.entry = {entry!r}: renamed; use {RENAMED_MODULES[module_name]}:{name}")
-    stand_ins.attach()
+    own_asyncio.attach()
     try:
         module = importlib.import_module(module_name)
     except Exception as error:
@@ -64,14 +64,14 @@ def load_program(entry: str) -> Program:
         missed = getattr(error, "name", None) if isinstance(error, ImportError) else None
         raise _load_error(entry, f"cannot import: {error_line(error)}", missed or module_name) from error
     finally:
-        stand_ins.detach()
+        own_asyncio.detach()
     program = getattr(module, name, None)
     if program is None:
         found = f"module {module_name} ({_origin(module)})"
         raise _load_error(entry, f"{found} has no {name!r}{did_you_mean(name, _programs_of(module))}", module_name)
     if not inspect.iscoroutinefunction(program):
         raise _load_error(entry, f"is not an async function: async def {name}(node)", module_name)
-    stand_ins.use_stand_ins(program)
+    own_asyncio.use_stand_ins(program)
     return program  # type: ignore[no-any-return]
 
 

@@ -31,8 +31,7 @@ from emulator.drivers.live.gateway import Gateway, check_trust, is_peer, session
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from emulator.scenario.program import PYTHON
-from vnet.counted import counted
-from vnet.errors import ProgramError, VnetError, first_names, shown
+from vnet.errors import ProgramError, VnetError, counted, first_names, shown
 from vnet.gateway import filled_in
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
 from vnet.gateway.keys import REPORT_KEY

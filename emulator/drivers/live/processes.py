@@ -31,8 +31,7 @@ from emulator.drivers.router import ROUTER
 from emulator.records.events import KINDS, EventKind
 from emulator.scenario.faults import EmulatorRestart, Infrastructure
 from emulator.viewer.sinks import Sinks
-from vnet.counted import counted
-from vnet.errors import ProgramError, TransportError, VnetError, WireError, first_names
+from vnet.errors import ProgramError, TransportError, VnetError, WireError, counted, first_names
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
 from vnet.transport import backbone_keys, keys, wire

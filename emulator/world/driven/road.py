@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scenario.network import Driven
-from vnet.counted import counted
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, counted
 from vnet.types import Array
 
 Ints = NDArray[np.intp]

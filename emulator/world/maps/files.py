@@ -33,8 +33,7 @@ from emulator.world.maps.formats import (
 from emulator.world.maps.roads import MAX_POINTS, Roads, RoadsBuilder, street
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import CoordinateFrame
-from vnet.counted import counted
-from vnet.errors import ScenarioError, printable, shown
+from vnet.errors import ScenarioError, counted, printable, shown
 from vnet.extras import require
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array

@@ -28,8 +28,7 @@ from emulator.scenario.network import node_id
 from emulator.scenario.sections import FAR_S
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import middle_deg, project
-from vnet.counted import counted
-from vnet.errors import ScenarioError, first_names, shown
+from vnet.errors import ScenarioError, counted, first_names, shown
 from vnet.transport.keys import is_segment
 from vnet.types import Array
 from vnet.units import NS_PER_S

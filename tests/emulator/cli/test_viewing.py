@@ -10,7 +10,7 @@ from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
-from tests.emulator.stream.test_playback import Watched, watch
+from tests.emulator.test_playback import Watched, watch
 
 pytestmark = pytest.mark.slow
 

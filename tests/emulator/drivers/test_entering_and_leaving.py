@@ -17,8 +17,7 @@ from emulator.drivers.simulate import simulate
 from emulator.drivers.status import Course
 from emulator.records.events import Event
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import unpack
-from emulator.stream.playback import messages
+from emulator.stream import messages, unpack
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import build_world, components

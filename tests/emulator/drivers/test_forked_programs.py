@@ -16,9 +16,9 @@ from typing import Any, NoReturn
 
 import pytest
 
-from emulator.drivers import pipes
+from emulator.drivers import local
 from emulator.drivers.conclude import conclude
-from emulator.drivers.pipes import ForkedPrograms
+from emulator.drivers.local import ForkedPrograms
 from emulator.drivers.simulate import process_count, simulate, split_evenly
 from emulator.radio.outcomes import Outcome
 from emulator.records.costs import read_cost
@@ -171,7 +171,7 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
     def has_no_room(*_: object) -> NoReturn:
         raise VnetError("no room for programs")
 
-    monkeypatch.setattr(pipes, "HostedPrograms", has_no_room)
+    monkeypatch.setattr(local, "HostedPrograms", has_no_room)
     emulation = emulate(tmp_path / "run")
     welcomes = [emulation.welcome("v01", b"")]
     process = ForkedPrograms(welcomes, {}, emulation.folder, [], lambda: None, 30.0)
@@ -184,7 +184,7 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
         process.close()
 
 
-@pytest.mark.parametrize("name", ["os.fork", "emulator.drivers.pipes.Pipe"])
+@pytest.mark.parametrize("name", ["os.fork", "emulator.drivers.local.Pipe"])
 def test_a_process_that_cannot_be_started_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

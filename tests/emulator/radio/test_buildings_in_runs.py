@@ -14,7 +14,7 @@ from emulator.records.recorded_world import RecordedWorld
 from emulator.report.map_figures import map_charts
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import scene_message, unpack
+from emulator.stream import scene_message, unpack
 from emulator.world.buildings import Buildings
 from emulator.world.world import build_world
 from tests.emulator.checks.test_judge import run_scenario

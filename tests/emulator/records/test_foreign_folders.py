@@ -13,7 +13,7 @@ import pytest
 from emulator.checks.judge import check_run
 from emulator.records import tables
 from emulator.scenario.scenario import Scenario
-from emulator.stream.playback import messages
+from emulator.stream import messages
 from tests.support.recorded import recorded
 from vnet.errors import VnetError
 

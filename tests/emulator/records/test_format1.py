@@ -12,7 +12,7 @@ from emulator.checks.judge import Verdict, check_run
 from emulator.records.recorded_run import RecordedRun
 from emulator.report.source import Source
 from emulator.report.write import report_page
-from emulator.stream.playback import messages
+from emulator.stream import messages
 from tests.support.folders import READERS, readings
 from vnet.errors import VnetError
 

@@ -15,7 +15,7 @@ from emulator.records.reference import reference_series
 from emulator.report.figures import degrees
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import scene_message
+from emulator.stream import scene_message
 from vnet.node import Node
 
 NAMES = ["v01", "v02", "v03"]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from emulator.records.metrics import Metrics, summarize
 from emulator.records.period_figures import program_figures
 from emulator.scenario.program import Program
-from emulator.stream.messages import beliefs_of, pack
+from emulator.stream import beliefs_of, pack
 from emulator.world.world import Instant
 from vnet.reports import Report, Value
 

@@ -14,7 +14,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import TABLES
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.stream.playback import messages
+from emulator.stream import messages
 from tests.emulator.checks.test_judge import run_scenario
 from tests.emulator.scenario.test_sumo import load as sumo_scenario
 from tests.emulator.scenario.test_sumo import sumo

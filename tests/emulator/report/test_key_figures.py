@@ -26,8 +26,7 @@ from emulator.report.sweep_page import heading
 from emulator.report.write import report_page
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import pack
-from emulator.stream.playback import messages
+from emulator.stream import messages, pack
 from emulator.terminal import summary
 from emulator.terminal.dashboard import Dashboard
 from emulator.viewer.drawing import PeriodArrays

@@ -7,7 +7,7 @@ import pytest
 
 from emulator.records.recorded_world import RecordedWorld
 from emulator.scenario.scenario import Radio, Scenario
-from emulator.stream.messages import scene_message
+from emulator.stream import scene_message
 from emulator.world.radio_inputs import LinkTable, load_links
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError

@@ -11,7 +11,7 @@ import pytest
 
 from tests.vnet.runtime.test_host import World
 from vnet import Node
-from vnet.runtime import own_asyncio, stand_ins
+from vnet.runtime import own_asyncio
 from vnet.runtime.own_asyncio import present_node
 
 OWN = asyncio.Future, asyncio.Task, asyncio.all_tasks, asyncio.as_completed, asyncio.wrap_future
@@ -155,8 +155,8 @@ def test_a_task_in_an_empty_context_ends_with_its_program() -> None:
 
 
 def test_names_of_asyncio_stand_for_others_only_while_programs_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stand_ins, "_users", 0)  # runs of other tests may not have been closed
-    stand_ins._set_names(own=True)
+    monkeypatch.setattr(own_asyncio, "_users", 0)  # runs of other tests may not have been closed
+    own_asyncio._set_names(own=True)
     during: list[tuple[Any, ...]] = []
 
     async def program(node: Node) -> None:
@@ -178,11 +178,11 @@ def test_other_loops_have_asyncios_own_behaviour_while_programs_run() -> None:
         await whole
         return all(hash(each) == object.__hash__(each) for each in (future, task, whole))
 
-    stand_ins.attach()
+    own_asyncio.attach()
     try:
         assert asyncio.run(elsewhere())
     finally:
-        stand_ins.detach()
+        own_asyncio.detach()
 
 
 @pytest.mark.skipif(sys.version_info < (3, 12), reason="eager tasks came with Python 3.12")
@@ -237,7 +237,7 @@ def test_a_program_runs_a_loop_of_its_own_in_a_thread_alone() -> None:
 def test_names_that_a_programs_module_has_imported_are_replaced_too() -> None:
     module: dict[str, Any] = {"Future": OWN[0], "waits": OWN[3], "other": asyncio.sleep}
     exec("async def main(node): pass", module)
-    stand_ins.use_stand_ins(module["main"])
+    own_asyncio.use_stand_ins(module["main"])
     assert module["Future"] is own_asyncio.Future
     assert module["waits"] is own_asyncio.as_completed
     assert module["other"] is asyncio.sleep

@@ -22,7 +22,7 @@ from numpy.random import normal
 
 import emulator
 from vnet import Node
-from vnet.runtime import stand_ins
+from vnet.runtime import own_asyncio
 from vnet.runtime.own_asyncio import current_node
 
 DRAWS: dict[str, Callable[[], Any]] = {
@@ -87,10 +87,10 @@ def as_node(node: Any, draw: Callable[[], Any]) -> Any:
 @pytest.fixture(autouse=True)
 def attached() -> Any:
     """Names as they are while programs run."""
-    stand_ins.attach()
-    stand_ins.use_stand_ins(draws)
+    own_asyncio.attach()
+    own_asyncio.use_stand_ins(draws)
     yield
-    stand_ins.detach()
+    own_asyncio.detach()
 
 
 @given(st.lists(st.tuples(st.sampled_from([1, 2]), st.sampled_from(sorted(DRAWS))), max_size=30))
@@ -144,9 +144,9 @@ def test_a_child_process_draws_other_numbers() -> None:
 
 
 def test_names_are_the_modules_own_when_no_program_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stand_ins, "_users", 1)  # runs of other tests may not have been closed
-    stand_ins.detach()
+    monkeypatch.setattr(own_asyncio, "_users", 1)  # runs of other tests may not have been closed
+    own_asyncio.detach()
     assert random.random.__self__ is random._inst  # type: ignore[attr-defined]
     assert os.urandom.__module__ == "posix"
-    stand_ins.attach()
+    own_asyncio.attach()
     assert not hasattr(random.random, "__self__")

@@ -28,8 +28,7 @@ from emulator.report.map_figures import map_charts
 from emulator.report.source import Source
 from emulator.scenario.loading import load_scenario, scenario_from
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import unpack
-from emulator.stream.playback import messages
+from emulator.stream import messages, unpack
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from emulator.world.driven.sumo import SumoWorld

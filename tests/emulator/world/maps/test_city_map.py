@@ -15,7 +15,7 @@ from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import dump_scenario, load_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import scene_message, unpack
+from emulator.stream import scene_message, unpack
 from emulator.world.world import build_world
 from tests.support.motion import Course, Stay, along, scenario_of_trips, write_trips
 from tests.support.recorded import prepared

@@ -18,8 +18,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import mean_busy
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import LATENCY_BIN_NS, LATENCY_BINS, unpack, unpack_pairs
-from emulator.stream.playback import messages
+from emulator.stream import LATENCY_BIN_NS, LATENCY_BINS, messages, unpack, unpack_pairs
 from tests.support.paths import ROOT
 from tests.support.recorded import prepared
 from vnet.errors import VnetError

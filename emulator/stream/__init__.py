@@ -1,1 +1,0 @@
-"""The stream to observers: its messages, live and from a finished run."""
