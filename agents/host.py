@@ -29,7 +29,7 @@ from vnet.runtime import interrupts
 from vnet.runtime.ahead import RunAhead
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.host import Disks, Host
-from vnet.runtime.process_end import count_as_death, end_within
+from vnet.runtime.outside_loop import count_as_death, end_within
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, VirtualTimeLoop
 from vnet.transport import keys, wire

@@ -31,7 +31,7 @@ import agents.cli
 import agents.host  # what every agent needs
 from vnet.runtime import forking
 from vnet.runtime.die_with_parent import signal_at_parent_death
-from vnet.runtime.process_end import end_forked
+from vnet.runtime.outside_loop import end_forked
 
 STANDARD_ERROR = 2
 

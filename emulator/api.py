@@ -14,15 +14,18 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from emulator.cells.programs import (
+from emulator.cells.worker import (
+    Place,
+    Worker,
+    call_fitly,
     checked_function,
     entry_of,
+    is_fit,
     is_importable,
     name_of,
     require_importable,
     with_folder_of,
 )
-from emulator.cells.worker import Place, Worker, call_fitly, is_fit
 from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.drivers.simulate import ProcessCount
 from emulator.report.notebook import Run

@@ -18,8 +18,7 @@ from emulator.world.neighbours import links_within
 from emulator.world.world import build_world
 from studies.comparisons import COOPERATIVE
 from studies.measure import study_cell
-from studies.paper import Labels
-from studies.paper_values import PAPER_RANGE_M
+from studies.paper import PAPER_RANGE_M, Labels
 from studies.reports import (
     MISSING,
     Result,

@@ -23,8 +23,7 @@ from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
 from studies.figures import against_time, save, styled
 from studies.measure import study_cell
-from studies.paper import SETTLED_S, everybody
-from studies.paper_values import PAPER_RANGE_M
+from studies.paper import PAPER_RANGE_M, SETTLED_S, everybody
 from studies.reports import MISSING, Result, column, in_seeds, markdown_table, mean_and_error, select, unique
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array

@@ -21,7 +21,7 @@ from emulator.cli.options import pair
 from emulator.scenario.sections import DAY_S
 from emulator.terminal.console import one_line_errors, tell
 from studies import paper
-from studies.paper_values import PAPER_RMSE_M
+from studies.paper import PAPER_RMSE_M
 from vnet.errors import VnetError
 
 app = group("Run the paper's experiments, and vnet's own: in a clone of vnet, no part of the wheel.")

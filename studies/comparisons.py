@@ -20,8 +20,7 @@ from emulator.scenario.loading import scenario_of
 from emulator.scenario.scenario import Scenario
 from studies.figures import against_time
 from studies.measure import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS, study_cell
-from studies.paper import BOUND, BOUND_POSITION, Labels, counted_from
-from studies.paper_values import PAPER_RANGE_M
+from studies.paper import BOUND, BOUND_POSITION, PAPER_RANGE_M, Labels, counted_from
 from studies.reports import (
     MISSING,
     Result,

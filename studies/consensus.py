@@ -33,8 +33,7 @@ from emulator.pages.palette import PALETTE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.measure import study_cell
-from studies.paper import network_sections
-from studies.paper_values import PAPER_RANGE_M
+from studies.paper import PAPER_RANGE_M, network_sections
 from vnet.errors import VnetError
 from vnet.types import Array
 

@@ -22,8 +22,7 @@ from agents.cooperative.hears_all import lane_model
 from agents.cooperative.information_estimator import PASSED_SHARE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from studies.paper import counted_from
-from studies.paper_values import PAPER_RANGE_M
+from studies.paper import PAPER_RANGE_M, counted_from
 from studies.reports import Result, markdown_table, mean_and_error, paired_ratio, select, unique
 from vnet.types import Array, Mask
 

@@ -1,24 +1,25 @@
-"""The cells of the paper's tables, and the same questions asked of vnet's own profile.
-
-Table I: four vehicles at a crossing, each hearing the next on a directed ring. Table II: the published networks, or
-generated ones of the same character. In the paper's profile the filters start at the true common error, the
-network's mean is exact and lanes are bounded on one side; the constants are in `agents/cooperative/options.py`.
-"""
+"""The paper's values, from the program that the paper is about."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from emulator.cells.cells import Cell
+from emulator.scenario.own_functions import load_entry
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.measure import REFERENCE, study_cell
-from studies.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
 from vnet.errors import VnetError
+
+_VALUES = "agents.cooperative.declared"
+PAPER_RMSE_M: dict[str, dict[str, float]] = load_entry(f"{_VALUES}:PAPER_RMSE_M")
+PAPER_VEHICLES: dict[str, int] = load_entry(f"{_VALUES}:PAPER_VEHICLES")
+PAPER_RANGE_M: float = load_entry(f"{_VALUES}:PAPER_RANGE_M")
+network_file: Callable[[str], str] = load_entry(f"{_VALUES}:network_file")
 
 Labels = dict[str, str | int | float]
 BOUND, BOUND_POSITION = f"{REFERENCE}common_error_rmse_m", f"{REFERENCE}position_rmse_m"

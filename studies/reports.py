@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from emulator.records.metrics import anees_band
-from studies.paper import ALPHAS
-from studies.paper_values import PAPER_RMSE_M
+from studies.paper import ALPHAS, PAPER_RMSE_M
 from vnet.types import Array
 
 MISSING = "–"

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import msgspec
 
-from vnet.arguments import number_or_nan
 from vnet.errors import shown
+from vnet.radio import number_or_nan
 
 LARGEST_M_S2 = 1e6
 """Largest acceleration that can be asked for; what vehicles can do is far below it."""

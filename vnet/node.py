@@ -18,10 +18,18 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vnet.backbone import Backbone, BackboneTransport, UnitAbilities
 from vnet.driving import Action, checked_action
-from vnet.mailbox import Mailbox
-from vnet.radio import NO_ABILITIES, Radio, RadioAbilities, RadioTransport, SentFrame
+from vnet.radio import (
+    NO_ABILITIES,
+    Backbone,
+    BackboneTransport,
+    Mailbox,
+    Radio,
+    RadioAbilities,
+    RadioTransport,
+    SentFrame,
+    UnitAbilities,
+)
 from vnet.reports import NoteDetail, Report, Reporter, checked_detail
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap

@@ -1,16 +1,114 @@
-"""Radio: what a vehicle program sends and receives, and what its radio measures of it."""
+"""Radio and backbone: what a vehicle program sends and receives, what its radio measures of it, and its mailboxes.
+
+The backbone is the wired network among roadside units, as their programs see it. A mailbox holds what waits for a
+program to read it: packets of its radio, messages of its backbone, fixes of its receiver.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
-from typing import Annotated, NamedTuple, Protocol
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Generic, NamedTuple, Protocol, TypeVar
 
 from msgspec import Meta, Struct
 
-from vnet.arguments import checked_payload, number_or_nan
 from vnet.errors import PayloadTooLargeError, shown
-from vnet.mailbox import Mailbox
+
+T = TypeVar("T")
+
+INBOX_LIMIT = 4096
+"""Packets (or fixes) that are kept for a program that does not read them; beyond it the oldest are dropped."""
+
+
+def number_or_nan(value: Any) -> float:
+    """Return a number, numpy's included, as a float; NaN for what is none: texts, booleans, and beyond floats."""
+    if isinstance(value, (str, bytes, bytearray, bool)):
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def checked_payload(call: str, payload: bytes) -> bytes:
+    """Return a payload of a `call` as bytes. Raise TypeError for what is not bytes."""
+    try:
+        return bytes(memoryview(payload))
+    except TypeError:
+        raise TypeError(
+            f"{call}({shown(payload)}): bytes are expected, not {type(payload).__name__}; encode it first, "
+            "as with msgpack.packb(…) or text.encode()"
+        ) from None
+
+
+class Waits:
+    """The number of tasks that wait at some mailboxes; those of a process that was killed count on."""
+
+    count = 0
+
+
+class Mailbox(Generic[T]):
+    """A bounded queue with one side for the transport (`deliver`) and one for the program.
+
+    `waiting` tells the transport that a task of the program waits here: only then does an arrival wake the node;
+    otherwise the program finds the item when it next runs. `refill` is called before the program reads, so that a
+    transport may leave items in its own buffer until then (real time).
+    `guard` is called before that, and raises where the program may not read. `waits` counts the tasks that wait
+    here, with those at others, so that a transport of many mailboxes need not ask each.
+    """
+
+    def __init__(self) -> None:
+        self.refill: Callable[[], None] = lambda: None
+        self.guard: Callable[[], None] = lambda: None
+        self.waits = Waits()
+        self._items: deque[T] = deque(maxlen=INBOX_LIMIT)
+        self._waiters: deque[asyncio.Future[None]] = deque()
+
+    @property
+    def awaited(self) -> bool:
+        """True if a task may be waiting here; may be read from another thread."""
+        return bool(self._waiters)
+
+    @property
+    def waiting(self) -> bool:
+        """True if a task waits for the next item."""
+        for waiter in self._waiters:  # noqa: SIM110 (`any` costs six times as much)
+            if not waiter.done():
+                return True
+        return False
+
+    def deliver(self, items: Sequence[T]) -> None:
+        """Append items and wake the waiting tasks."""
+        self._items.extend(items)
+        for waiter in self._waiters:
+            if not waiter.done():
+                waiter.set_result(None)
+
+    async def get(self) -> T:
+        """Remove and return the oldest item; wait for one if there is none. Cancelling it loses no item."""
+        self.guard()
+        self.refill()
+        while not self._items:
+            waiter = asyncio.get_running_loop().create_future()
+            self._waiters.append(waiter)
+            self.waits.count += 1
+            try:
+                self.refill()  # again: an item that came before the waiter was visible woke no task
+                await waiter
+            finally:
+                self._waiters.remove(waiter)
+                self.waits.count -= 1
+        return self._items.popleft()
+
+    def drain(self) -> list[T]:
+        """Remove and return all items, oldest first, without waiting."""
+        self.guard()
+        self.refill()
+        items = list(self._items)
+        self._items.clear()
+        return items
 
 
 class Packet(Struct, frozen=True, gc=False):  # made six times as fast as a dataclass; a run has millions
@@ -256,4 +354,80 @@ class Radio:
         return self
 
     async def __anext__(self) -> Packet:
+        return await self.inbox.get()
+
+
+class BackboneMessage(NamedTuple):
+    """A message of another roadside unit. Times are emulated nanoseconds from the start of the run."""
+
+    sender: str
+    sent_ns: int
+    received_ns: int
+    payload: bytes
+
+
+class UnitAbilities(NamedTuple):
+    """Position of a roadside unit in m, names of the other units, and largest message in bytes."""
+
+    position_m: tuple[float, float]
+    peers: Sequence[str] = ()
+    max_message_bytes: int = 0
+
+
+class BackboneTransport(Protocol):
+    """Interface of a backbone to the process that hosts its node."""
+
+    def send_message(self, node: str, to: str | None, payload: bytes) -> None:
+        """Enqueue a message of `node` to one unit, or to all others, at the present time."""
+        ...
+
+
+class Backbone:
+    """The roadside unit's end of the backbone: sends to other units, and receives their messages.
+
+    Attributes:
+        peers: names of the other units.
+        max_message: largest payload of a message in bytes.
+    """
+
+    def __init__(self, node_id: str, transport: BackboneTransport, peers: Sequence[str], max_message: int) -> None:
+        self.peers = tuple(peers)
+        self.max_message = max_message
+        self.inbox: Mailbox[BackboneMessage] = Mailbox()
+        self._node_id = node_id
+        self._transport = transport
+
+    async def send(self, to: str, payload: bytes) -> None:
+        """Send a message to the unit `to`. Messages between two units arrive in the order in which they were sent.
+
+        Raise `PayloadTooLargeError` above `max_message` bytes, TypeError for what is not bytes, and ValueError for
+        a `to` that is none of the `peers`.
+        """
+        if to not in self.peers:
+            allowed = f"one of {', '.join(self.peers)} is expected" if self.peers else "there is no other unit"
+            raise ValueError(f"backbone.send({shown(to)}, …): {allowed}")
+        self._transport.send_message(self._node_id, to, self._checked("send", payload))
+
+    async def broadcast(self, payload: bytes) -> None:
+        """Send a message to all other units. The exceptions are those of `send`."""
+        self._transport.send_message(self._node_id, None, self._checked("broadcast", payload))
+
+    def _checked(self, call: str, payload: bytes) -> bytes:
+        content = checked_payload(f"backbone.{call}", payload)
+        if len(content) > self.max_message:
+            raise PayloadTooLargeError(len(content), self.max_message, "backbone.max_message_bytes")
+        return content
+
+    def drain(self) -> list[BackboneMessage]:
+        """Return all messages received since the last call, oldest first, without waiting."""
+        return self.inbox.drain()
+
+    async def receive(self) -> BackboneMessage:
+        """Return the next message; wait for one if there is none."""
+        return await self.inbox.get()
+
+    def __aiter__(self) -> Backbone:
+        return self
+
+    async def __anext__(self) -> BackboneMessage:
         return await self.inbox.get()

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from agents.cooperative.cmm.consensus import Share, tracked_mean
 from agents.cooperative.cmm.information import Five, Information, plain_moments
-from agents.cooperative.cmm.lane_exchange import LaneExchange
-from agents.cooperative.cmm.lane_memory import all_information_of, is_of_lane, kind_of_increment
+from agents.cooperative.cmm.lane_memory import LaneExchange, all_information_of, is_of_lane, kind_of_increment
 from agents.cooperative.cmm.own_vehicle import OwnVehicle, own_vehicle
 from agents.cooperative.cmm.plausibility import (
     INCREMENT_FACTOR,

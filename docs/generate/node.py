@@ -13,11 +13,9 @@ import msgspec
 import vnet
 from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
-from vnet.backbone import Backbone, BackboneMessage
 from vnet.errors import PayloadTooLargeError
-from vnet.mailbox import INBOX_LIMIT
 from vnet.node import GnssReceiver
-from vnet.radio import Radio, SendResult
+from vnet.radio import INBOX_LIMIT, Backbone, BackboneMessage, Radio, SendResult
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.units import unit_of

@@ -21,8 +21,7 @@ from emulator.world.maps.files import read_roads, write_roads, writer_of
 from emulator.world.maps.problems import PLACE_M, Calibration, MapReport, calibrate, examine, residuals
 from emulator.world.maps.roads import Roads
 from emulator.world.projection import CoordinateFrame
-from emulator.world.trips.drive import whole_motion
-from emulator.world.trips.files import check_trips_name, write_trips
+from emulator.world.trips.drive import check_trips_name, whole_motion, write_trips
 from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
 from emulator.world.trips.motion import Motion, Rules
 from vnet.errors import ScenarioError, VnetError

@@ -20,7 +20,7 @@ from emulator.records.tables import BackboneRow, backbone_table
 from emulator.scenario.program import Backbone
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Scenario
-from vnet.backbone import UnitAbilities
+from vnet.radio import UnitAbilities
 from vnet.runtime.arrivals import NewsItem
 from vnet.transport.wire import MessageRef, SentMessage, WireMessage, WireSendResult, sent_in_full
 from vnet.units import NS_PER_MS

@@ -46,8 +46,7 @@ from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.host import Disks, Host
-from vnet.runtime.outside_loop import present_node
-from vnet.runtime.process_end import caught
+from vnet.runtime.outside_loop import caught, present_node
 from vnet.runtime.programs import Programs, error_line, load_programs
 from vnet.runtime.ready_queue import CpuMeter
 from vnet.runtime.running_node import LOOK_S, Patience, RunningNode

@@ -25,9 +25,8 @@ from msgspec.structs import replace
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.processes import Processes, ProtocolError, check_yield
 from emulator.scenario.scenario import lookahead_ns
-from vnet.mailbox import INBOX_LIMIT
 from vnet.node import Fix
-from vnet.radio import Packet
+from vnet.radio import INBOX_LIMIT, Packet
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 from vnet.types import IntArray

@@ -18,7 +18,7 @@ import zenoh
 from emulator.drivers.launch import Launcher
 from vnet.errors import TransportError
 from vnet.runtime.die_with_parent import signal_at_parent_death
-from vnet.runtime.process_end import end_within
+from vnet.runtime.outside_loop import end_within
 from vnet.transport.access import Access
 
 ROUTER = "router"

@@ -28,10 +28,9 @@ from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude, judge_unkept
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
-from emulator.drivers.launch import Exit
+from emulator.drivers.launch import AGENT_ENVIRONMENT, Exit
 from emulator.drivers.lockstep import Lockstep, no_horizon
 from emulator.drivers.simulate import ProcessCount, process_count, simulate
-from emulator.drivers.zygote import AGENT_ENVIRONMENT
 from emulator.records.code_digest import entries_of
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.faults import refuse_router_restart

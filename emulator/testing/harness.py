@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from emulator.cells.programs import rule_entry
+from emulator.cells.worker import rule_entry
 from emulator.checks.judge import CheckResult, Judgement, Verdict
 from emulator.checks.own import PREFIX, Result, finding_of, load_checks
 from emulator.checks.properties import ANY, PERIOD, Effect, Predicate, always, eventually, leads_to, never

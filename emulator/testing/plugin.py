@@ -50,7 +50,7 @@ def vnet_emulation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[C
     from emulator.testing.death_watch import watch
     from emulator.testing.harness import RunHarness
     from emulator.testing.scenarios import make_scenario
-    from vnet.runtime.process_end import refuse_success
+    from vnet.runtime.outside_loop import refuse_success
 
     refuse_success()
     watch(request.config)

@@ -13,7 +13,7 @@ from emulator.cells import cells as cells_module
 from emulator.cli.commands import app
 from emulator.records.metrics import anees_band
 from studies import divergence, paper
-from studies.paper_values import PAPER_VEHICLES
+from studies.paper import PAPER_VEHICLES
 
 pytestmark = pytest.mark.slow
 

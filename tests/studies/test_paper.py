@@ -5,7 +5,7 @@ import pytest
 
 from emulator.world.world import build_world
 from studies import paper, reports
-from studies.paper_values import PAPER_RANGE_M
+from studies.paper import PAPER_RANGE_M
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,7 @@ import pyarrow as pa
 import pytest
 
 from studies import figures, reports
-from studies.paper import ALPHAS
-from studies.paper_values import PAPER_VEHICLES
+from studies.paper import ALPHAS, PAPER_VEHICLES
 
 pytestmark = pytest.mark.slow
 

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
-from vnet.mailbox import INBOX_LIMIT, Mailbox
 from vnet.node import Fix, Node
-from vnet.radio import Packet
+from vnet.radio import INBOX_LIMIT, Mailbox, Packet
 from vnet.runtime.own_asyncio import present_node
 from vnet.runtime.ready_queue import OrderedQueue
 from vnet.runtime.virtual_time import SkewedLoop

@@ -31,10 +31,7 @@ _NOT_STEPPED_INTO = (
     "agents.host",
     "emulator.",
     "namedtuple_",  # what Python generates for named tuples
-    "vnet.arguments",
     "vnet.driving",
-    "vnet.backbone",
-    "vnet.mailbox",
     "vnet.node",
     "vnet.radio",
     "vnet.reports",

@@ -28,16 +28,15 @@ from msgspec.structs import replace
 
 from vnet.driving import Action
 from vnet.errors import DeadlockError
-from vnet.mailbox import Mailbox, Waits
 from vnet.node import Fix, Node
-from vnet.radio import Packet, RadioAbilities, SentFrame
+from vnet.radio import Mailbox, Packet, RadioAbilities, SentFrame, Waits
 from vnet.reports import NoteDetail, Report
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap, map_from_wire
 from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, NodeClocks, Window
+from vnet.runtime.outside_loop import ProcessEndedError
 from vnet.runtime.own_asyncio import Task, current_node, present_node
-from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
 from vnet.runtime.ready_queue import EventChooser, chooser_of, node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap

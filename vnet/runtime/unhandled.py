@@ -20,9 +20,8 @@ from typing import Any
 
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
-from vnet.runtime.outside_loop import ExecutorJob, collector
+from vnet.runtime.outside_loop import ExecutorJob, ProcessEndedError, collector
 from vnet.runtime.own_asyncio import NOBODY, current_node, present_node
-from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import error_line, leaves
 from vnet.runtime.ready_queue import node_of
 from vnet.runtime.virtual_time import SkewedLoop

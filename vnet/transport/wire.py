@@ -18,11 +18,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from vnet.backbone import BackboneMessage, UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError, printable
 from vnet.node import NOTHING_SENSED, Fix, Reading
-from vnet.radio import Packet, SendResult, SentFrame
+from vnet.radio import BackboneMessage, Packet, SendResult, SentFrame, UnitAbilities
 from vnet.reports import Report
 
 TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]

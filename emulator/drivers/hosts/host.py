@@ -25,10 +25,9 @@ import zenoh
 from emulator.drivers.agent_keys import AgentKeys, Hear
 from emulator.drivers.hosts import messages
 from emulator.drivers.hosts.messages import Call, Calls, HostHello, HostWelcome, encode
-from emulator.drivers.launch import Launcher
+from emulator.drivers.launch import Launcher, Zygote
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
-from emulator.drivers.zygote import Zygote
 from emulator.records.code_digest import vnet_digest
 from vnet.errors import TransportError, VnetError, WireError
 from vnet.transport import keys, wire

@@ -21,7 +21,7 @@ from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.control import answer, control_endpoint
 from emulator.drivers.debugging import debug_point
 from emulator.drivers.emulation import Emulation, PeriodView
-from emulator.drivers.launch import Launcher
+from emulator.drivers.launch import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Launcher, Zygote
 from emulator.drivers.live.processes import RECORDER, LiveProcesses
 from emulator.drivers.live.supervisor import SHUT_DOWN_S
 from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
@@ -31,7 +31,6 @@ from emulator.drivers.realtime import RealTime, run_in_real_time
 from emulator.drivers.signals import cancelled_by_signals
 from emulator.drivers.status import Course
 from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
-from emulator.drivers.zygote import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Zygote
 from emulator.records.code_digest import entries_of
 from emulator.records.events import EventKind
 from emulator.scenario.scenario import Scenario

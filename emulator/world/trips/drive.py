@@ -1,33 +1,354 @@
-"""Trips of a scenario, from files, SUMO, a city, or a function of the user's own."""
+"""Trips of a scenario, from files (which are written as well), SUMO, a city, or a function of the user's own.
+
+Tables (CSV, Parquet) have the columns id, time_s and x_m, y_m or lat_deg, lon_deg; `heading_rad` and `speed_mps`
+are optional, and others are ignored. Files are read in batches.
+
+In SUMO's floating car data (`--fcd-output`) an element `timestep` with `time` holds elements `vehicle` with `id`,
+`x`, `y`, `angle` (degrees clockwise from north) and `speed`. Positions are metres of SUMO's network, or degrees
+with `--fcd-output.geo`, which the header states. They are those of the middle of the front bumper.
+
+Arrays (NPZ) are `lat_deg`, `lon_deg` or `x_m`, `y_m` (N, K), a row for each vehicle, and `rate_hz`. Column k is the
+time k / rate_hz. A vehicle is absent where both coordinates are NaN. `id` (N,), `heading_rad` and `speed_mps` (N,
+K) are optional; without ids vehicles are v1, v2, …, padded with zeros so that they sort.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+from xml.parsers import expat
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from emulator.scenario.network import Map, Network, read_begin_s
 from emulator.scenario.own_functions import in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
 from emulator.scenario.sections import DAY_S
+from emulator.world.input_files import open_csv, read_arrays
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import lanes_around, notes_of, read_roads
 from emulator.world.projection import CoordinateFrame
-from emulator.world.trips.files import drive_sumo, read_csv, read_fcd, read_npz, read_parquet
 from emulator.world.trips.generate import RIGHT, Side, generate_motion
-from emulator.world.trips.motion import MOST_SAMPLES, Motion, Rules, Samples, Selection, motion_of
-from vnet.errors import ScenarioError, shown
+from emulator.world.trips.motion import (
+    DEGREES,
+    METRES,
+    MOST_SAMPLES,
+    OPTIONAL,
+    Motion,
+    Rules,
+    Samples,
+    Selection,
+    motion_of,
+)
+from vnet.errors import ScenarioError, printable, shown
 from vnet.roads.road_map import RoadMap
 from vnet.runtime.programs import search_programs_in
+from vnet.types import Array
 from vnet.units import NS_PER_S
 
+_LONGEST_LINE = 100_000
+"""Characters of the header line."""
+BATCH_ROWS = 1 << 16
+"""Rows that are read at once."""
+_CHUNK_BYTES = 1 << 20
+"""Bytes that are parsed at once."""
+_GEO = re.compile(r'<fcd-output\.geo\s+value="(?:true|1|t)"')
+_EXPLAIN_LINES = 3
+"""Lines of SUMO's errors that are shown."""
+_LARGEST_BYTES = 8 * MOST_SAMPLES + (1 << 20)
+"""Largest array that is read."""
+ENDINGS = (".csv", ".parquet")
 USAGE = "def {}(seed, vehicles, duration_s)"
 COLUMNS = ("time_s", "x_m", "y_m", "heading_rad")
 """Numbers of a sample; the heading may be missing."""
+
+
+def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
+    """Return the samples of a CSV file. Raise ScenarioError, naming the row (the header is 1), for a bad file."""
+    with open_csv(path, _LONGEST_LINE) as lines:
+        columns = choose_columns(path, next(csv.reader(lines), []))
+    types = {name: pa.string() if name == "id" else pa.float64() for name in columns}
+    convert = pacsv.ConvertOptions(
+        column_types=types, include_columns=columns, null_values=[], strings_can_be_null=False
+    )
+    try:
+        # With one thread pyarrow's errors name the row.
+        reader = pacsv.open_csv(path, pacsv.ReadOptions(use_threads=False), convert_options=convert)
+        return _collect(path, reader, columns, first_row=2, window_s=window_s)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise ScenarioError(f"{path}: not a CSV file of trips: {printable(str(error), 300)}") from None
+
+
+def read_parquet(path: Path, window_s: tuple[float, float] | None) -> Samples:
+    """Return the samples of a Parquet file. Raise ScenarioError, naming the row (from 1), for a bad file."""
+    try:
+        with pq.ParquetFile(path.absolute()) as file:
+            columns = choose_columns(path, file.schema_arrow.names)
+            batches = file.iter_batches(BATCH_ROWS, columns=columns)
+            return _collect(path, batches, columns, first_row=1, window_s=window_s)
+    except (OSError, pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        raise ScenarioError(f"{path}: not a Parquet file of trips: {printable(str(error), 300)}") from None
+
+
+def choose_columns(path: Path, names: Sequence[str]) -> list[str]:
+    """Return the columns of a file that are read: id, time_s, positions in metres or degrees, and optional ones.
+
+    Raise ScenarioError if one is missing, or appears twice.
+    """
+    where = METRES if set(METRES) <= set(names) else DEGREES
+    for name in ("id", "time_s", *where):
+        if name not in names:
+            raise ScenarioError(
+                f"{path}: no column {name!r}; needed are id, time_s, and x_m, y_m or lat_deg, lon_deg"
+            )
+    columns = ["id", "time_s", *where, *(name for name in OPTIONAL if name in names)]
+    for name in columns:
+        if list(names).count(name) > 1:
+            raise ScenarioError(f"{path}: two columns {name!r}")
+    return columns
+
+
+def _collect(
+    path: Path,
+    batches: Iterable[pa.RecordBatch],
+    columns: Sequence[str],
+    first_row: int,
+    window_s: tuple[float, float] | None,
+) -> Samples:
+    samples = Samples(path, "row", window_s)
+    for batch in batches:
+        numbers = {name: batch[name].cast(pa.float64()) for name in columns[1:]}
+        row = first_row + samples.taken + np.arange(len(batch), dtype=np.int64)
+        values = {name: np.asarray(column.to_numpy(zero_copy_only=False)) for name, column in numbers.items()}
+        samples.add(batch["id"].cast(pa.string()), row, values)
+    return samples
+
+
+def read_fcd(path: Path, window_s: tuple[float, float] | None) -> Samples:
+    """Return the samples of an FCD file. Raise ScenarioError, naming the line, for a bad file."""
+    return _Reader(path, window_s).read()
+
+
+class _Reader:
+    """Handlers for expat, which add the samples in batches."""
+
+    def __init__(self, path: Path, window_s: tuple[float, float] | None) -> None:
+        self._path = path
+        self._samples = Samples(path, "line", window_s)
+        self._where = METRES
+        self._time_s: float | None = None
+        self._ids: list[str] = []
+        self._rows: list[tuple[int, float, float, float, float, float]] = []
+        self._parser = expat.ParserCreate()
+        self._parser.StartElementHandler = self._start
+        self._parser.CommentHandler = self._comment
+        self._parser.StartDoctypeDeclHandler = self._doctype
+        self._is_fcd = False
+
+    def read(self) -> Samples:
+        """Read the file to its end."""
+        try:
+            with self._path.open("rb") as file:
+                while chunk := file.read(_CHUNK_BYTES):
+                    self._parser.Parse(chunk, False)
+                self._parser.Parse(b"", True)
+        except OSError as error:
+            raise ScenarioError(f"{self._path}: cannot be read: {error.strerror}") from None
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two for encodings
+            raise ScenarioError(f"{self._path}: not an XML file: {error}") from None
+        self._flush()
+        return self._samples
+
+    def _problem(self, text: str) -> ScenarioError:
+        return ScenarioError(f"{self._path}: line {self._parser.CurrentLineNumber}: {text}")
+
+    def _comment(self, text: str) -> None:
+        if _GEO.search(text):
+            self._where = (DEGREES[1], DEGREES[0])  # x is the longitude
+
+    def _doctype(self, *_: object) -> None:
+        raise self._problem("a document type; SUMO writes none")
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        if not self._is_fcd:
+            if name != "fcd-export":
+                raise self._problem(f"element {printable(name)!r}: fcd-export, as SUMO writes it, is needed")
+            self._is_fcd = True
+        elif name == "timestep":
+            self._time_s = self._number(attributes, "time")
+        elif name == "vehicle":
+            self._vehicle(attributes)
+
+    def _vehicle(self, attributes: dict[str, str]) -> None:
+        if self._time_s is None:
+            raise self._problem("a vehicle outside every timestep")
+        if "id" not in attributes:
+            raise self._problem("a vehicle without id")
+        numbers = [self._number(attributes, name) for name in ("x", "y", "angle", "speed")]
+        self._ids.append(attributes["id"])
+        self._rows.append((self._parser.CurrentLineNumber, self._time_s, *numbers))  # type: ignore[arg-type]
+        if len(self._rows) >= BATCH_ROWS:
+            self._flush()
+
+    def _number(self, attributes: dict[str, str], name: str) -> float:
+        try:
+            return float(attributes[name])
+        except KeyError:
+            raise self._problem(f"no {name}") from None
+        except ValueError:
+            raise self._problem(f"{name} = {shown(attributes[name])}: a number is needed") from None
+
+    def _flush(self) -> None:
+        if not self._rows:
+            return
+        line, time_s, x, y, angle_deg, speed_mps = np.array(self._rows).T
+        heading_rad = np.radians(90.0 - angle_deg)
+        columns = {"time_s": time_s, self._where[0]: x, self._where[1]: y, "heading_rad": heading_rad}
+        self._samples.add(pa.array(self._ids), line.astype(np.int64), columns | {"speed_mps": speed_mps})
+        self._ids, self._rows = [], []
+
+
+def drive_sumo(path: Path, seed: int, end_s: float | None) -> Samples:
+    """Run SUMO on a configuration from its beginning, at most until `end_s`, and return the samples.
+
+    The same files and seed give the same trips. Raise ScenarioError if SUMO is not installed, or fails.
+    """
+    with TemporaryDirectory(prefix="vnet-sumo-") as folder:
+        output = Path(folder) / "fcd.xml"
+        command = [_sumo(path), "-c", str(path), "--seed", str(seed), "--fcd-output", str(output)]
+        command += ["--fcd-output.geo", "false", "--no-step-log", "--precision", "6"]
+        command += [] if end_s is None else ["--end", str(end_s)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        except OSError as error:
+            raise ScenarioError(f"{path}: cannot start {command[0]}: {error.strerror}") from None
+        if done.returncode or not output.exists():
+            lines = [line for line in done.stderr.splitlines() if line.startswith("Error")] or [done.stderr.strip()]
+            reason = " ".join(lines[:_EXPLAIN_LINES])
+            raise ScenarioError(f"{path}: SUMO failed (exit status {done.returncode}): {reason}")
+        try:
+            return read_fcd(output, None)
+        except ScenarioError as error:
+            raise ScenarioError(f"{path}: output of SUMO: {error}") from None
+
+
+def _sumo(path: Path) -> str:
+    """Return the path of SUMO, found on the PATH, beside this Python (the extra `sumo`), or in SUMO_HOME."""
+    folders = [os.environ.get("PATH", ""), str(Path(sys.executable).parent)]
+    if home := os.environ.get("SUMO_HOME"):
+        folders.append(str(Path(home) / "bin"))
+    found = shutil.which("sumo", path=os.pathsep.join(folders))
+    if found is None:
+        raise ScenarioError(
+            f"{path}: SUMO is not installed: pip install 'vnet-emulator[sumo]', or apt-get install sumo"
+        )
+    return found
+
+
+def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
+    """Return the samples of an NPZ file. Raise ScenarioError, naming the array or the row, for a bad file."""
+    arrays = _load(path)
+    where = METRES if set(METRES) <= arrays.keys() else DEGREES
+    for name in (*where, "rate_hz"):
+        if name not in arrays:
+            raise ScenarioError(f"{path}: no array {name!r}; needed are rate_hz, and lat_deg, lon_deg or x_m, y_m")
+    first, second = (arrays[name] for name in where)
+    count, length = _shape(path, where, first, second)
+    rate_hz = arrays["rate_hz"]
+    if rate_hz.ndim or not 0 < rate_hz <= 10_000:
+        raise ScenarioError(f"{path}: rate_hz = {printable(str(rate_hz))}: a number in (0, 10000] is needed")
+    time_s = np.arange(length) / float(rate_hz)
+    columns = [*where, *(name for name in OPTIONAL if name in arrays)]
+    for name in columns:
+        if arrays[name].shape != (count, length):
+            raise ScenarioError(f"{path}: {name} is {arrays[name].shape}, and {where[0]} {(count, length)}")
+    samples = Samples(path, "row", window_s)
+    for row, node_id in enumerate(_ids(path, arrays, count)):
+        present = ~(np.isnan(first[row]) & np.isnan(second[row]))
+        if not present.any():
+            continue
+        values = {"time_s": time_s[present], **{name: arrays[name][row, present] for name in columns}}
+        row_number = np.full(int(present.sum()), row + 1)
+        samples.add(pa.array([node_id]).take(pa.array(np.zeros(len(row_number), np.int64))), row_number, values)
+    return samples
+
+
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    arrays = read_arrays(path, (*METRES, *DEGREES, *OPTIONAL, "rate_hz", "id"), _LARGEST_BYTES)
+    for name, array in arrays.items():
+        if name != "id":
+            if array.dtype.kind not in "fiu":
+                raise ScenarioError(f"{path}: {name} holds {array.dtype}: numbers are needed")
+            arrays[name] = array.astype(float)
+    return arrays
+
+
+def _shape(path: Path, where: tuple[str, str], first: Array, second: Array) -> tuple[int, int]:
+    if first.ndim != 2 or first.shape != second.shape or not first.size:
+        shapes = f"{where[0]} is {first.shape}, {where[1]} {second.shape}"
+        raise ScenarioError(f"{path}: {shapes}: matrices of one shape are needed, a row for each vehicle")
+    return first.shape
+
+
+def _ids(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> list[str]:
+    if "id" not in arrays:
+        width = len(str(count))
+        return [f"v{number:0{width}d}" for number in range(1, count + 1)]
+    ids = [str(name) for name in arrays["id"].ravel()]
+    if len(ids) != count:
+        raise ScenarioError(f"{path}: {len(ids)} ids for {count} rows")
+    if len(set(ids)) != count:
+        twice = next(name for number, name in enumerate(ids) if name in ids[:number])
+        raise ScenarioError(f"{path}: id = {printable(twice)} appears twice; ids must differ")
+    return ids
+
+
+def check_trips_name(path: Path) -> None:
+    """Raise ScenarioError unless trips can be written in the format of this name."""
+    if path.suffix.lower() not in ENDINGS:
+        raise ScenarioError(f"{path}: trips are written as {' or '.join('*' + ending for ending in ENDINGS)}")
+
+
+def write_trips(motion: Motion, path: Path, rate_hz: float) -> int:
+    """Write the positions of each vehicle while it is present, in metres, by vehicle; return the number of samples.
+
+    Raise ScenarioError if the file cannot be written.
+    """
+    vehicle, period = np.nonzero(np.isfinite(motion.position_m[..., 0]).T)
+    position_m = motion.position_m[period, vehicle]
+    table = pa.table(
+        {
+            "id": pa.array(motion.node_ids).take(pa.array(vehicle)),
+            "time_s": period / rate_hz,
+            "x_m": np.round(position_m[:, 0], 3),
+            "y_m": np.round(position_m[:, 1], 3),
+            "heading_rad": np.round(motion.heading_rad[period, vehicle], 5),
+        }
+    )
+    try:
+        if path.suffix.lower() == ".csv":
+            pyarrow.csv.write_csv(table, path)
+        else:
+            pq.write_table(table, path.absolute())  # a colon would make it an address
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return len(table)
+
+
 READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml": read_fcd}
 """Readers of trips by the ending of the file's name."""
 

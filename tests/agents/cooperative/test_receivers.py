@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.cooperative.cmm.kalman_bound import LaneModel, OffsetAndMultipath
-from agents.cooperative.cmm.lane_exchange import LaneExchange
+from agents.cooperative.cmm.lane_memory import LaneExchange
 from agents.cooperative.cmm.own_vehicle import OwnConfig, OwnVehicle
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
 from agents.cooperative.information_frame import InformationFrame

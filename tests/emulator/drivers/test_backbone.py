@@ -11,8 +11,8 @@ from emulator.drivers.backbone import BackboneNetwork
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import run_other_ways, run_together
-from vnet.backbone import Backbone
 from vnet.errors import PayloadTooLargeError
+from vnet.radio import Backbone
 from vnet.transport.wire import SentMessage
 
 NAMES = ("rsu01", "rsu02", "rsu03")

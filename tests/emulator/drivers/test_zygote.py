@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from emulator.drivers import zygote as zygotes
-from emulator.drivers.launch import MOST_ZYGOTES, Exit, Launcher
-from emulator.drivers.zygote import ForkedProcess, Zygote, ZygoteGoneError
+from emulator.drivers import launch as zygotes
+from emulator.drivers.launch import MOST_ZYGOTES, Exit, ForkedProcess, Launcher, Zygote, ZygoteGoneError
 from tests.support.processes import has_ended, wait_until
 from vnet.errors import VnetError
 from vnet.runtime import forking

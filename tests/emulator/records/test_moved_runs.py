@@ -191,7 +191,7 @@ def test_a_folder_of_a_later_format_is_refused(inputs: Path, tmp_path: Path) -> 
 NAMES = {getattr(run_folder, name) for name in dir(run_folder) if name.endswith("_FILE")}
 NAMES |= {table.file for table in TABLES}
 READ = ("read_table", "ParquetFile", "read_schema")
-ELSEWHERE = {"emulator/cells/cells.py", "emulator/world/trips/files.py"}
+ELSEWHERE = {"emulator/cells/cells.py", "emulator/world/trips/drive.py"}
 """Modules that read Parquet files, and none of a run's folder."""
 
 

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 PROGRAM = """
 import threading
 
-from vnet.runtime.process_end import end_within
+from vnet.runtime.outside_loop import end_within
 
 end_within(0.1)
 threading.Event().wait()

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 PROGRAM = """
 import atexit, sys, threading, types
-from vnet.runtime.process_end import end_forked
+from vnet.runtime.outside_loop import end_forked
 shared = frozenset(sys.modules)
 
 own = sys.modules["own"] = types.ModuleType("own")

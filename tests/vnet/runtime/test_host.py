@@ -9,8 +9,7 @@ import pytest
 
 from vnet import Node
 from vnet.errors import PayloadTooLargeError, ProgramError
-from vnet.mailbox import INBOX_LIMIT, Mailbox
-from vnet.radio import Packet
+from vnet.radio import INBOX_LIMIT, Mailbox, Packet
 from vnet.roads.lanes import LaneMap
 from vnet.runtime.arrivals import Window
 from vnet.runtime.host import Host

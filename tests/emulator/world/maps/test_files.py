@@ -285,7 +285,7 @@ def test_a_map_in_metres_keeps_its_place_on_the_earth_to_the_bit(tmp_path: Path)
 
 
 def test_a_map_and_trips_of_one_origin_fall_on_each_other(tmp_path: Path) -> None:
-    from emulator.world.trips.files import read_csv
+    from emulator.world.trips.drive import read_csv
 
     lines = [f"car,{node},{maps.degrees(node)[1]!r},{maps.degrees(node)[0]!r}" for node in (1, 2, 4)]
     trips = read_csv(write(tmp_path, "trips.csv", "\n".join(["id,time_s,lat_deg,lon_deg", *lines])), None)
