@@ -1,24 +1,21 @@
-"""Node: everything that a vehicle program sees of its vehicle and its network.
-
-A program is `async def main(node: Node) -> None`. It has a radio, a GNSS receiver and a clock, and reports its
-estimates. The source of the packets (lockstep or real time, one process or fifty) is hidden behind the
-`NodeTransport`: the program is the same in all.
-"""
+"""Driving: what a program asks its vehicle to do."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 from zlib import crc32
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vnet.driving import Action, checked_action
+from vnet.errors import shown
 from vnet.radio import (
     NO_ABILITIES,
     Backbone,
@@ -29,11 +26,15 @@ from vnet.radio import (
     RadioTransport,
     SentFrame,
     UnitAbilities,
+    number_or_nan,
 )
 from vnet.reports import NoteDetail, Report, Reporter, checked_detail
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
+
+LARGEST_M_S2 = 1e6
+"""Largest acceleration that can be asked for; what vehicles can do is far below it."""
 
 LEVELS = ("debug", "info", "warning", "error", "critical")
 """Levels of a line of a node's log."""
@@ -46,6 +47,46 @@ NOTHING_SENSED: Mapping[str, Reading] = MappingProxyType({})
 
 MOMENTS_OF_FAULTS = ("fault_started", "fault_ended")
 """Names of the moments at which faults begin and end at a vehicle (`emulator.checks.properties`)."""
+
+
+class Action(msgspec.Struct, frozen=True, array_like=True):
+    """Request of the program of `node`: an acceleration, or a change by `lane` lanes, 1 to the left.
+
+    `release` leaves the speed to the vehicle: to SUMO's driver where there is one, else it is kept.
+    """
+
+    node: str
+    acceleration_m_s2: Annotated[float, msgspec.Meta(ge=-LARGEST_M_S2, le=LARGEST_M_S2)] | None = None
+    lane: Annotated[int, msgspec.Meta(ge=-1, le=1)] = 0
+    release: bool = False
+
+    @property
+    def is_sound(self) -> bool:
+        """True unless its acceleration is no number, which no bound of a message excludes."""
+        return self.acceleration_m_s2 is None or math.isfinite(self.acceleration_m_s2)
+
+
+def checked_action(
+    node: str, can_drive: bool, acceleration_m_s2: float | None, lane: int, release: bool = False
+) -> Action:
+    """Return an action of `node`. Raise ValueError for one that is none, and if programs do not drive."""
+    if not can_drive:
+        raise ValueError('drive(…): programs drive only with [network] kind = "driven", or with step = true')
+    asked = acceleration_m_s2
+    if asked is not None:
+        asked = number_or_nan(asked)
+        if not abs(asked) <= LARGEST_M_S2:
+            text = f"a finite number within ±{LARGEST_M_S2:g} is needed"
+            raise ValueError(f"drive(acceleration_m_s2={shown(acceleration_m_s2)}): {text}")
+    if lane not in (-1, 0, 1):
+        raise ValueError(f"drive(lane={shown(lane)}): allowed are -1 (right), 1 (left) and 0 (stay)")
+    if not isinstance(release, bool):
+        raise ValueError(f"drive(release={shown(release)}): True or False is needed")
+    if asked is not None and release:
+        raise ValueError("drive(…, release=True): gives the speed back, and takes no acceleration_m_s2")
+    if asked is None and lane == 0 and not release:
+        raise ValueError("drive(): give acceleration_m_s2, lane or both")
+    return Action(node, asked, int(lane), release)
 
 
 @dataclass(slots=True)  # a frozen one takes five times as long to make; each is its program's own

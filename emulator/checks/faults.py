@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.checks.channel import binomial_band, frame_digests, received_twice
-from emulator.checks.latency import bounds
+from emulator.checks.channel import binomial_band, bounds, frame_digests, received_twice
 from emulator.fault_plan import PlannedFault
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import SLOT_NS

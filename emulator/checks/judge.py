@@ -22,6 +22,7 @@ from pathlib import Path
 from emulator.checks.channel import (
     check_conservation,
     check_isolation,
+    check_latency,
     check_loss_rate,
     check_peer_cap,
     check_range,
@@ -38,7 +39,6 @@ from emulator.checks.faults import (
     check_pause_respected,
 )
 from emulator.checks.folder import judge_folder
-from emulator.checks.latency import check_latency
 from emulator.checks.own import PREFIX, check_own_rules, load_checks, own_findings, recorded_findings
 from emulator.checks.radio import check_fading, check_medium
 from emulator.checks.replay import ONCE, check_replay

@@ -24,7 +24,6 @@ from emulator.radio.outcomes import Outcome
 from emulator.records.costs import run_cost
 from emulator.records.events import EventKind
 from emulator.records.manifest import write_manifest
-from emulator.records.node_files import collect
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run import Run
 from emulator.records.run_folder import (
@@ -32,6 +31,7 @@ from emulator.records.run_folder import (
     VERDICT_FILE,
     WORLD_FILE,
     RunFolder,
+    collect,
     write_text,
 )
 from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS, SAMPLES, TABLES, busy_table

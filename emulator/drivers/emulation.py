@@ -48,7 +48,7 @@ from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
 from emulator.world.own_sensors import SensorFailure
 from emulator.world.world import Instant, World, components
-from vnet.driving import Action
+from vnet.node import Action
 from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire

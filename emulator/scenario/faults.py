@@ -8,7 +8,7 @@ follows. CONTRIBUTING.md shows an example. The layers above act on families:
 |---|---|---|
 | `ProcessFault` | `drivers/emulation.py` | `checks/faults.py` |
 | `cuts = True` | `radio/faults.py` | `checks/faults.py` |
-| `LossFault`, `DelayFault` | `radio/faults.py` by the kind's law | `checks/faults.py`, `checks/latency.py` |
+| `LossFault`, `DelayFault` | `radio/faults.py` by the kind's law | `checks/faults.py`, `checks/channel.py` |
 | `SenderFault` | `radio/faults.py` | `checks/faults.py` |
 | `OwnRule` | `radio/own_rules.py` | `checks/own_rules.py` |
 | `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/faults.py` |

@@ -18,8 +18,8 @@ from tests.docs.layouts import Field, Layouts, split
 from tests.support.paths import ROOT
 from tests.support.recorded import prepared
 from tests.vnet.transport.test_wire import agent_messages, emulator_messages, names, reports, times, unit_messages
-from vnet.driving import Action
 from vnet.errors import WireError
+from vnet.node import Action
 from vnet.radio import SentFrame, UnitAbilities
 from vnet.reports import Report
 from vnet.transport import backbone_keys, keys, wire

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vnet.driving import Action, checked_action
+from vnet.node import Action, checked_action
 
 
 @pytest.mark.parametrize("asked", [2, 2.0, np.float32(2), np.int64(2), np.array(2.0)])

@@ -31,7 +31,6 @@ _NOT_STEPPED_INTO = (
     "agents.host",
     "emulator.",
     "namedtuple_",  # what Python generates for named tuples
-    "vnet.driving",
     "vnet.node",
     "vnet.radio",
     "vnet.reports",

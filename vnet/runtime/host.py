@@ -26,9 +26,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from msgspec.structs import replace
 
-from vnet.driving import Action
 from vnet.errors import DeadlockError
-from vnet.node import Fix, Node
+from vnet.node import Action, Fix, Node
 from vnet.radio import Mailbox, Packet, RadioAbilities, SentFrame, Waits
 from vnet.reports import NoteDetail, Report
 from vnet.roads.lanes import LaneMap

@@ -12,7 +12,7 @@ import zlib
 from pathlib import Path
 from types import FrameType
 
-from vnet.driving import Action
+from vnet.node import Action
 from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.runtime.unhandled import NOT_THE_PROGRAM

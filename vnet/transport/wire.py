@@ -18,9 +18,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from vnet.driving import Action
 from vnet.errors import WireError, printable
-from vnet.node import NOTHING_SENSED, Fix, Reading
+from vnet.node import NOTHING_SENSED, Action, Fix, Reading
 from vnet.radio import BackboneMessage, Packet, SendResult, SentFrame, UnitAbilities
 from vnet.reports import Report
 

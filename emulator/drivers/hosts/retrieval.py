@@ -13,8 +13,7 @@ from pathlib import Path, PurePosixPath
 from emulator.drivers.hosts.messages import PART_BYTES, Call
 from emulator.drivers.processes import ProtocolError
 from emulator.records.events import EventKind
-from emulator.records.node_files import DEEPEST, MOST_FILES, collect
-from emulator.records.run_folder import FILES, RunFolder
+from emulator.records.run_folder import DEEPEST, FILES, MOST_FILES, RunFolder, collect
 from vnet.errors import printable
 from vnet.units import BYTES_PER_MB
 

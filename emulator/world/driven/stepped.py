@@ -19,9 +19,8 @@ from emulator.world.driven.vehicles import DrivenVehicles, Happening, Log
 from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion
 from emulator.world.truth import MotionSensors, World, periods_of, refuse_shared_processes
-from vnet.driving import Action
 from vnet.errors import ScenarioError
-from vnet.node import Fix
+from vnet.node import Action, Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array, Mask

@@ -45,10 +45,9 @@ from emulator.world.driven.sumo_process import (
 from emulator.world.driven.vehicles import COLLISION, LIMITED, Happening, Log
 from emulator.world.projection import CoordinateFrame
 from emulator.world.truth import refuse_shared_processes
-from vnet.driving import Action
 from vnet.errors import ScenarioError, VnetError, first_names, printable, shown
 from vnet.extras import require
-from vnet.node import Fix
+from vnet.node import Action, Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array

@@ -16,8 +16,8 @@ import numpy as np
 
 from emulator.scenario.network import Driven
 from emulator.world.driven.road import Start, one_each, start_on_single_road
-from vnet.driving import Action
 from vnet.errors import ScenarioError
+from vnet.node import Action
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 

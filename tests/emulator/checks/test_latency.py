@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.checks.latency import NO_EPISODE, _plain_course, _throttled_course
+from emulator.checks.channel import NO_EPISODE, _plain_course, _throttled_course
 
 batches = st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**7)), min_size=1, max_size=30)
 

@@ -7,8 +7,7 @@ import pytest
 
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
-from emulator.records.node_files import DEEPEST, MOST_FILES, collect
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import DEEPEST, MOST_FILES, RunFolder, collect
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.node import Node
 from vnet.runtime.host import Disks

@@ -9,8 +9,8 @@ import pytest
 
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import MOST_NOTES, Emulation
-from emulator.records.node_files import NodeLogs
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import NodeLogs
 from emulator.records.tables import STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
@@ -108,7 +108,7 @@ def test_a_flood_is_cut_and_counted() -> None:
 
 
 def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.records.node_files.LARGEST_LOG_BYTES", 20)
+    monkeypatch.setattr("emulator.records.run_folder.LARGEST_LOG_BYTES", 20)
     logs = NodeLogs(tmp_path)
     for number in range(5):
         logs.write("v01", f"line {number:03}")

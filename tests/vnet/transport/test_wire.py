@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vnet.driving import Action
 from vnet.errors import WireError
-from vnet.node import Fix
+from vnet.node import Action, Fix
 from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire

@@ -8,8 +8,7 @@ from emulator.drivers.hosts import retrieval
 from emulator.drivers.hosts.messages import Call
 from emulator.drivers.hosts.retrieval import Retrieval, hand_in
 from emulator.drivers.processes import ProtocolError
-from emulator.records.node_files import collect
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import RunFolder, collect
 from emulator.scenario.scenario import Scenario
 
 PROCESSES = [["v01", "v02"], ["v03"]]

@@ -13,8 +13,8 @@ from emulator.world.driven.stepped import DrivenWorld
 from emulator.world.driven.vehicles import COLLISION, LANE_ENDED, LIMITED, DrivenVehicles, Happening
 from emulator.world.world import build_world
 from tests.support.map_files import CROSS, Point, write_map
-from vnet.driving import Action
 from vnet.errors import ScenarioError
+from vnet.node import Action
 from vnet.roads.road_map import RoadMap
 
 EAST, NORTH = ("edge 0", "edge 1"), ("edge 2", "edge 3")

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 
 from emulator.scenario.network import Driven
 from emulator.world.driven.vehicles import COLLISION, LIMITED, DrivenVehicles, Happening
-from vnet.driving import Action
 from vnet.errors import ScenarioError
+from vnet.node import Action
 
 STEP_NS = 100_000_000
 
