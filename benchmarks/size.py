@@ -9,7 +9,8 @@ SOURCE = ("vnet", "agents", "emulator", "studies")
 TO_CHANGE_A_RUN = (
     "vnet",
     "agents",
-    *(f"emulator/{name}" for name in ("scenario", "faults", "world", "radio", "records", "checks", "drivers")),
+    "emulator/fault_plan.py",
+    *(f"emulator/{name}" for name in ("scenario", "world", "radio", "records", "checks", "drivers")),
 )
 """The packages that somebody must know who changes how a run runs."""
 SMALL = 60

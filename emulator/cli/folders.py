@@ -7,7 +7,7 @@ import webbrowser
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -15,8 +15,6 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.cli.options import LATEST, ChecksOption, RunArgument, path_of
-from emulator.records.parting import FrameEntry, frame_log
-from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import VERDICT_FILE
 from emulator.scenario.program import from_here, split_file
 from emulator.terminal.console import one_line_errors, tell
@@ -24,6 +22,9 @@ from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError, did_you_mean, printable, shown
 from vnet.runtime.programs import error_line, search_programs_in
 from vnet.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from emulator.records.parting import FrameEntry
 
 COLUMNS = ("s", "sender", "frame", "bytes", "content", "receivers")
 LONGEST_CONTENT = 200
@@ -45,7 +46,8 @@ def check(
     ] = False,
 ) -> None:
     """Judge a run again, from its files alone; its own checks stand as recorded unless asked."""
-    from emulator.checks.judge import check_run  # only this command judges
+    from emulator.checks.judge import check_run  # slow to import, as are the readers of folders below
+    from emulator.records.recorded_run import RecordedRun
     from emulator.terminal.summary import print_checks
 
     with one_line_errors():
@@ -69,6 +71,9 @@ def trace(
     ] = None,
 ) -> None:
     """Show who sent what to whom, and what became of it; on a terminal as a table, else separated by tabs."""
+    from emulator.records.parting import frame_log
+    from emulator.records.recorded_run import RecordedRun
+
     with one_line_errors():
         if end is not None and not end > start:
             raise VnetError(f"--to {end:g}: must come after --from {start:g}")
