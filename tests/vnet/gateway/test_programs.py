@@ -1,6 +1,7 @@
 """Surroundings of unmodified programs on virtual time: their classes by name, their configuration, themselves."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -276,7 +277,39 @@ def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Driv
             print(list(pool.map(work, range(3))), [job.result() for job in as_completed(jobs)])
         """
     )
-    assert log(run)[:-1] == ["9 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]"]
+    lines = [line for line in log(run)[:-1] if "child processes" not in line]
+    assert lines == ["9 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]"]
+
+
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_zenoh_of_a_child_process_opens_no_session_and_says_that_it_is_outside(drive: Drive, method: str) -> None:
+    """It would be a peer of whatever is on the machine's network."""
+    run = drive(
+        f"""
+        import multiprocessing, subprocess, sys, zenoh
+        def open_there(end):
+            try:
+                zenoh.open(zenoh.Config())
+            except Exception as error:
+                end.send(str(error))
+        if __name__ == "__main__":
+            ours, theirs = multiprocessing.Pipe()
+            child = multiprocessing.get_context("{method}").Process(target=open_there, args=(theirs,))
+            child.start()
+            print(ours.recv())
+            child.join()
+            for _ in range(2):
+                code = "import zenoh; zenoh.open(zenoh.Config())"
+                done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+                print(done.stderr.splitlines()[-1])
+        """,
+        vehicles=2,
+    )
+    for node in ("v01", "v02"):
+        by_fork, *_, by_run, _, _ = lines = log(run, node)
+        assert "outside of the emulation" in by_fork and "opens no session" in by_run
+        assert sum("child processes are outside" in line for line in lines) == 1
+    assert "VNET_OUTSIDE" not in os.environ
 
 
 def test_a_program_that_ignores_its_end_is_ended(drive: Drive) -> None:

@@ -22,7 +22,9 @@ from vnet.errors import ProgramError
 from vnet.gateway import filled_in
 from vnet.gateway.emulated import advanced, queries, sessions, values
 from vnet.gateway.emulated.modules import ENDPOINT, ProgramModules
+from vnet.gateway.emulated.process import children_outside
 from vnet.gateway.emulated.shown import Facade
+from vnet.gateway.emulated.strands import go_no_further_if_ended
 from vnet.gateway.emulated.values import Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.gateway.ros2 import Ros2
@@ -58,6 +60,7 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
         if timestamp_callback is not None:
             raise zenoh.ZError("timestamp_callback is not available on virtual time")
+        go_no_further_if_ended()
         program.has_session = True
         return sessions.Session(vehicle, outlet, config)
 
@@ -99,9 +102,10 @@ async def main(node: Node) -> None:
     clock = [] if topics is None else [vehicle.tell_clock(topics["clock_hz"])]
     background = [Task(each, loop=loop) for each in [*vehicle.tasks(), *clock]]
     try:
-        async with asyncio.TaskGroup() as tasks:
-            for words in commands:
-                tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT)))
+        with children_outside():
+            async with asyncio.TaskGroup() as tasks:
+                for words in commands:
+                    tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT)))
     except* Exception as errors:
         error = errors.exceptions[0]
         raise error.with_traceback(_of_program(error.__traceback__)) from None

@@ -40,8 +40,8 @@ from vnet.gateway.emulated.strands import Threads, look, set_generator_hooks, sl
 from vnet.node import Node
 from vnet.units import NS_PER_S
 
-ENDPOINT = "tcp/127.0.0.1:7447"
-"""Endpoint that programs are told. Sessions here have no transport, and connect to nothing."""
+ENDPOINT = "tcp/127.0.0.1:1"
+"""Endpoint that programs are told, at which nobody listens. Sessions here have no transport."""
 CLIENT_CONFIG = Path(__file__).with_name("client.json5")
 """File of a client's configuration for that endpoint, as a gateway gives one."""
 EPOCH_NS = 1_735_689_600 * NS_PER_S
@@ -120,6 +120,8 @@ class ProgramModules:
         self.environ = {**os.environ, **own}
         if "ros2" in node.options:
             self.environ["ROS_DOMAIN_ID"] = str(node.options["ros2"]["domain"])
+        has_children = "child processes are outside of the emulation: Zenoh in Python opens no session there"
+        tell = cache(partial(node.log, has_children))
         self.modules = OwnModules()
         self._facades: dict[str, Callable[[], ModuleType]] = {
             "_thread": self.threads.module,
@@ -129,7 +131,7 @@ class ProgramModules:
             "os": self._os,
             "select": lambda: Facade(select, select=_select),
             "signal": lambda: Facade(signal, **self.process.signal_functions()),
-            "subprocess": lambda: Facade(subprocess, **subprocess_functions(self.environ)),
+            "subprocess": lambda: Facade(subprocess, **subprocess_functions(self.environ, tell)),
             "sys": self._sys,
             "time": self._time,
         }

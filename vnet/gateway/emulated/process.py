@@ -10,12 +10,16 @@ import errno
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, NoReturn
 
+from vnet.gateway import STARTUP
 from vnet.gateway.emulated.strands import HardExit, Threads, block_on, current_strand, leave_hard, sleep
 
+OUTSIDE = "VNET_OUTSIDE"
+"""Variable by which a child process knows that it has no radio, as its Zenoh would reach the machine's network."""
 PID = 1
 """Number of the program's process."""
 INTERRUPTED = 130
@@ -117,17 +121,39 @@ def _refuse(*args: object, **options: object) -> NoReturn:
     raise OSError(errno.ENOSYS, "not available on virtual time: the process has other vehicles, too")
 
 
-def subprocess_functions(environ: Mapping[str, str]) -> dict[str, Any]:
+_programs, _path_before = 0, ""
+
+
+@contextmanager
+def children_outside() -> Iterator[None]:
+    """Have Zenoh in Python's child processes, however they are started, open no session meanwhile."""
+    global _programs, _path_before
+    if _programs == 0:
+        _path_before = os.environ.get("PYTHONPATH", "")
+        os.environ |= {"PYTHONPATH": os.pathsep.join(filter(None, [str(STARTUP), _path_before])), OUTSIDE: "1"}
+    _programs += 1
+    try:
+        yield
+    finally:
+        _programs -= 1
+        if _programs == 0:
+            os.environ["PYTHONPATH"] = _path_before  # empty means none
+            del os.environ[OUTSIDE]
+
+
+def subprocess_functions(environ: Mapping[str, str], tell: Callable[[], object]) -> dict[str, Any]:
     """Return what stands for functions of `subprocess`: child processes get the program's environment."""
+
+    def environment(given: Any) -> Any:
+        tell()
+        return environ if given is None else given
 
     class Popen(subprocess.Popen[Any]):
         def __init__(self, *args: Any, **options: Any) -> None:
-            if options.get("env") is None:
-                options["env"] = environ
-            super().__init__(*args, **options)
+            super().__init__(*args, **options | {"env": environment(options.get("env"))})
 
     def inheriting(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda *args, env=None, **options: function(*args, env=environ if env is None else env, **options)
+        return lambda *args, env=None, **options: function(*args, env=environment(env), **options)
 
     names = ("call", "check_call", "check_output", "run")
     return {"Popen": Popen, **{name: inheriting(getattr(subprocess, name)) for name in names}}

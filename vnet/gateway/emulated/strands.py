@@ -205,7 +205,12 @@ def set_generator_hooks(*hooks: Any, **named: Any) -> None:
 
 
 def go_no_further_if_ended() -> None:
-    """Raise GreenletExit whenever the present strand goes on, if it is ended, so that no loop of it is endless."""
+    """Raise GreenletExit whenever the present strand goes on, if it is ended, so that no loop of it is endless.
+
+    Raises RuntimeError in a process that a program has forked.
+    """
+    if _is_child:
+        raise RuntimeError("a forked process is outside of the emulation: no session, no channel and no lock there")
     strand = current_strand()
     while strand is not None and strand.is_ended:
         assert strand.parent is not None

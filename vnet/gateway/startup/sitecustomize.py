@@ -49,6 +49,8 @@ def open_with_override(zenoh: Any) -> None:
     opened = zenoh.open
 
     def open(config: Any, **options: Any) -> Any:
+        if "VNET_OUTSIDE" in os.environ:
+            raise zenoh.ZError("a child process on virtual time is outside of the emulation, and opens no session")
         changes = os.environ.get("ZENOH_CONFIG_OVERRIDE", "") if isinstance(config, zenoh.Config) else ""
         for setting in filter(None, changes.split(";")):
             config.insert_json5(*setting.split("=", 1))
