@@ -25,7 +25,7 @@ from typing import Any
 
 from vnet.errors import VnetError
 from vnet.runtime.environment import use_same_arithmetic
-from vnet.runtime.process_end import end_forked
+from vnet.runtime.outside_loop import end_forked
 
 PYTHON = [sys.executable, "-P", "-m"]
 VNET = [*PYTHON, "emulator.cli"]
