@@ -561,3 +561,77 @@ def test_what_virtual_time_does_not_have_is_refused_when_the_scenario_is_read(
 ) -> None:
     with pytest.raises(ValueError, match=text):
         Scenario.model_validate({"program": {"kind": "zenoh", "command": words}, "fault": fault})
+
+
+def test_what_is_closed_ends_what_waits_as_at_zenoh_itself(drive: Drive) -> None:
+    run = drive(
+        """
+        import threading, time, zenoh
+        def say(*words):
+            print(f"{time.monotonic():.1f}", *words)
+        def told(name):
+            return zenoh.handlers.Callback(lambda item: None, lambda: say("dropped", name))
+        asked, session, held = zenoh.open(zenoh.Config()), zenoh.open(zenoh.Config()), []
+        asked.declare_queryable("slow", held.append)
+        publisher = session.declare_publisher("a")
+        publisher.declare_matching_listener(told("first listener"))
+        publisher.undeclare()
+        time.sleep(0.1)
+        session.get("slow", told("get"), timeout=3)
+        replies = session.get("slow", timeout=3)
+        left = session.declare_publisher("a")
+        left.declare_matching_listener(told("listener"))
+        session.declare_subscriber("a", told("subscriber"))
+        time.sleep(0.4)
+        session.close()
+        say("closed", list(replies))
+
+        session = zenoh.open(zenoh.Config())
+        for declare in (session.declare_subscriber, session.declare_queryable):
+            channel = declare("b")
+            thread = threading.Thread(target=lambda: say(type(channel.recv()).__name__))
+            thread.start()
+            time.sleep(0.1)
+            try:
+                channel.undeclare()
+            except RuntimeError as error:
+                say(error)
+            asked.put("b", "x")
+            asked.get("b")
+            thread.join()
+            channel.undeclare()
+            for use in (channel.recv, channel.try_recv, lambda: channel.handler, channel.undeclare):
+                try:
+                    use()
+                except zenoh.ZError as error:
+                    print(error)
+        """
+    )
+    first, *drops, closed = log(run)[:5]
+    assert first == "0.0 dropped first listener"
+    assert sorted(drops) == [f"0.5 dropped {name}" for name in ("get", "listener", "subscriber")]
+    assert closed == "0.5 closed []"
+    lines = log(run)[5:-1]
+    assert [line[4:] for line in lines if line[0] == "0"] == [
+        *("Already borrowed", "Sample"),
+        *("Already borrowed", "Query"),
+    ]
+    assert [line for line in lines if line[0] != "0"] == ["Undeclared subscriber"] * 4 + [
+        "Undeclared queryable"
+    ] * 4
+
+
+def test_sys_exit_in_a_callback_ends_nothing_and_is_told(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        session.declare_subscriber("a", lambda sample: sys.exit(5))
+        session.put("a", "b")
+        time.sleep(0.1)
+        print("goes on")
+        """
+    )
+    assert run.verdict == "invalid"
+    assert any("SystemExit(5)" in line for line in log(run))
+    assert "goes on" in log(run)

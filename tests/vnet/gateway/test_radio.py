@@ -293,6 +293,7 @@ def test_large_sample_crosses_in_fragments(drive: Drive) -> None:
 
 RECOVER = """
     import sys, time, zenoh
+    from datetime import timedelta
     from zenoh.ext import *
     session = zenoh.open(zenoh.Config())
     if sys.argv[1] == "v01":
@@ -317,7 +318,7 @@ RECOVER = """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recovery", ["heartbeat=True", "periodic_queries=0.2"])
+@pytest.mark.parametrize("recovery", ["heartbeat=True", "periodic_queries=timedelta(seconds=0.2)"])
 def test_advanced_subscriber_recovers_most_of_what_the_radio_loses_in_order(drive: Drive, recovery: str) -> None:
     # Zenoh gives up what lies before a query's end: queries over the radio must end before the next begins.
     zenoh = {"zenoh": {"query_s": 0.1}}

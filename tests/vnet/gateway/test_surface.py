@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from tests.support.paths import ROOT
+from tests.vnet.gateway.conftest import Drive, log
 from vnet.gateway.emulated import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
@@ -74,3 +75,59 @@ def test_values_are_zenohs_own_wherever_python_can_construct_them() -> None:
 def test_page_names_all_that_is_refused() -> None:
     page = (ROOT / "docs/how-to/zenoh.md").read_text().partition("Refused by name are")[2]
     assert {name for name in REFUSED if f"`{name}`" not in page} == set()
+
+
+ARGUMENTS = """
+    ext.RecoveryConfig(periodic_queries=1.0)
+    ext.RecoveryConfig(periodic_queries=SECOND)
+    ext.RecoveryConfig(heartbeat=False)
+    ext.MissDetectionConfig(heartbeat=SECOND)
+    ext.MissDetectionConfig(heartbeat=-1.0)
+    ext.MissDetectionConfig(heartbeat=0)
+    ext.MissDetectionConfig(sporadic_heartbeat="1")
+    ext.CacheConfig(-1)
+    ext.CacheConfig("3")
+    ext.CacheConfig(3)
+    ext.HistoryConfig(max_age=SECOND)
+    ext.HistoryConfig(max_age=1, detect_late_publishers=True)
+    ext.RepliesConfig(priority=3)
+    handlers.RingChannel(-1)
+    handlers.FifoChannel(0)
+    session.get("a", timeout=-1.0)
+    session.get("a", timeout=float("nan"))
+    session.get("a", timeout=SECOND)
+    session.get("a", timeout=1, allowed_destination="any")
+    session.get("a", timeout=0)
+    session.declare_querier("a", timeout=SECOND)
+    session.declare_queryable("a", complete=1)
+    session.declare_subscriber("a", allowed_origin=3)
+    session.declare_publisher("a", reliability=True)
+    session.liveliness().get("a", timeout=SECOND)
+    session.liveliness().declare_subscriber("a", history=1)
+"""
+NAMES = "from datetime import timedelta\nfrom zenoh import ext, handlers\nSECOND = timedelta(seconds=1)\n"
+
+
+def attempts() -> str:
+    """Return a program that collects in `answers` what becomes of each of these calls at a `session`."""
+    return f"""
+answers = []
+for call in {ARGUMENTS.split(chr(10))[1:-1]!r}:
+    try:
+        eval(call.strip())
+    except Exception as error:
+        answers.append(f"{{call.strip()}}: {{type(error).__name__}}")
+"""
+
+
+@pytest.mark.slow
+def test_arguments_are_refused_as_by_zenoh_itself(drive: Drive) -> None:
+    config = zenoh.Config()
+    for key in ("scouting/multicast/enabled", "scouting/gossip/enabled"):
+        config.insert_json5(key, "false")
+    config.insert_json5("listen/endpoints", "[]")
+    with zenoh.open(config) as session:
+        there: dict[str, Any] = {"session": session}
+        exec(NAMES + attempts(), there)
+    run = drive(f"import zenoh\n{NAMES}session = zenoh.open(zenoh.Config()){attempts()}print(*answers, sep='\\n')")
+    assert log(run)[:-1] == there["answers"] != []

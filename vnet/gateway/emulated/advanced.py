@@ -12,6 +12,7 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import timedelta
 from functools import partial, partialmethod
 from typing import Any, Literal, NoReturn
 
@@ -22,7 +23,17 @@ from zenoh.ext import UInt32, z_deserialize, z_serialize
 from vnet.gateway.emulated.modules import EPOCH_NS
 from vnet.gateway.emulated.queries import ALL_REPLIES, ANY_KEY, Asking, Entity, Query
 from vnet.gateway.emulated.sessions import Listening, LivelinessToken, Publisher, Session, Subscriber, Watcher
-from vnet.gateway.emulated.values import Direct, EntityGlobalId, Reply, Sample, Sink, SourceInfo, ZenohId, key_of
+from vnet.gateway.emulated.values import (
+    Direct,
+    EntityGlobalId,
+    Reply,
+    Sample,
+    Sink,
+    SourceInfo,
+    ZenohId,
+    check,
+    key_of,
+)
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
@@ -33,7 +44,13 @@ _WITHOUT_ID = "uhlc"
 
 
 @dataclass(frozen=True)
-class RepliesConfig:
+class _Config:
+    def __post_init__(self) -> None:
+        check(vars(self))
+
+
+@dataclass(frozen=True)
+class RepliesConfig(_Config):
     """Quality of service of a cache's replies."""
 
     congestion_control: zenoh.CongestionControl | None = field(default=None, kw_only=True)
@@ -42,7 +59,7 @@ class RepliesConfig:
 
 
 @dataclass(frozen=True)
-class CacheConfig:
+class CacheConfig(_Config):
     """A publisher's cache."""
 
     max_samples: int | None = None
@@ -50,7 +67,7 @@ class CacheConfig:
 
 
 @dataclass(frozen=True)
-class HistoryConfig:
+class HistoryConfig(_Config):
     """History for which a subscriber asks caches at its beginning."""
 
     detect_late_publishers: bool | None = field(default=None, kw_only=True)
@@ -64,7 +81,7 @@ class HistoryConfig:
 
 
 @dataclass(frozen=True)
-class MissDetectionConfig:
+class MissDetectionConfig(_Config):
     """Seconds between the heartbeats by which the last misses are detected; sporadic ones follow samples alone."""
 
     heartbeat: float | None = field(default=None, kw_only=True)
@@ -72,13 +89,14 @@ class MissDetectionConfig:
 
 
 @dataclass(frozen=True)
-class RecoveryConfig:
+class RecoveryConfig(_Config):
     """Ways to find that a subscriber's last sample was not the publisher's."""
 
-    periodic_queries: Any = field(default=None, kw_only=True)
+    periodic_queries: timedelta | None = field(default=None, kw_only=True)
     heartbeat: Literal[True] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.periodic_queries is None) == (not self.heartbeat):
             raise ValueError("invalid parameters")
 
@@ -410,8 +428,7 @@ class AdvancedSubscriber(Subscriber):
         if period is not None and source.has_numbers:
             if source.timer is not None:
                 source.timer.cancel()
-            period_s = period.total_seconds() if hasattr(period, "total_seconds") else period
-            source.timer = _every(period_s, partial(self._recover, source))
+            source.timer = _every(period.total_seconds(), partial(self._recover, source))
 
     def _hear_heartbeat(self, sample: Sample) -> None:
         source_id = _publisher_of(sample.key_expr)

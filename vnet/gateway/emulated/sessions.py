@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial, partialmethod
 from itertools import count
 from typing import Any, Literal
@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from vnet.gateway.emulated.queries import ANY_KEY, Asking, Entity
-from vnet.gateway.emulated.strands import go_no_further_if_ended
+from vnet.gateway.emulated.strands import give_way, go_no_further_if_ended
 from vnet.gateway.emulated.values import (
     DELETE,
     NO_ENCODING,
@@ -28,6 +28,7 @@ from vnet.gateway.emulated.values import (
     SourceInfo,
     ZenohId,
     bytes_or_none,
+    check,
     encoding_of,
     key_of,
     sink_of,
@@ -48,29 +49,6 @@ _REFUSED_SETTINGS = (
 )
 """Parts of a configuration that change what a session sends, and which virtual time does not have."""
 LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
-
-
-_TYPES: dict[str, type] = {
-    "priority": zenoh.Priority,
-    "congestion_control": zenoh.CongestionControl,
-    "express": bool,
-    "timestamp": zenoh.Timestamp,
-    "target": zenoh.QueryTarget,
-    "config": zenoh.Config,
-}
-"""Types of arguments that are of no other."""
-
-
-def _check(options: Mapping[str, object]) -> None:
-    """Raise TypeError for an option of another type, and ZError for one that virtual time does not have."""
-    for name, value in options.items():
-        if value is None and name != "config":
-            continue
-        if name == "timestamp_instrumentation":
-            raise zenoh.ZError(f"{name} is not available on virtual time: sessions have no transport")
-        if not isinstance(value, kind := _TYPES.get(name, object)):
-            given = type(value).__name__
-            raise TypeError(f"argument '{name}': '{given}' object cannot be converted to '{kind.__name__}'")
 
 
 class Declared:
@@ -110,16 +88,23 @@ class Listening(Declared):
     _noun = "listener"
 
     def __init__(self, handler: Any, outlet: Outlet) -> None:
-        self._sink, self.handler = sink_of(handler, outlet)
+        self._sink, self._handler = sink_of(handler, outlet)
         self._is_background = callable(handler)
         self._ends = [self._sink.close]
 
-    handler: Any
     _is_background = True
     """True if it goes on when the program discards it, as a callback does."""
+    _readers = 0
+    """Threads that are in `recv`."""
 
     def __class_getitem__(cls, item: object) -> type[Listening]:
         return cls
+
+    @property
+    def handler(self) -> Any:
+        """The handler that the program reads."""
+        self.check_declared()
+        return self._handler
 
     def try_recv(self) -> Any:
         """Return the next item, None if there is none now."""
@@ -127,7 +112,18 @@ class Listening(Declared):
 
     def recv(self) -> Any:
         """Return the next item; block until there is one."""
-        return self.handler.recv()
+        handler = self.handler
+        self._readers += 1
+        try:
+            return handler.recv()
+        finally:
+            self._readers -= 1
+
+    def undeclare_if_declared(self) -> None:
+        """Undeclare it unless it has been. Raises RuntimeError while a thread is in `recv`, as Zenoh's Python."""
+        if self._readers:
+            raise RuntimeError("Already borrowed")
+        super().undeclare_if_declared()
 
     def __iter__(self) -> Any:
         return iter(self.handler)
@@ -152,6 +148,7 @@ class Subscriber(Listening):
         allowed_origin: zenoh.Locality | None = None,
         complete: bool | None = None,
     ) -> None:
+        check({"allowed_origin": allowed_origin, "complete": complete})
         own_id, key = session.new_id(), key_of(key_expr)
         super().__init__(handler, session.outlet)
         self.session = session
@@ -178,6 +175,7 @@ class Watcher(Subscriber):
     kind = "watcher"
 
     def __init__(self, session: Session, key: Any, handler: Any, history: bool | None) -> None:
+        check({"history": history})
         super().__init__(session, key, handler)
         if history:
             session.vehicle.tell_present(self._entity)
@@ -243,6 +241,7 @@ class Liveliness:
         cancellation_token: CancellationToken | None = None,
     ) -> Any:
         """Get the tokens that are there: those of other vehicles as far as they have been heard."""
+        check({"timeout": timeout})
         self._session.check_open()
         sink, seen = sink_of(handler, self._session.outlet)
         if cancellation_token is not None:
@@ -256,13 +255,18 @@ class Liveliness:
 class MatchingListener(Listening):
     """A listener that is told whether there may be anybody at the other end."""
 
+    _noun = "matching listener"
+
     def __init__(self, owner: Sending, handler: Any = None) -> None:
         super().__init__(handler, owner.session.outlet)
         self._owner, self._matching = owner, False
-        listeners = owner.session.vehicle.on_matching
-        self._ends = [partial(listeners.remove, self._look)]
-        listeners.append(self._look)
+        owner.session.vehicle.on_matching.append(self._look)
+        self._ends = [owner.until_undeclared(self._stop)]
         self._look()
+
+    def _stop(self) -> None:
+        self._owner.session.vehicle.on_matching.remove(self._look)
+        self._sink.close()
 
     def _look(self) -> None:
         status = self._owner.matching_status
@@ -282,6 +286,13 @@ class Sending(Declared):
     def __init__(self, session: Session, key: Any) -> None:
         self.session, self.id, self.key_expr = session, session.new_id(), key_of(key)
         self._ends = []
+
+    def until_undeclared(self, end: Callable[[], object]) -> Callable[[], None]:
+        """Have `end` called when it is undeclared, or its session closed; return what calls it before."""
+        self.check_declared()
+        assert self._ends is not None
+        self._ends.append(ends := self.session.until_closed(end))
+        return ends
 
     @property
     def matching_status(self) -> MatchingStatus:
@@ -320,7 +331,7 @@ class Publisher(Sending):
             "express": express,
             "allowed_destination": allowed_destination,
         }
-        _check(self._qos)
+        check({**self._qos, "reliability": reliability})
 
     encoding: zenoh.Encoding
     congestion_control: zenoh.CongestionControl
@@ -336,7 +347,7 @@ class Publisher(Sending):
         self._publish(DELETE, NOTHING, **options)
 
     def _publish(self, kind: zenoh.SampleKind, payload: Any, **options: Any) -> Sample:
-        _check(options)
+        check(options)
         self.check_declared()
         return self.session.publish(kind, self.key_expr, payload, **self._qos, **options)
 
@@ -360,7 +371,7 @@ class Querier(Sending):
         self._matches = partial(session.vehicle.matches_queryable, self.key_expr, all_complete)
         self.accept_replies = accept_replies or zenoh.ReplyKeyExpr.DEFAULT
         self._options = {**options, "target": target, "accept_replies": accept_replies}
-        _check(self._options)
+        check(self._options)
 
     accept_replies: zenoh.ReplyKeyExpr
 
@@ -401,7 +412,7 @@ class Session:
     """A session."""
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, config: zenoh.Config) -> None:
-        _check({"config": config})
+        check({"config": config})
         self.vehicle, self.outlet = vehicle, outlet
         self._entity_numbers = count(1)
         self._is_closed = False
@@ -440,6 +451,7 @@ class Session:
             self._is_closed = True
             for end in list(self._ends):
                 self._end(end)
+            give_way()  # to what is called in answer
 
     def is_closed(self) -> bool:
         """Return whether it has been closed."""
@@ -484,12 +496,12 @@ class Session:
 
     def put(self, key_expr: Any, payload: Any, **options: Any) -> None:
         """Put a sample."""
-        _check(options)
+        check(options)
         self.publish(PUT, key_expr, payload, **options)
 
     def delete(self, key_expr: Any, **options: Any) -> None:
         """Delete a key."""
-        _check(options)
+        check(options)
         self.publish(DELETE, key_expr, NOTHING, **options)
 
     def publish(
@@ -538,14 +550,21 @@ class Session:
         **options: Any,
     ) -> Any:
         """Ask for replies."""
-        _check({**options, "timestamp_instrumentation": timestamp_instrumentation})
+        check({**options, "timeout": timeout, "timestamp_instrumentation": timestamp_instrumentation})
+        check({"accept_replies": accept_replies, "allowed_destination": allowed_destination})
         self.check_open()
         sink, seen = sink_of(handler, self.outlet)
         selector = selector if isinstance(selector, zenoh.Selector) else zenoh.Selector(selector)
         if accept_replies == zenoh.ReplyKeyExpr.ANY and ANY_KEY not in selector.parameters:
             rest = str(selector.parameters)
             selector = zenoh.Selector(selector.key_expr, f"{rest};{ANY_KEY}" if rest else ANY_KEY)
-        asking = Asking(selector, sink.push, sink.close, **options)
+
+        def ended() -> None:
+            self._ends.pop(asking.cancel, None)
+            sink.close()
+
+        asking = Asking(selector, sink.push, ended, **options)
+        self._ends[asking.cancel] = None
         if cancellation_token is not None:
             cancellation_token.add(sink, asking)
         asking.expire_after(self._timeout_s if timeout is None else timeout)
@@ -571,4 +590,4 @@ class Scout(Listening):
         if matcher.matches(zenoh.WhatAmI.ROUTER):
             self._sink.push(Hello(zenoh.WhatAmI.ROUTER, vehicle.zid, []))
 
-    stop = Declared.undeclare_if_declared
+    stop = Listening.undeclare_if_declared

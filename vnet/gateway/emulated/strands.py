@@ -274,6 +274,13 @@ def sleep(seconds: float) -> None:
     block_on(asyncio.sleep(seconds))
 
 
+def give_way() -> None:
+    """Let what is due run before the present strand goes on, unless it is ended."""
+    strand = current_strand()
+    if strand is not None and not strand.is_ended:
+        sleep(0.0)
+
+
 class Waiting:
     """Strands that wait for others, in the order in which they came."""
 

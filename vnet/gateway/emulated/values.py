@@ -8,7 +8,10 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
 from dataclasses import dataclass
+from datetime import timedelta
 from functools import lru_cache
+from math import isfinite
+from operator import index
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import msgspec
@@ -172,6 +175,54 @@ def refused(name: str, reason: str) -> type:
     return type(name, (), {"__new__": refuse, "__doc__": f"Refused: {reason}."})
 
 
+# Arguments.
+
+
+def _seconds(value: float) -> None:
+    if not (isfinite(value) and value >= 0):
+        raise ValueError("negative timeout")
+
+
+def _count(value: int) -> None:
+    if index(value) < 0:
+        raise OverflowError("can't convert negative int to unsigned")
+
+
+_TYPES: dict[str, type] = {
+    **dict.fromkeys(["allowed_origin", "allowed_destination"], zenoh.Locality),
+    **dict.fromkeys(["complete", "detect_late_publishers", "express", "history"], bool),
+    "accept_replies": zenoh.ReplyKeyExpr,
+    "config": zenoh.Config,
+    "congestion_control": zenoh.CongestionControl,
+    "periodic_queries": timedelta,
+    "priority": zenoh.Priority,
+    "reliability": zenoh.Reliability,
+    "target": zenoh.QueryTarget,
+    "timestamp": zenoh.Timestamp,
+}
+"""Types of arguments that are of no other."""
+_NUMBERS: dict[str, Callable[[Any], object]] = {
+    **dict.fromkeys(["heartbeat", "sporadic_heartbeat", "timeout"], _seconds),
+    **dict.fromkeys(["capacity", "max_samples"], _count),
+    "max_age": isfinite,  # of any sign
+}
+"""What raises for an argument that is no number of its kind."""
+
+
+def check(options: Mapping[str, Any]) -> None:
+    """Raise as Zenoh for an option of another type or sign, and ZError for what virtual time does not have."""
+    for name, value in options.items():
+        if value is None and name != "config":
+            continue
+        if name == "timestamp_instrumentation":
+            raise zenoh.ZError(f"{name} is not available on virtual time: sessions have no transport")
+        if name in _NUMBERS:
+            _NUMBERS[name](value)
+        elif not isinstance(value, kind := _TYPES.get(name, object)):
+            given = type(value).__name__
+            raise TypeError(f"argument '{name}': '{given}' object cannot be converted to '{kind.__name__}'")
+
+
 # Between samples and what crosses the radio.
 
 
@@ -258,6 +309,7 @@ class FifoChannel(DefaultHandler):
     """A channel of any length: a full one would stop Zenoh, and here stops nothing."""
 
     def __init__(self, capacity: int) -> None:
+        check({"capacity": capacity})
         self.capacity = capacity
 
 
@@ -374,8 +426,9 @@ class CallbackSink:
     def _call(self, function: Callable[..., Any], *args: Any) -> None:
         try:
             function(*args)
-        except SystemExit:
-            pass  # it ends a thread, and a callback at most
+        except SystemExit as leave:  # which ends a callback at most
+            error = RuntimeError(f"SystemExit({leave.code!r}) in a callback ends nothing")
+            fail(error.with_traceback(leave.__traceback__), "in a callback of Zenoh")
         except Exception as error:
             fail(error, "in a callback of Zenoh")
 
