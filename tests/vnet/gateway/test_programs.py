@@ -161,19 +161,29 @@ def test_chance_of_numpy_is_the_vehicles_own(drive: Drive) -> None:
                 break
             except queue.Empty:
                 pass""",
+        "while not pool.done(): pass",
+        "while thread.is_alive(): pass",
+        "while thread.is_alive(): thread.join(0)",
+        "while not lock.acquire(blocking=False): pass",
+        "while lock.locked(): pass",
+        "while not wait([pool], timeout=0)[0]: pass",
     ],
 )
 def test_a_program_that_polls_without_a_pause_comes_to_its_time(drive: Drive, waits: str) -> None:
     run = drive(f"""
         import queue, threading, time, zenoh
-        session = zenoh.open(zenoh.Config())
+        from concurrent.futures import ThreadPoolExecutor, wait
+        session, lock = zenoh.open(zenoh.Config()), threading.Lock()
         samples, came, items = session.declare_subscriber("a"), threading.Event(), queue.Queue()
         def put():
             time.sleep(0.5)
             session.put("a", "b")
             came.set()
             items.put(1)
-        threading.Thread(target=put).start()
+            lock.release()
+        lock.acquire()
+        thread, pool = threading.Thread(target=put), ThreadPoolExecutor(1).submit(time.sleep, 0.5)
+        thread.start()
         {waits}
         print(f"{{time.monotonic():.2f}}")
         """)
@@ -191,8 +201,6 @@ def test_signals_to_itself_and_hard_exits_end_a_program_alone(drive: Drive) -> N
         os.kill(os.getpid(), signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)
         os.kill(os.getpid(), 0)
-        signal.alarm(1)
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
         try:
             os.kill(os.getpid(), signal.SIGINT)
         except KeyboardInterrupt:
@@ -227,7 +235,29 @@ def test_signals_to_itself_and_hard_exits_end_a_program_alone(drive: Drive) -> N
         assert "never" not in log(run, node)
     crashes = {event["node"]: event["error"] for event in events(run, "crashed")}
     assert "3" in crashes["v02"]
-    assert "-9" in crashes["v03"]
+    assert "-9" in crashes["v03"] and "program0.py" in crashes["v03"]
+
+
+def test_alarms_ring_by_emulated_time_and_end_a_wait(drive: Drive) -> None:
+    run = drive(
+        """
+        import signal, time
+        def ring(number, frame):
+            print(type(number).__name__, f"{time.monotonic():.1f}", signal.getitimer(signal.ITIMER_REAL)[1])
+        def stop(number, frame):
+            raise TimeoutError
+        signal.signal(signal.SIGALRM, ring)
+        signal.setitimer(signal.ITIMER_REAL, 0.2, 0.1)
+        time.sleep(0.35)
+        signal.signal(signal.SIGALRM, stop)
+        print(round(signal.setitimer(signal.ITIMER_REAL, 0.5)[0], 2), signal.alarm(1))
+        try:
+            time.sleep(10)
+        except TimeoutError:
+            print(f"{time.monotonic():.2f}")
+        """
+    )
+    assert log(run)[:-1] == ["int 0.2 0.1", "int 0.3 0.1", "0.05 1", "1.35"]
 
 
 def test_output_that_a_program_takes_for_itself_is_its_own(drive: Drive) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
-from vnet.gateway.emulated.strands import Lock, Threads, fail, look
+from vnet.gateway.emulated.strands import Lock, Threads, fail
 from vnet.node import Node
 from vnet.runtime.outside_loop import collector
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -30,7 +30,6 @@ class _Selector:
     def select(self, timeout: float | None = None) -> list[Any]:
         """Block until `wake`, or for so many seconds; return that no file is ready."""
         if timeout is not None and timeout <= 0:
-            look()
             self._news.acquire(blocking=False)
         else:
             self._news.acquire(timeout=-1 if timeout is None else timeout)

@@ -420,6 +420,7 @@ class ProgramModules:
                 return super().map(function, *iterables, timeout=timeout)
 
         module.ProcessPoolExecutor = ProcessPoolExecutor
+        module.Future.done = _looking(module.Future.done, nothing=False)
         module._base.LOGGER.addFilter(lambda _: not isinstance(sys.exception(), GreenletExit))
 
 

@@ -10,9 +10,11 @@ import errno
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from types import ModuleType
+from math import ceil
+from types import ModuleType, TracebackType
 from typing import Any, NoReturn
 
 from vnet.gateway import STARTUP
@@ -34,6 +36,8 @@ class OwnProcess:
     def __init__(self, threads: Threads) -> None:
         self._threads = threads
         self._handlers: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
+        self._timer: asyncio.TimerHandle | None = None
+        self._interval_s = 0.0
         self.interrupt: BaseException | None = None
         """The last interrupt that was the program's own."""
 
@@ -66,9 +70,9 @@ class OwnProcess:
             "sigwaitinfo": lambda signals: _wait_for_ever(),
             "sigtimedwait": lambda signals, timeout: sleep(timeout),
             "pthread_sigmask": lambda how, mask: set(),
-            "alarm": lambda seconds: 0,
-            "setitimer": lambda which, seconds, interval=0.0: (0.0, 0.0),
-            "getitimer": lambda which: (0.0, 0.0),
+            "alarm": lambda seconds: ceil(self._set_timer(signal.ITIMER_REAL, seconds)[0]),
+            "setitimer": self._set_timer,
+            "getitimer": self._timer_left,
             "set_wakeup_fd": lambda *args, **kwargs: -1,
             "siginterrupt": lambda *args: None,
         }
@@ -78,6 +82,27 @@ class OwnProcess:
         before = self._handlers.get(number, signal.SIG_DFL)
         self._handlers[number] = handler
         return before
+
+    def _timer_left(self, which: int) -> tuple[float, float]:
+        if self._timer is None or which != signal.ITIMER_REAL:
+            return 0.0, 0.0
+        return self._timer.when() - asyncio.get_running_loop().time(), self._interval_s
+
+    def _set_timer(self, which: int, seconds: float, interval: float = 0.0) -> tuple[float, float]:
+        """Do as `signal.setitimer`; timers of the processor's time, of which computing takes none, never ring."""
+        before = self._timer_left(which)
+        if which == signal.ITIMER_REAL:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._interval_s = interval
+            self._timer = asyncio.get_running_loop().call_later(seconds, self._ring) if seconds else None
+        return before
+
+    def _ring(self) -> None:
+        self._timer = None
+        if not self._threads.are_over:
+            self._set_timer(signal.ITIMER_REAL, self._interval_s, self._interval_s)
+            self._threads.start(self.send, (signal.SIGALRM,))
 
     def _kill(self, pid: int, number: int) -> None:
         if pid in (PID, -PID, 0, -1):
@@ -95,7 +120,7 @@ class OwnProcess:
         if not callable(handler):
             return
         try:
-            handler(number, None)
+            handler(int(number), None)
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 self.interrupt = error
@@ -105,12 +130,20 @@ class OwnProcess:
 
     def _exit(self, status: int) -> None:
         """End the program at once: nothing of it runs any more."""
-        leave, strand = HardExit(status), current_strand()
+        leave, strand = HardExit(status).with_traceback(_place()), current_strand()
         if strand is self._threads.main:
             leave_hard(leave)
         self._threads.interrupt(leave)
         if strand is not None:
             leave_hard(None)
+
+
+def _place() -> TracebackType:
+    """Return where the program is that runs."""
+    frame = sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("vnet."):
+        frame = frame.f_back
+    return TracebackType(None, frame, frame.f_lasti, frame.f_lineno)
 
 
 def _wait_for_ever() -> None:
@@ -159,10 +192,10 @@ def subprocess_functions(environ: Mapping[str, str], tell: Callable[[], object])
     return {"Popen": Popen, **{name: inheriting(getattr(subprocess, name)) for name in names}}
 
 
-def take_output(builtins: dict[str, Any], sys: ModuleType) -> None:
+def take_output(builtins: dict[str, Any], own_sys: ModuleType) -> None:
     """Have `print` write where the program's own `sys.stdout` is."""
 
     def own_print(*values: object, file: Any = None, **options: Any) -> None:
-        print(*values, file=vars(sys)["stdout"] if file is None else file, **options)
+        print(*values, file=vars(own_sys)["stdout"] if file is None else file, **options)
 
     builtins["print"] = own_print

@@ -340,7 +340,10 @@ class Lock(Waiting):
         if not self._locked:
             self._locked = True
             return True
-        return blocking and self.wait(timeout)
+        if blocking and timeout != 0:
+            return self.wait(timeout)
+        look()
+        return False
 
     def release(self) -> None:
         """Give the lock to who waits for it, if anybody does. Raises RuntimeError unless it is taken."""
@@ -357,6 +360,11 @@ class Lock(Waiting):
 
     def locked(self) -> bool:
         """Return whether it is taken."""
+        if self._locked:
+            look()
+        return self._locked
+
+    def _is_owned(self) -> bool:  # which conditions ask, and no look
         return self._locked
 
     def __enter__(self) -> bool:
