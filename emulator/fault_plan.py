@@ -182,7 +182,7 @@ class FaultPlan:
         moving = None
         try:
             if self._nodes_at is None or not _selects_by_position(fault):
-                nodes, links = _selection(fault, self._nodes, stream(self._seed, number, "select"))
+                nodes, links = _selection(fault, self._nodes, fault_stream(self._seed, number, "select"))
             else:
                 moving = _MovingSelection(fault, self._nodes_at, self._period_ns, self._seed, number)
                 nodes, links = moving(start_ns)
@@ -272,7 +272,7 @@ class _MovingSelection:
     def __call__(self, time_ns: int) -> Selection:
         period = time_ns // self._period_ns
         if self._last is None or self._last[0] != period:
-            rng = stream(self._seed, self._number, "select")
+            rng = fault_stream(self._seed, self._number, "select")
             self._last = period, _selection(self._fault, self._nodes_at(period), rng)
         return self._last[1]
 
@@ -294,7 +294,7 @@ def _ends(links: Mask) -> Mask:
     return np.asarray(links.any(axis=0) | links.any(axis=1))
 
 
-def stream(seed: int, number: int, what: str) -> np.random.Generator:
+def fault_stream(seed: int, number: int, what: str) -> np.random.Generator:
     """Return the random stream of one fault of the plan, named by what it decides."""
     return random_streams.stream(seed, f"fault {number} {what}")
 
@@ -303,7 +303,7 @@ def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, i
     """Return (node, cut off at, back at) of each node of a swizzle: off in the first half, back in the second."""
     assert isinstance(planned.fault, Swizzle)
     chosen = np.flatnonzero(planned.nodes)
-    rng = stream(seed, planned.number, "swizzle")
+    rng = fault_stream(seed, planned.number, "swizzle")
     half_ns = round((planned.fault.over_s or planned.fault.duration_s) * NS_PER_S) // 2
     step_ns = half_ns // max(1, len(chosen))
     back = dict(zip(rng.permutation(chosen).tolist(), range(len(chosen)), strict=True))

@@ -13,9 +13,9 @@ import pyarrow as pa
 from emulator.cells.cells import Cell
 from emulator.drivers.emulation import Emulation
 from emulator.records.distributions import chi2_quantile
+from emulator.records.metrics import reference_series
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.recorded_world import RecordedWorld
-from emulator.records.reference import reference_series
 from emulator.records.reported import reported_figures
 from emulator.records.run import first_lasting
 from vnet.errors import VnetError

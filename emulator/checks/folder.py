@@ -54,7 +54,7 @@ from emulator.scenario.faults import Corrupt, OwnRule, SenderFault, StaleMessage
 from emulator.scenario.loading import input_files_of, parse_toml
 from emulator.scenario.own_functions import are_here, declared_checks
 from emulator.scenario.scenario import Scenario
-from emulator.world.gnss_faults import FaultyGnss
+from emulator.world.truth import FaultyGnss
 from emulator.world.world import Instant, build_world, components, periods_of
 from vnet.errors import ScenarioError, counted, first_names, printable
 from vnet.radio import SentFrame

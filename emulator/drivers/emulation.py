@@ -44,9 +44,9 @@ from emulator.scenario.program import Program, RoadsideUnit
 from emulator.scenario.scenario import Scenario, least_transit_ns
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
-from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
 from emulator.world.own_sensors import SensorFailure
+from emulator.world.truth import FaultyGnss, clock_of
 from emulator.world.world import Instant, World, components
 from vnet.node import Action
 from vnet.radio import SentFrame

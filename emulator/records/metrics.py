@@ -1,6 +1,10 @@
-"""The figures of a run, period by period (MODEL 6): how wrong the vehicles are, and what their program declares.
+"""The figures of a run, period by period (MODEL 6), and those of the reference that its program declares.
 
-`states` has a row for each node and period, `metrics` one for each period. What programs do not report is null.
+`states` has a row for each node and period, `metrics` one for each period: how wrong the vehicles are, and what
+their program declares. What programs do not report is null.
+
+The reference is an estimator that is told more than any vehicle, run over a run. The declared module names its
+class as `REFERENCE = "module:class"`. Its figures stand beside those of the run that have their names.
 """
 
 from __future__ import annotations
@@ -8,30 +12,29 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass
 from functools import cached_property
 from keyword import iskeyword
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from emulator.radio.topology import component_links
 from emulator.records.distributions import chi2_quantile
-from emulator.records.period_figures import (
-    NUMBER,
-    Period,
-    ProgramFigures,
-    figures_of,
-    program_figures,
-    vectors,
-)
+from emulator.records.period_figures import NUMBER, Period, ProgramFigures, figures_of, program_figures, vectors
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import ValueColumns, figures_among
 from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, columns_of, schema_of
+from emulator.scenario.own_functions import declared, load_entry
 from emulator.scenario.program import Program
-from emulator.world.world import Instant
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import Instant, components
+from vnet.errors import VnetError
 from vnet.reports import Report, Value
 from vnet.runtime.programs import search_programs_in
+from vnet.types import Array
 
 ROWS_A_PIECE = 2048
 """Largest number of states kept as Python numbers, except for the rest of a period."""
@@ -221,3 +224,70 @@ def _is_not_finite(report: Report) -> bool:
         if not isinstance(value, str):
             numbers += value if isinstance(value, list) else [value]
     return not all(map(math.isfinite, numbers))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The inputs of a reference.
+
+    `component` (N,) labels each vehicle's component; `periods` is the number of a run that is over.
+    """
+
+    scenario: Scenario
+    component: NDArray[np.integer[Any]]
+    lane_point_m: Array
+    lane_heading_rad: Array
+    periods: int | None = None
+
+
+class Reference(Protocol):
+    """A reference. It raises VnetError in one line for a setting in which there is none."""
+
+    NAME: ClassVar[str]
+    """Its name in legends."""
+    TEXT: ClassVar[str]
+    """Its description, a noun phrase."""
+    COLUMNS: ClassVar[tuple[str, ...]]
+    """The columns of the states that it needs."""
+
+    def __init__(self, setting: Setting) -> None: ...
+
+    def step(self, time_ns: int, states: Mapping[str, Array]) -> Mapping[str, float | list[float]]:
+        """Take a period, in which each column has a row for each vehicle; returns figures by name.
+
+        A figure with a value for each component is a list. No figures where there is nothing to compare with.
+        """
+
+
+def reference_of(scenario: Scenario) -> type[Reference]:
+    """Return the reference that a scenario's programs declare. Raises VnetError if they declare none."""
+    entries = declared(scenario.program, "REFERENCE")
+    if not entries:
+        raise VnetError("the program declares no reference")
+    return load_entry(entries[0])  # type: ignore[no-any-return]
+
+
+def reference_series(recorded: RecordedRun) -> dict[str, Array]:
+    """Return the figures of a run's reference by name, (periods,) or (periods, components); NaN where it has none.
+
+    Of the states the columns that the reference names are needed. Raises VnetError with the reason if the run has
+    no reference.
+    """
+    scenario, world = recorded.scenario, recorded.world
+    made = reference_of(scenario)
+    if world is None:
+        raise VnetError("the lanes of the run were not recorded")
+    links = component_links(scenario, world.radio_inputs, world.position_m)
+    component = components(world.position_m, scenario.radio.range_m, links)
+    setting = Setting(scenario, component, world.lane_point_m, world.lane_heading_rad, recorded.periods)
+    reference = made(setting)
+    columns = {name: recorded.by_period(name) for name in made.COLUMNS}
+    rows = [
+        reference.step(k * scenario.period_ns, {name: column[k] for name, column in columns.items()})
+        for k in range(recorded.periods)
+    ]
+    some = next(filter(None, rows), None)
+    if some is None:
+        raise VnetError(f"no program reported what the {made.NAME} is compared with")
+    missing = {name: np.full_like(value, np.nan, dtype=float) for name, value in some.items()}
+    return {name: np.array([row.get(name, missing[name]) for row in rows], dtype=float) for name in some}

@@ -12,10 +12,10 @@ import pyarrow as pa
 
 from emulator.pages.canvas import FaultSpan
 from emulator.records.events import CUTS_RUN, Event, EventKind
+from emulator.records.metrics import Reference, reference_of, reference_series
 from emulator.records.period_figures import SAME, Views
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.records.reference import Reference, reference_of, reference_series
 from emulator.records.reported import reported_figures
 from emulator.records.tables import STATES, TRACE
 from vnet.errors import VnetError, printable

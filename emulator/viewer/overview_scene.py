@@ -13,8 +13,8 @@ import rerun as rr
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import WARNING, EventKind, level_of
+from emulator.records.metrics import Setting, reference_of
 from emulator.records.period_figures import Views, figures_if_here
-from emulator.records.reference import Setting, reference_of
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.records.tables import STATES, columns_of
 from emulator.scenario.loading import parse_recorded_scenario
@@ -303,7 +303,7 @@ def describe(scene: Mapping[str, Any]) -> str:
 
 
 class DrawnReference:
-    """Takes the messages of a run; see `emulator.records.reference`. Raises VnetError if it has no reference."""
+    """Takes the messages of a run; see `emulator.records.metrics`. Raises VnetError if it has no reference."""
 
     def __init__(self, scene: Mapping[str, Any]) -> None:
         scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))

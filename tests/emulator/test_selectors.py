@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.fault_plan import FaultPlan, Nodes, PlannedFault, partitioned_links, select, stream, swizzle_times_ns
+from emulator.fault_plan import (
+    FaultPlan,
+    Nodes,
+    PlannedFault,
+    fault_stream,
+    partitioned_links,
+    select,
+    swizzle_times_ns,
+)
 from emulator.scenario.faults import Partition, Selector
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
@@ -23,7 +31,7 @@ def some_nodes(count: int, seed: int = 0) -> Nodes:
 
 
 def chosen(nodes: Nodes, seed: int = 0, **selector: Any) -> list[int]:
-    return np.flatnonzero(select(Selector(**selector), nodes, stream(seed, 0, "select"))).tolist()
+    return np.flatnonzero(select(Selector(**selector), nodes, fault_stream(seed, 0, "select"))).tolist()
 
 
 def planned(faults: list[dict[str, Any]], count: int, seed: int = 1) -> list[PlannedFault]:
@@ -166,7 +174,7 @@ def test_links_have_an_end_among_the_nodes_and_go_from_senders_to_receivers(seed
 
 def cut(count: int, seed: int, groups: Any) -> np.ndarray:
     fault = Partition(kind="partition", duration_s=1, groups=groups)
-    return partitioned_links(fault, some_nodes(count), stream(seed, 0, "select"))
+    return partitioned_links(fault, some_nodes(count), fault_stream(seed, 0, "select"))
 
 
 def islands(severed: np.ndarray) -> list[int]:

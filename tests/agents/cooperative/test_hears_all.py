@@ -12,8 +12,8 @@ import pytest
 from agents.cooperative.hears_all import lanes_of, reflected_deviation_m, why_no_bound
 from emulator.api import simulate_into
 from emulator.cells.cells import compute
+from emulator.records.metrics import reference_series
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.records.reference import reference_series
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from emulator.scenario.scenario import Scenario

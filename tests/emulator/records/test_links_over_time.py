@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from emulator.api import simulate_into
+from emulator.records.metrics import reference_series
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.reference import reference_series
 from emulator.report.figures import degrees
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario

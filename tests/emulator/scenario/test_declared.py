@@ -8,8 +8,8 @@ import pytest
 
 from emulator.api import simulate_into
 from emulator.checks.judge import check_run
+from emulator.records.metrics import reference_series
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.reference import reference_series
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.own_functions import are_here, declared_checks
 from emulator.scenario.program import Program

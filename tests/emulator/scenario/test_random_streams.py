@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emulator.fault_plan import stream as fault_stream
+from emulator.fault_plan import fault_stream
 from emulator.scenario.random_streams import Draws, stream
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from emulator.fault_plan import FaultPlan, Nodes
 from emulator.scenario.scenario import Scenario
-from emulator.world.gnss_faults import FaultyGnss
+from emulator.world.truth import FaultyGnss
 from emulator.world.world import World, build_world
 
 VEHICLES = 4

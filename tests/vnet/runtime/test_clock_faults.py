@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from emulator.fault_plan import PlannedFault
 from emulator.scenario.faults import parse_fault
-from emulator.world.gnss_faults import clock_of
+from emulator.world.truth import clock_of
 from tests.vnet.runtime.test_host import Over, welcome
 from vnet import Node
 from vnet.runtime.host import Host
