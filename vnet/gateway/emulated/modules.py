@@ -278,13 +278,8 @@ class ProgramModules:
         return Facade(importlib, import_module=import_module, __import__=self._builtins["__import__"])
 
     def _sys(self) -> ModuleType:
-        own: dict[str, Any] = {
-            "argv": self.argv,
-            "path": self.path,
-            "modules": self.modules,
-            "stdin": io.StringIO(),
-        }
-        own["set_asyncgen_hooks"] = set_generator_hooks
+        own: dict[str, Any] = {"argv": self.argv, "path": self.path, "modules": self.modules}
+        own |= {"stdin": io.StringIO(), "set_asyncgen_hooks": set_generator_hooks}
         return Facade(sys, **own, __stdout__=sys.stdout, __stderr__=sys.stderr)
 
     def _os(self) -> ModuleType:
@@ -292,8 +287,7 @@ class ProgramModules:
             os,
             environ=self.environ,
             getenv=self.environ.get,
-            cpu_count=lambda: CORES,
-            process_cpu_count=lambda: CORES,
+            **dict.fromkeys(["cpu_count", "process_cpu_count"], lambda: CORES),
             register_at_fork=lambda **hooks: None,
             sched_yield=partial(sleep, 0.0),
             **self.process.os_functions(),
@@ -316,25 +310,18 @@ class ProgramModules:
         own: dict[str, Any] = {
             "time": partial(seconds, EPOCH_NS),
             "time_ns": partial(ns, EPOCH_NS),
-            "monotonic": seconds,
-            "monotonic_ns": ns,
-            "perf_counter": seconds,
-            "perf_counter_ns": ns,
-            "process_time": lambda: 0.0,  # computing costs no emulated time
-            "process_time_ns": lambda: 0,
-            "thread_time": lambda: 0.0,
-            "thread_time_ns": lambda: 0,
+            **dict.fromkeys(["monotonic", "perf_counter"], seconds),
+            **dict.fromkeys(["monotonic_ns", "perf_counter_ns"], ns),
+            **dict.fromkeys(["process_time", "thread_time"], lambda: 0.0),  # computing costs no emulated time
+            **dict.fromkeys(["process_time_ns", "thread_time_ns"], lambda: 0),
             "clock_gettime": lambda clock: seconds(starts_ns[clock]),
             "clock_gettime_ns": lambda clock: ns(starts_ns[clock]),
             "sleep": sleep,
-            "gmtime": utc,
-            "localtime": utc,
+            **dict.fromkeys(["gmtime", "localtime"], utc),
             "ctime": lambda at=None: time.asctime(utc(at)),
             "asctime": lambda at=None: time.asctime(at or utc()),
             "strftime": lambda form, at=None: time.strftime(form, at or utc()),
-            "timezone": 0,
-            "altzone": 0,
-            "daylight": 0,
+            **dict.fromkeys(["timezone", "altzone", "daylight"], 0),
             "tzname": ("UTC", "UTC"),
         }
         # As those of `time`, they make no methods of classes that have them.

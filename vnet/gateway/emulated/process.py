@@ -45,17 +45,12 @@ class OwnProcess:
         """Return what stands for functions of `os`."""
         return {
             "chdir": self._threads.folder.change,
-            "getpid": lambda: PID,
-            "getpgid": lambda pid: PID,
-            "getpgrp": lambda: PID,
+            **dict.fromkeys(["getpid", "getpgid", "getpgrp"], lambda *pid: PID),
             "getppid": lambda: 0,
-            "kill": self._kill,
-            "killpg": self._kill,
+            **dict.fromkeys(["kill", "killpg"], self._kill),
             "_exit": self._exit,
             "abort": lambda: self._exit(-signal.SIGABRT),
-            "fork": _refuse,
-            "forkpty": _refuse,
-            **{name: _refuse for name in vars(os) if name.startswith("exec")},
+            **{name: _refuse for name in vars(os) if name.startswith(("exec", "fork"))},
         }
 
     def signal_functions(self) -> dict[str, Any]:
@@ -65,9 +60,7 @@ class OwnProcess:
             "getsignal": lambda number: self._handlers.get(number, signal.SIG_DFL),
             "raise_signal": self.send,
             "pthread_kill": lambda thread, number: self.send(number),
-            "pause": _wait_for_ever,
-            "sigwait": lambda signals: _wait_for_ever(),
-            "sigwaitinfo": lambda signals: _wait_for_ever(),
+            **dict.fromkeys(["pause", "sigwait", "sigwaitinfo"], _wait_for_ever),
             "sigtimedwait": lambda signals, timeout: sleep(timeout),
             "pthread_sigmask": lambda how, mask: set(),
             "alarm": lambda seconds: ceil(self._set_timer(signal.ITIMER_REAL, seconds)[0]),
@@ -146,7 +139,7 @@ def _place() -> TracebackType:
     return TracebackType(None, frame, frame.f_lasti, frame.f_lineno)
 
 
-def _wait_for_ever() -> None:
+def _wait_for_ever(*_: object) -> None:
     block_on(asyncio.get_running_loop().create_future())
 
 

@@ -25,7 +25,6 @@ from vnet.gateway.emulated.values import (
     Reply,
     Sample,
     Sink,
-    SourceInfo,
     ZenohId,
     bytes_or_none,
     check,
@@ -511,14 +510,11 @@ class Session:
         payload: Any,
         *,
         encoding: Any = None,
-        congestion_control: zenoh.CongestionControl | None = None,
-        priority: zenoh.Priority | None = None,
-        express: bool | None = None,
         attachment: Any = None,
         timestamp: zenoh.Timestamp | None = None,
         timestamp_instrumentation: object = None,
         allowed_destination: zenoh.Locality | None = None,
-        source_info: SourceInfo | None = None,
+        **options: Any,
     ) -> Sample:
         """Put or delete a sample, and return it."""
         self.check_open()
@@ -528,11 +524,8 @@ class Session:
             kind,
             encoding_of(encoding) if kind == PUT else NO_ENCODING,
             self.new_timestamp() if timestamp is None and self.stamps else timestamp,
-            congestion_control or zenoh.CongestionControl.DEFAULT,
-            priority or zenoh.Priority.DEFAULT,
-            bool(express),
-            bytes_or_none(attachment),
-            source_info,
+            attachment=bytes_or_none(attachment),
+            **{name: value for name, value in options.items() if value is not None},
         )
         self.vehicle.put(self, sample, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return sample

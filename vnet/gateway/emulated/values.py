@@ -206,7 +206,7 @@ _NUMBERS: dict[str, Callable[[Any], object]] = {
     **dict.fromkeys(["capacity", "max_samples"], _count),
     "max_age": isfinite,  # of any sign
 }
-"""What raises for an argument that is no number of its kind."""
+"""Check of each argument that is a number."""
 
 
 def check(options: Mapping[str, Any]) -> None:
