@@ -118,8 +118,10 @@ def _wrong_metrics(recorded: RecordedRun, rows: list[Any]) -> Iterator[dict[str,
 def _alike(ours: Any, theirs: Any) -> bool:
     if isinstance(ours, list) and isinstance(theirs, list):
         return len(ours) == len(theirs) and all(map(_alike, ours, theirs))
+    if ours == theirs:
+        return True
     if ours is None or theirs is None:
-        return ours is theirs
+        return False
     return bool(same_numbers(np.asarray(ours, float), np.asarray(theirs, float)))
 
 
