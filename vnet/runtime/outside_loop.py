@@ -77,6 +77,8 @@ _schedules = 0
 _before_schedules: tuple[tuple[int, int, int], bool] = (gc.get_threshold(), False)
 BLOCKS_A_COUNT = 20
 """Blocks from one count of many objects to the next: counting takes milliseconds."""
+BLOCKS_FROZEN = 100
+"""Blocks for which what others have frozen counts as frozen: in a session of tests a count takes 0.1 s."""
 _blocks = 0
 _objects = 0
 """Objects at the first count, or left by the last collection before a block."""
@@ -123,7 +125,7 @@ def collected_by_schedule() -> Iterator[None]:
 def _others_have_frozen() -> bool:
     """Return True if objects are frozen before a block, which are counted only now and then once there are some."""
     global _found_frozen
-    if _found_frozen % BLOCKS_A_COUNT == 0:
+    if _found_frozen % BLOCKS_FROZEN == 0:
         _found_frozen = int(gc.get_freeze_count() > 0)
     else:
         _found_frozen += 1

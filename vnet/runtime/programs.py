@@ -9,6 +9,7 @@ import sys
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib.machinery import FileFinder
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -133,4 +134,6 @@ def search_programs_in(folders: Iterable[Path]) -> None:
     wanted = dict.fromkeys(str(folder) for folder in [*folders, Path.cwd()])
     _added[:] = [path for path in wanted if path not in sys.path]
     sys.path.extend(_added)
-    importlib.invalidate_caches()
+    for place, finder in list(sys.path_importer_cache.items()):  # what lies elsewhere has not been written just now
+        if isinstance(finder, FileFinder) and place.startswith(tuple(wanted)):
+            finder.invalidate_caches()

@@ -11,7 +11,7 @@ from tests.vnet.runtime.test_host import World
 from vnet import Node
 from vnet.reports import Report
 from vnet.runtime import host, outside_loop
-from vnet.runtime.outside_loop import BLOCKS_A_COUNT, MOST_UNCOLLECTED, collected_by_schedule
+from vnet.runtime.outside_loop import BLOCKS_A_COUNT, BLOCKS_FROZEN, MOST_UNCOLLECTED, collected_by_schedule
 from vnet.transport import wire
 
 SECOND_NS = 1_000_000_000
@@ -103,7 +103,7 @@ def test_what_was_frozen_before_stays_frozen_and_is_counted_seldom(monkeypatch: 
                 pass
 
     gc.freeze()
-    pass_blocks(BLOCKS_A_COUNT)
+    pass_blocks(BLOCKS_FROZEN)
     assert len(counts) == 1 and count() > 0
     gc.unfreeze()
     pass_blocks(1)
