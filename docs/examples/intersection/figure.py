@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy import stats
+from scipy import special
 
 import emulator
 from vnet.types import Array
@@ -80,7 +80,7 @@ def main() -> None:
         )
         mean, width = figures.mean(axis=1), np.zeros((len(settings), 3))
         if options.seeds > 1:
-            width = stats.t.ppf(0.975, options.seeds - 1) * stats.sem(figures, axis=1)
+            width = special.stdtrit(options.seeds - 1, 0.975) * figures.std(axis=1, ddof=1) / options.seeds**0.5
         for changes, row, spread in zip(settings, mean, width, strict=True):
             shown = [
                 f"{value:.1f}" + (f" ± {wide:.1f}" if options.seeds > 1 else "")
