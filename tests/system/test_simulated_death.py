@@ -34,7 +34,8 @@ def command(folder: Path, end: str) -> list[str]:
 
 
 def scenario(folder: Path) -> None:
-    (folder / "beacon.toml").write_text((ROOT / "scenarios" / "beacon.toml").read_text())
+    text = (ROOT / "scenarios" / "beacon.toml").read_text()
+    (folder / "beacon.toml").write_text(text.replace("duration_s = 10.0", "duration_s = 2.0"))
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_it_is_the_wheel_that_runs(command: Command, environment: Path) -> None:
 
 
 def test_shipped_scenarios_run_by_their_names(command: Command, tmp_path: Path) -> None:
-    assert "verdict: valid" in command("vnet", "simulate", "beacon", "--duration", "1", "--quiet")
+    assert "verdict: valid" in command("vnet", "simulate", "beacon", "--duration", "1", "--quiet", "--no-report")
     command("vnet", "demo", "--duration", "0.1", "--out", "demo")
     assert (tmp_path / "demo" / "recording.rrd").stat().st_size > 0
 
@@ -96,7 +96,9 @@ def test_pages_and_examples_come_with_the_wheel(command: Command, environment: P
     assert command("vnet", "docs", "tutorial") == (ROOT / "docs" / "tutorial.md").read_text()
     assert Path(command("vnet", "docs", "--path").strip()).is_relative_to(environment.parent)
     command("vnet", "new", "--example", "platoon")
-    assert "verdict: valid" in command("vnet", "simulate", "platoon/platoon.toml", "--duration", "6", "--quiet")
+    assert "verdict: valid" in command(
+        "vnet", "simulate", "platoon/platoon.toml", "--duration", "6", "--quiet", "--no-report"
+    )
 
 
 def test_the_wheel_has_no_studies_and_says_in_one_line_where_they_are(environment: Path, tmp_path: Path) -> None:
