@@ -363,7 +363,7 @@ def debug_target(text: str | None, scenario: Scenario, only_the_result: bool) ->
     """
     if text is None:
         return None
-    target = resolve(DebugTarget.parse(text), scenario.program.folders)
+    target = resolve(DebugTarget.parse(text), scenario.program.folders, scenario.program.kind == "zenoh")
     if only_the_result:
         raise VnetError(f"--debug {target.node}: cannot be combined with --quiet or --log-format json")
     if scenario.run.pacing != Pacing.LOCKSTEP.value:

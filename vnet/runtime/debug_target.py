@@ -31,8 +31,10 @@ class DebugTarget:
         return f"{self.node}:{self.file}:{self.line}" if self.file else self.node
 
 
-def resolve(target: DebugTarget, folders: Sequence[Path]) -> DebugTarget:
+def resolve(target: DebugTarget, folders: Sequence[Path], has_scripts: bool = False) -> DebugTarget:
     """Return a target with its file absolute, looked for in the current folder and then in `folders`.
+
+    With `has_scripts` programs are run as scripts are, so that a debugger stops outside of functions, too.
 
     Raises VnetError where there is no such file, or no code on the line.
     """
@@ -41,7 +43,7 @@ def resolve(target: DebugTarget, folders: Sequence[Path]) -> DebugTarget:
     found = [path for folder in (Path(), *folders) if (path := (folder / target.file).absolute()).is_file()]
     if not found:
         raise VnetError(f"--debug {target}: {printable(target.file)}: no such file")
-    lines = _lines_with_code(found[0])
+    lines = _lines_with_code(found[0], has_scripts)
     if lines is not None and target.line not in lines:
         later = min((line for line in lines if line > target.line), default=None)
         hint = "" if later is None else f"; the next one with code is {later}"
@@ -49,8 +51,8 @@ def resolve(target: DebugTarget, folders: Sequence[Path]) -> DebugTarget:
     return DebugTarget(target.node, str(found[0]), target.line)
 
 
-def _lines_with_code(path: Path) -> set[int] | None:
-    """Lines at which a debugger can stop within functions; None for a file that does not compile."""
+def _lines_with_code(path: Path, of_modules: bool) -> set[int] | None:
+    """Lines at which a debugger can stop within functions, or anywhere; None for a file that does not compile."""
     try:
         waiting = [compile(path.read_bytes(), str(path), "exec", dont_inherit=True)]
     except (OSError, SyntaxError, ValueError):
@@ -60,6 +62,7 @@ def _lines_with_code(path: Path) -> set[int] | None:
         code = waiting.pop()
         inner = [constant for constant in code.co_consts if inspect.iscode(constant)]
         waiting += inner
-        if code.co_flags & inspect.CO_NEWLOCALS:
-            lines.update(line for _, _, line in code.co_lines() if line is not None and line != code.co_firstlineno)
+        if of_modules or code.co_flags & inspect.CO_NEWLOCALS:
+            first = code.co_firstlineno if code.co_flags & inspect.CO_NEWLOCALS else 0
+            lines.update(line for _, _, line in code.co_lines() if line is not None and line > first)
     return lines

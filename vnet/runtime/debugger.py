@@ -31,6 +31,7 @@ _NOT_STEPPED_INTO = (
     "agents.host",
     "emulator.",
     "namedtuple_",  # what Python generates for named tuples
+    "vnet.gateway",
     "vnet.node",
     "vnet.radio",
     "vnet.reports",
@@ -38,8 +39,8 @@ _NOT_STEPPED_INTO = (
     "vnet.transport.",
 )
 """Beginnings of the names of modules in which a step does not stop: what lies between the lines of a program."""
-_LIBRARIES = tuple(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib"))
-"""Folders in which a step does not stop either, unless the program itself is installed there."""
+_LIBRARIES = ("<frozen ", *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")))
+"""Beginnings of the files in which a step does not stop either, unless the program itself is installed there."""
 _BELOW_THE_PROGRAM = ("asyncio.events", "vnet.runtime.host")
 """Modules whose frames, and those below, are not shown."""
 _BETWEEN_COROUTINES = (StopIteration, GeneratorExit)
@@ -146,8 +147,8 @@ class NodeDebugger(pdb.Pdb):
         return module.partition(".")[0] == self._package or not frame.f_code.co_filename.startswith(_LIBRARIES)
 
     def dispatch_call(self, frame: FrameType, arg: Any) -> Any:
-        """Enter a function; a coroutine is entered whenever it goes on, and stops at its next line."""
-        if frame.f_code.co_flags & _RESUMABLE:
+        """Enter a function; a coroutine is entered whenever it goes on, and stops at its next line, as a script."""
+        if frame.f_code.co_flags & _RESUMABLE or frame.f_code.co_name == "<module>":
             return self.trace_dispatch
         return super().dispatch_call(frame, arg)
 

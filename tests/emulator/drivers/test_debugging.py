@@ -16,6 +16,7 @@ from emulator.drivers.debugging import DebugPoint, debug_point
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.simulate import simulate
+from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, run_together, scenario_of
 from vnet.errors import VnetError
 from vnet.node import Node
@@ -77,7 +78,7 @@ def debug(monkeypatch: pytest.MonkeyPatch) -> Debug:
     """Simulate under a debugger that gets these commands; returns the run, what was said, and if it ended early."""
 
     def run(
-        program: str, target: str, *commands: str, faults: Sequence[dict[str, Any]] = ()
+        program: str | Scenario, target: str, *commands: str, faults: Sequence[dict[str, Any]] = ()
     ) -> tuple[Emulation, list[str], bool]:
         said = io.StringIO()
 
@@ -86,7 +87,8 @@ def debug(monkeypatch: pytest.MonkeyPatch) -> Debug:
             return NodeDebugger(target, io.StringIO, on_quit, entered, said)
 
         monkeypatch.setattr(local, "_debugger", debugger)
-        emulation = emulation_of(scenario_of(faults, HERE + program))
+        scenario = program if isinstance(program, Scenario) else scenario_of(faults, HERE + program)
+        emulation = emulation_of(scenario)
         trace, hook = sys.gettrace(), sys.breakpointhook
         _, interrupted = simulate(emulation, debug=DebugTarget.parse(target))
         assert (sys.gettrace(), sys.breakpointhook) == (trace, hook), "all is as it was"
@@ -230,6 +232,23 @@ def test_a_file_is_looked_for_here_and_beside_the_program(tmp_path: Path) -> Non
         resolve(DebugTarget.parse("v02:own.py:99"), (tmp_path,))
     with pytest.raises(VnetError, match=r"own.py: no such file"):
         resolve(DebugTarget.parse("v02:own.py:6"), ())
+
+
+@pytest.mark.slow
+def test_a_script_of_a_zenoh_vehicle_is_stopped_at_its_first_line_and_outside_of_functions(
+    debug: Debug, tmp_path: Path
+) -> None:
+    path = tmp_path / "script.py"
+    path.write_text("import time\n\nfor number in range(3):\n    time.sleep(0.1)\n    number *= 2\n")
+    program = {"kind": "zenoh", "command": ["python", str(path)]}
+    scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "network": {"vehicles": 2}, "program": program})
+    _, said, _ = debug(scenario, "v02", "n", "c")
+    assert stops(said) == ["import time", "for number in range(3):"]
+    target = resolve(DebugTarget.parse(f"v02:{path}:5"), (), has_scripts=True)
+    _, said, _ = debug(scenario, str(target), "c", f"cl {path}:5", "c")
+    assert stops(said) == ["number *= 2"] * 2
+    *_, interrupted = debug(scenario, "v02", "q")
+    assert interrupted
 
 
 # The terminal of another process.

@@ -106,9 +106,11 @@ async def main(node: Node) -> None:
             async with asyncio.TaskGroup() as tasks:
                 for words in commands:
                     tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT)))
-    except* Exception as errors:
+    except ExceptionGroup as errors:
         error = errors.exceptions[0]
         raise error.with_traceback(_of_program(error.__traceback__)) from None
+    except KeyboardInterrupt:  # of the whole process, which has heard of it by the command's task
+        raise asyncio.CancelledError from None
     finally:
         for task in background:
             task.cancel()
