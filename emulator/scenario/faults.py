@@ -10,9 +10,9 @@ follows. CONTRIBUTING.md shows an example. The layers above act on families:
 | `cuts = True` | `radio/faults.py` | `checks/faults.py` |
 | `LossFault`, `DelayFault` | `radio/faults.py` by the kind's law | `checks/faults.py`, `checks/channel.py` |
 | `SenderFault` | `radio/faults.py` | `checks/faults.py` |
-| `OwnRule` | `radio/own_rules.py` | `checks/own_rules.py` |
+| `OwnRule` | `radio/own_rules.py` | `checks/own.py` |
 | `GnssFault`, `ClockFault` | `world/truth.py` | `checks/faults.py` |
-| `Infrastructure` | `drivers/live/reconnection.py` | `checks/faults.py` |
+| `Infrastructure` | `drivers/live/processes.py` | `checks/faults.py` |
 
 The same tables stand in a scenario (`[[fault]]`) and behind the live command (`vnet fault inject`). Every fault
 ends by itself.
