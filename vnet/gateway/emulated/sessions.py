@@ -35,6 +35,7 @@ from vnet.gateway.emulated.values import (
     zbytes_of,
 )
 from vnet.gateway.emulated.vehicle import Vehicle
+from vnet.runtime.own_asyncio import present_node
 
 QUERY_TIMEOUT_S = 10.0
 """Zenoh's own `queries_default_timeout`."""
@@ -121,6 +122,8 @@ class Listening(Declared):
     def undeclare_if_declared(self) -> None:
         """Undeclare it unless it has been. Raises RuntimeError while a thread is in `recv`, as Zenoh's Python."""
         if self._readers:
+            if (node := present_node()) is not None:
+                node.log("undeclare() while a thread is in recv() raises RuntimeError, as at Zenoh", "warning")
             raise RuntimeError("Already borrowed")
         super().undeclare_if_declared()
 
