@@ -34,7 +34,6 @@ from emulator.scenario.program import PYTHON
 from vnet.errors import ProgramError, VnetError, counted, first_names, shown
 from vnet.gateway import filled_in
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
-from vnet.gateway.keys import REPORT_KEY
 from vnet.gateway.ros2 import Ros2
 from vnet.radio import SentFrame
 from vnet.reports import Report, Reporter
@@ -469,7 +468,7 @@ class Gateways:
             estimate, covariance = values.pop("estimate_m", None), values.pop("covariance_m2", None)
             report = vehicle.reporter.report(self._now_ns(), estimate, covariance, values)
         except (msgspec.MsgspecError, TypeError, ValueError) as error:
-            self._note(vehicle, "warning", f"{REPORT_KEY}: {error}")
+            self._note(vehicle, "error", f"a report is refused: {error}")
         else:
             vehicle.reports.append(report)
             self._flush_soon(vehicle)
