@@ -1,4 +1,4 @@
-"""What all commands share at a terminal: errors in one line, the exit status, and output that never fails.
+"""Errors in one line, the exit status, and output that never fails: the same for all commands at a terminal.
 
 A reader that goes away, as `head` does, is no reason to end a run, nor is a full disk: what cannot be written is
 dropped, and the command goes on to its end.

@@ -1,4 +1,4 @@
-"""What programs do past the event loop: exceptions that it never sees, and ends of the process that they ask for.
+"""Exceptions of programs that the event loop never sees, and ends of the process that programs ask for.
 
 Python hands exceptions in threads that a program starts, and in `__del__`, to `threading.excepthook` and
 `sys.unraisablehook`, which print them. While hosts run programs, these hooks first ask for the node on whose behalf
