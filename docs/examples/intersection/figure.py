@@ -1,6 +1,6 @@
 """Run the study of docs/how-to/intersection.md, print its table and draw its figure.
 
-python docs/examples/intersection/figure.py intersection.png --losses 0,0.9 --seeds 1
+python docs/examples/intersection/figure.py intersection.png --losses 0,0.9 --seeds 1 --vehicles 16 --duration-s 60
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def starts(seed: int, vehicles: int) -> list[float]:
 
 def cross(changes: Mapping[str, object], seed: int, places: list[float]) -> Crossing:
     """Return the result of a run in which vehicles start at `places` in m along their roads."""
-    changes = {**changes, "network.driven.start_m": places}
+    changes = {**changes, "network.vehicles": len(places), "network.driven.start_m": places}
     with tempfile.TemporaryDirectory() as folder:
         run = emulator.simulate(SCENARIO, seed=seed, set=changes, out=Path(folder) / "run")
         time_ns, position = run.states["time_ns"].to_numpy(), run.states["position_m"].combine_chunks()
@@ -66,6 +66,8 @@ def main() -> None:
     parser.add_argument("picture")
     parser.add_argument("--losses", default="0,0.5,0.8,0.9,0.95")
     parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--vehicles", type=int, default=20)
+    parser.add_argument("--duration-s", type=float, default=100.0)
     options = parser.parse_args()
     losses = [float(text) for text in options.losses.split(",")]
     seeds = range(1, options.seeds + 1)
@@ -73,10 +75,12 @@ def main() -> None:
     both = figure.subplots(1, 2)
     for waits, colour, name in ((True, "#0072b2", "waits for a grant"), (False, "#d55e00", "without the unit")):
         settings = [
-            {"radio.loss": loss, "program.options.waits": waits} for loss in (losses if waits else losses[:1])
+            {"run.duration_s": options.duration_s, "radio.loss": loss, "program.options.waits": waits}
+            for loss in (losses if waits else losses[:1])
         ]
         figures = np.array(
-            [[cross(changes, seed, starts(seed, 20)) for seed in seeds] for changes in settings], dtype=float
+            [[cross(changes, seed, starts(seed, options.vehicles)) for seed in seeds] for changes in settings],
+            float,
         )
         mean, width = figures.mean(axis=1), np.zeros((len(settings), 3))
         if options.seeds > 1:
