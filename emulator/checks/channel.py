@@ -276,8 +276,19 @@ def drew_for_loss(recorded: RecordedRun) -> Mask:
 
 def received_twice(recorded: RecordedRun) -> Mask:
     """Return the rows that are no transmission of their own: duplicates of a reception."""
-    by_rule = recorded.caused_by("custom") & ~recorded.outcome_is("fault")
+    by_rule = recorded.caused_by("custom") & ~recorded.outcome_is("fault") & ~_retries(recorded)
     return np.asarray((recorded.caused_by("duplicate") | by_rule) & (recorded.copy > 0))
+
+
+def _retries(recorded: RecordedRun) -> Mask:
+    """Rows of retries of frames to single vehicles, each the first row of its transmission."""
+    retries = np.zeros(len(recorded.trace), dtype=bool)
+    rows = np.flatnonzero(recorded.attempt > 1)
+    if len(rows):
+        what = np.column_stack([recorded.frame[rows], recorded.attempt[rows], recorded.on_air_ns[rows]])
+        order = np.argsort(recorded.copy[rows], kind="stable")
+        retries[rows[order][np.unique(what[order], axis=0, return_index=True)[1]]] = True
+    return retries
 
 
 def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, float]:

@@ -268,7 +268,7 @@ def _(fault: LossFault, recorded: RecordedRun) -> Mask:
 
 @can_cause.register
 def _(fault: Corrupt, recorded: RecordedRun) -> Mask:
-    return recorded.arrived
+    return recorded.arrived | recorded.outcome_is("duplicate")
 
 
 @can_cause.register
@@ -288,7 +288,7 @@ def _(fault: StaleMessages, recorded: RecordedRun) -> Mask:
 
 @can_cause.register
 def _(fault: Custom, recorded: RecordedRun) -> Mask:
-    return recorded.outcome_is("fault") | recorded.arrived
+    return recorded.arrived | recorded.outcome_is("fault", "duplicate")
 
 
 @can_cause.register

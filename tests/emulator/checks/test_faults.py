@@ -18,6 +18,7 @@ from emulator.records.tables import STATES
 from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
+from tests.support.exchange_programs import exchange_run
 from vnet.node import Node
 
 NEEDED: dict[str, dict[str, Any]] = {
@@ -230,6 +231,17 @@ def test_a_pair_that_no_fault_explains_is_found(cause: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "more",
+    [{"kind": "corrupt", "probability": 0.5}, {"kind": "custom", "rule": "tests.support.rules:everything"}],
+    ids=["corrupt", "custom"],
+)
+def test_a_fault_may_alter_a_retry_of_what_had_arrived(tmp_path: Path, more: dict[str, Any]) -> None:
+    recorded = exchange_run(tmp_path, [{"at_s": 0.1, "duration_s": 0.6, **more}])
+    assert "duplicate" in recorded.trace["outcome"].to_numpy()[recorded.cause >= 0]
+    assert Verdict.INVALID not in not_valid(recorded).values()
+
+
 def test_a_fault_outside_its_time_or_its_links_is_found() -> None:
     recorded = with_fault("block")
     outside = some(recorded, "lost")[0]
