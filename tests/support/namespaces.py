@@ -1,17 +1,11 @@
 """Hosts of a network on one machine: Linux network namespaces, joined by a bridge in a namespace of its own."""
 
-import ctypes
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
-
-import emulator.cli
-from tests.support.forked_commands import MODULE
 
 LINK = "eth0"
 """The link of each host to the network."""
@@ -25,8 +19,8 @@ class NetworkHost:
     address: str
 
     def command(self, *words: str) -> list[str]:
-        """Return the command, to be forked, that runs vnet with these words on this host."""
-        return [*MODULE, "tests.support.namespaces", self.namespace, *words]
+        """Return the command that runs `words` on this host; its process id is that of `words`."""
+        return ["ip", "netns", "exec", self.namespace, *words]
 
 
 def why_impossible() -> str:
@@ -79,15 +73,3 @@ def _delete(namespace: str) -> None:
 def _ip(*words: str) -> str:
     done = subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
     return done.stdout
-
-
-def _enter(namespace: str) -> None:
-    """Have this process, which has one thread, be in a namespace."""
-    with (Path("/run/netns") / namespace).open() as file:
-        if ctypes.CDLL(None).setns(file.fileno(), 0):
-            raise OSError(f"{namespace}: cannot be entered")
-
-
-if __name__ == "__main__":
-    _enter(sys.argv.pop(1))
-    emulator.cli.main()
