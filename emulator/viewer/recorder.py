@@ -22,7 +22,7 @@ from emulator.records.period_figures import NO_VIEWS, Estimate, Views, views_of
 from emulator.viewer.drawing import POSITION, TIMELINE, Canvas, PeriodArrays
 from emulator.viewer.overview_scene import OverviewScene
 from emulator.viewer.radio_scene import WINDOW_S, RadioScene
-from emulator.viewer.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
+from emulator.viewer.sinks import Sinks, open_recording, written
 from emulator.viewer.vehicle_scene import ProgramScene, VehicleScene, entity, titled
 from vnet.errors import VnetError, first_names
 
@@ -311,7 +311,7 @@ class Recorder:
         self._vehicle = vehicle
         self._program = ProgramScene(self._canvas, scene, vehicle)
         self._recording.send_blueprint(blueprint(vehicle, content=self._content))
-        self._recording.flush(timeout_sec=CLOSE_TIMEOUT_S)  # whatever happens now, it can be looked at
+        written(self._recording)  # whatever happens now, it can be looked at
 
     def draw(self) -> None:
         """Draw the periods that wait, which `take` does only once there are some."""

@@ -236,14 +236,41 @@ def open_recording(sinks: Sinks, name: str) -> Iterator[rerun.RecordingStream]:
         except RuntimeError as error:
             raise VnetError(f"{sinks.save}: cannot write the recording: {error}") from None
         recording.set_log_time_enabled(False)  # emulated time is all that counts
-        stack.callback(recording.disconnect)
+        stack.callback(_finish, recording, sinks)
         recording.send_recording_name(name)
         if sinks.serve is not None:
             _wait_until_served(recording, sinks.serve)
-        stack.callback(recording.flush, timeout_sec=CLOSE_TIMEOUT_S)
         if sinks.serve is not None:
             stack.enter_context(_looked_at(sinks.serve, sinks.spawn))
         yield recording
+
+
+_broken: list[rerun.RecordingStream] = []
+"""Recordings that could not be written: to disconnect one, or to forget it, would wait for ever."""
+
+
+def written(recording: rerun.RecordingStream) -> None:
+    """Wait until what has been recorded is where it goes. Raises VnetError if it cannot be written."""
+    import rerun
+
+    try:
+        recording.flush(timeout_sec=CLOSE_TIMEOUT_S)
+    except RuntimeError as error:
+        _broken.append(recording)
+        rerun.unregister_shutdown()
+        raise VnetError(f"cannot write the recording: {error}") from None
+
+
+def _finish(recording: rerun.RecordingStream, sinks: Sinks) -> None:
+    """Write the rest of a recording; where that fails, say so, because the run's other files are worth keeping."""
+    if any(recording is broken for broken in _broken):
+        return
+    try:
+        written(recording)
+    except VnetError as error:
+        print(f"vnet: {sinks.save or 'rerun'}: {error}", file=sys.stderr)
+    else:
+        recording.disconnect()
 
 
 def _wait_until_served(recording: rerun.RecordingStream, place: ServeAt) -> None:

@@ -183,6 +183,28 @@ with open_recording(Sinks(Path(sys.argv[1])), "killed") as recording:
 """
 
 
+ON_A_FULL_DISK = """
+import resource, sys
+from pathlib import Path
+import rerun as rr
+from emulator.viewer import sinks
+sinks.CLOSE_TIMEOUT_S = 0.5
+with sinks.open_recording(sinks.Sinks(Path(sys.argv[1])), "full") as recording:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+    for number in range(100):
+        recording.log(f"a{number}", rr.TextLog(1000 * "a"))
+"""
+
+
+@pytest.mark.slow
+def test_a_recording_that_cannot_be_written_any_more_says_so_and_ends(tmp_path: Path) -> None:
+    path = tmp_path / "full.rrd"
+    command = [sys.executable, "-c", ON_A_FULL_DISK, str(path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == 0
+    assert f"vnet: {path}: cannot write the recording: " in done.stderr
+
+
 @pytest.mark.slow
 def test_a_recording_whose_writer_was_killed_can_be_read_and_repaired(tmp_path: Path) -> None:
     path = tmp_path / "torn.rrd"
