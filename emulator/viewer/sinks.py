@@ -7,6 +7,7 @@ holds nothing up: what waits for it is bounded, and it is dropped when it no lon
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib.util
 import ipaddress
 import os
@@ -257,6 +258,7 @@ def written(recording: rerun.RecordingStream) -> None:
         recording.flush(timeout_sec=CLOSE_TIMEOUT_S)
     except RuntimeError as error:
         _broken.append(recording)
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(recording.inner))  # not forgotten at the process's end, either
         rerun.unregister_shutdown()
         raise VnetError(f"cannot write the recording: {error}") from None
 
