@@ -33,11 +33,11 @@ from agents.cooperative.cmm.plausibility import (
     median_belief,
     moved,
     prior_shares,
+    relative_to_most,
     scaled_by,
     scaled_down,
     spread_limit_m,
     traces_of,
-    unless_most_disagree,
 )
 from agents.cooperative.cmm.rbpf import Observation
 from agents.cooperative.estimator import FusionRule, mean_consensus, usable
@@ -267,7 +267,9 @@ class InformationEstimator:
                 by_kind.setdefault(kind_of_increment(increment), []).append(row)
         for kind, rows in by_kind.items():
             about = self._lanes.news(kind, is_before) if kind else belief
-            shares = self._origins.shares([codes[row] for row in rows], [said[row] for row in rows], about, now_s)
+            shares = self._origins.shares(
+                [codes[row] for row in rows], [said[row] for row in rows], about, now_s, True
+            )
             for row, share in zip(rows, shares, strict=True):
                 used[row] = share
         return used
@@ -298,7 +300,7 @@ class InformationEstimator:
         self._prior_shares = prior_shares(heard.moments, own)
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
         used = self._shares_used(heard.codes, heard.increments, belief, False)
-        self._used_shares = unless_most_disagree(used)
+        self._used_shares = relative_to_most(used)
         if min(self._prior_shares) < 1 or min(self._used_shares) < 1:
             self._reject("prior", sum(share < COUNTED_SHARE for share in self._prior_shares))
             self._reject("increment", sum(share < COUNTED_SHARE for share in self._used_shares))

@@ -21,12 +21,16 @@ INCREMENT_GATE = 16.0
 SUM_GATE = 4.0
 """Largest squared deviation of an origin's sum of many increments: the errors of what was believed partly cancel,
 and one honest sum in ten thousand deviates by 3.5 (N2) to 4.5 (N1)."""
+COMPARED_GATE = 1.0
+"""The same, less what most sums deviate by."""
+FAR = 4.0
+"""So many times the deviation that the gate of a sum lets through is far beyond it."""
 PRIOR_GATE = 4.0
 """Largest squared deviation of a prior's mean from one's own."""
 SPREAD_GATE = 3.5
 """Largest distance of a prior's mean from the median of all, in deviations of their spread."""
 MANY = 90.0
-"""Number of increments in a sum, less what has decayed, from which on `SUM_GATE` applies; for one it is
+"""Number of increments in a sum, less what has decayed, from which on the gate of many applies; for one it is
 `INCREMENT_GATE`."""
 LEAN_LIMIT = 0.1
 """Largest mean distance of an origin's priors from the median of all, in deviations that both claim: in honest runs
@@ -96,6 +100,13 @@ def rooted_triangle(xx: float, xy: float, yy: float) -> Three:
     root_xx = math.sqrt(xx)
     root_yx = xy / root_xx
     return root_xx, root_yx, math.sqrt(max(yy - root_yx * root_yx, 0.0))
+
+
+def _whitened(offset_m: tuple[float, float], root: Three) -> tuple[float, float]:
+    """Return C⁻¹ of an offset (x, y), with C (xx, yx, yy) lower triangular."""
+    c_xx, c_yx, c_yy = root
+    x = offset_m[0] / c_xx
+    return x, (offset_m[1] - c_yx * x) / c_yy
 
 
 def deviation(information: Five, belief: Belief) -> float:
@@ -168,16 +179,15 @@ def cut_to(off_m: list[tuple[float, float]], limit_m: float) -> list[tuple[float
     return [(x * part, y * part) for (x, y), part in zip(off_m, share, strict=True)]
 
 
-def unless_most_disagree(shares: list[float]) -> list[float]:
-    """Return 1 for all where most are less: then it is what is believed that is wrong, and not they."""
-    if len(shares) >= MAJORITY - 1 and 2 * shares.count(1.0) < len(shares):
-        return [1.0] * len(shares)
-    return shares
+def relative_to_most(shares: list[float]) -> list[float]:
+    """Return shares relative to their median: where most are below 1, what is believed is wrong, and not they."""
+    middle = sorted(shares)[len(shares) // 2] if len(shares) >= MAJORITY - 1 else 1.0
+    return shares if middle >= 1 else [min(1.0, share / max(middle, _TINY)) for share in shares]
 
 
-def _sum_gate(count: float) -> float:
+def _sum_gate(count: float, gate_of_many: float) -> float:
     """Return the largest squared deviation of a sum of so many increments."""
-    return INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * min(1.0, count / MANY)
+    return INCREMENT_GATE + (gate_of_many - INCREMENT_GATE) * min(1.0, count / MANY)
 
 
 class Origins:
@@ -186,25 +196,39 @@ class Origins:
     def __init__(self) -> None:
         self._sums: dict[int, Sums] = {}
         self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
+        self._common_m: tuple[float, float] | None = None  # by most sums the belief is off by this
 
     def __len__(self) -> int:
         """Number of origins whose increments are summed up."""
         return len(self._sums)
 
-    def shares(self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, now_s: float) -> list[float]:
+    def shares(
+        self,
+        codes: Sequence[int],
+        increments: Sequence[Five],
+        belief: Belief,
+        now_s: float,
+        is_about_lanes: bool = False,
+    ) -> list[float]:
         """Return the share (n,) of each increment (n,) of the origins `codes` that is used.
 
-        It is 1 within the gates, for the increment by itself and for the origin's sum, and beyond them the gate
-        relative to the squared deviation: an M-estimator whose influence descends. To drop it would err where few
-        contradict each other for long and are right: three vehicles on nearly parallel lanes, or on a map.
-        What is beyond is summed up all the same: who has lied is believed again when it has decayed. Each is
-        compared with the belief (x, P) when it came: c itself moves by half a metre in the sum's memory.
+        It is 1 within the gates. Beyond that of one increment it is the gate relative to the squared deviation;
+        beyond that of the origin's sum the root of this, so that the influence stays, and far beyond it less, so
+        that it descends (Hampel 1974). To drop it would err where few contradict each other for long and are right:
+        three vehicles on nearly parallel lanes, or on a map. What is beyond is summed up all the same: who has lied
+        is believed again when it has decayed. Each is compared with the belief (x, P) when it came: c itself moves
+        by half a metre in the sum's memory. What the sums within the gates have in common is the belief's error and
+        does not count; sums about lanes (`is_about_lanes`) have nothing in common, because their beliefs differ.
         """
         sums = self._sums
         if len(sums) + len(codes) > MAX_ORIGINS:
             sums = self._sums = _newest(sums, now_s)
         (mean_x, mean_y), covariance_m2 = belief
         c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
+        common_m = None if is_about_lanes else self._common_m
+        off_x, off_y = _whitened(common_m or (0.0, 0.0), (c_xx, c_yx, c_yy))
+        gate_of_many = SUM_GATE if common_m is None else COMPARED_GATE
+        within, s_xx, s_xy, s_yx, s_yy, s_x, s_y = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         then_s, keep, keep_2 = now_s, 1.0, 1.0
         nothing: Sums = (now_s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         shares = []
@@ -227,7 +251,8 @@ class Origins:
             more = 1e-4 * (n_a + n_d) + 1e-9
             n_a += more
             n_d += more
-            in_sum = (n_d * n_x * n_x - 2 * n_b * n_x * n_y + n_a * n_y * n_y) / (n_a * n_d - n_b * n_b)
+            r_x, r_y = n_x - n_xx * off_x - n_xy * off_y, n_y - n_yx * off_x - n_yy * off_y
+            in_sum = (n_d * r_x * r_x - 2 * n_b * r_x * r_y + n_a * r_y * r_y) / (n_a * n_d - n_b * n_b)
             a += m_xx * m_xx + m_xy * m_xy
             b += m_xx * m_yx + m_xy * m_yy
             d += m_yx * m_yx + m_yy * m_yy
@@ -235,10 +260,27 @@ class Origins:
             a += more
             d += more
             alone = (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
-            share = 1.0
-            if not (alone < INCREMENT_GATE and (in_sum < SUM_GATE or in_sum < _sum_gate(count))):
-                share = min(INCREMENT_GATE / max(alone, _TINY), _sum_gate(count) / max(in_sum, _TINY))
-            shares.append(share)
+            # What has a negative eigenvalue may deviate by less than nothing, which is no less a deviation.
+            gate = gate_of_many
+            if not -gate < in_sum < gate:
+                gate = _sum_gate(count, gate)
+            if -INCREMENT_GATE < alone < INCREMENT_GATE and -gate < in_sum < gate:
+                shares.append(1.0)
+                within += 1
+                s_xx += n_xx
+                s_xy += n_xy
+                s_yx += n_yx
+                s_yy += n_yy
+                s_x += n_x
+                s_y += n_y
+            else:
+                of_sum = gate / max(abs(in_sum), _TINY)
+                shares.append(min(1.0, INCREMENT_GATE / max(abs(alone), _TINY), math.sqrt(of_sum), FAR * of_sum))
+        if not is_about_lanes:
+            self._common_m = None
+            if within >= MAJORITY and (determinant := s_xx * s_yy - s_xy * s_yx):
+                x, y = (s_yy * s_x - s_xy * s_y) / determinant, (s_xx * s_y - s_yx * s_x) / determinant
+                self._common_m = c_xx * x, c_yx * x + c_yy * y
         return shares
 
     def without_lean(
