@@ -556,6 +556,8 @@ def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str
     if isinstance(source, Scenario):
         # Without defaults: another `kind` of a section has others. What is the default for some programs stays.
         data = source.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+        if "max_payload_bytes" not in source.radio.model_fields_set:  # it follows from the MAC
+            data.get("radio", {}).pop("max_payload_bytes", None)
         if source.program.kind == "zenoh":
             data.setdefault("radio", {})["jitter_ms"] = source.radio.jitter_ms
         source = data

@@ -180,20 +180,10 @@ class Radio(Section):
     @model_validator(mode="before")
     @classmethod
     def _mac_has_a_kind(cls, data: Any) -> Any:
-        """Fill in 802.11p, and the largest payload that a sidelink's slot can carry."""
+        """Fill in 802.11p."""
         if not isinstance(data, dict) or not isinstance(mac := data.get("mac"), dict):
             return data
-        data = {**data, "mac": {"kind": Edca.model_fields["kind"].default, **mac}}
-        fields, carried = Sidelink.model_fields, 1
-        for key in ("subchannels", "subchannel_bytes"):
-            given = mac.get(key, fields[key].default)
-            carried *= given if type(given) is int else 0
-        if (
-            mac.get("kind") in ("lte-mode4", "nr-mode2")
-            and 0 < carried < cls.model_fields["max_payload_bytes"].default
-        ):
-            data = {"max_payload_bytes": carried, **data}
-        return data
+        return {**data, "mac": {"kind": Edca.model_fields["kind"].default, **mac}}
 
     @model_validator(mode="after")
     def _sections_fit_the_mac(self) -> Radio:
@@ -203,6 +193,8 @@ class Radio(Section):
                 raise ValueError('congestion.kind = "cr_limit" goes with a MAC of kind "lte-mode4" or "nr-mode2"')
             return self
         carried = mac.subchannels * mac.subchannel_bytes
+        if "max_payload_bytes" not in self.model_fields_set:  # nor is it then: it follows from the MAC
+            self.__dict__["max_payload_bytes"] = min(self.max_payload_bytes, carried)
         if self.max_payload_bytes > carried:
             raise ValueError(
                 f"max_payload_bytes = {self.max_payload_bytes}: a slot of {mac.subchannels} subchannels carries at "

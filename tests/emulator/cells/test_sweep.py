@@ -57,6 +57,16 @@ def test_kinds_are_varied_with_the_defaults_of_each() -> None:
     assert [cell.scenario.radio.mac.kind for cell in cells if cell.scenario.radio.mac] == kinds
 
 
+def test_the_largest_payload_follows_the_varied_mac_unless_it_is_given() -> None:
+    vary: dict[str, list[Any]] = {"radio.mac": [{"kind": "nr-mode2", "subchannels": 8}, {"kind": "80211p"}]}
+    radio = {"path_loss": {"kind": "log_distance"}, "mac": {"kind": "nr-mode2"}}
+    for given, expected in (({}, [1400, 1400]), ({"max_payload_bytes": 300}, [300, 300])):
+        plan = SweepPlan.of(scenario_of({"radio": {**radio, **given}}, {}), vary, [1], False)
+        assert [cell.scenario.radio.max_payload_bytes for cell in plan.cells] == expected
+    plan = SweepPlan.of(scenario_of({"radio": radio}, {}), {"radio.mac.subchannels": [1, 2]}, [1], False)
+    assert [cell.scenario.radio.max_payload_bytes for cell in plan.cells] == [190, 380]
+
+
 def test_shards_are_the_whole_without_an_overlap() -> None:
     whole = plan()
     shards = [whole.shard(number, 3) for number in (1, 2, 3)]
