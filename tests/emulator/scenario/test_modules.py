@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import pytest
 from typer.testing import CliRunner
@@ -16,7 +17,8 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
-from vnet.runtime.programs import search_programs_in
+from vnet.errors import ProgramError
+from vnet.runtime.programs import load_program, search_programs_in
 
 SAY = """
 async def main(node):
@@ -216,3 +218,31 @@ def test_a_file_name_may_have_blanks(here: Path) -> None:
     assert status == 0, said
     digests = [json.loads((here / each / "verdict.json").read_text())["trace_sha256"] for each in ("run", "again")]
     assert digests[0] == digests[1]
+
+
+def test_programs_that_were_not_there_before_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder on the path that is made later, an archive that is written again, a relative entry."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "later"), str(tmp_path / "z.zip"), "relative"])
+    text = "async def main(node): pass"
+
+    def write(folder: str) -> None:
+        Path(folder).mkdir(exist_ok=True)
+        Path(folder, f"found_{folder}_9.py").write_text(text)
+
+    def pack(*names: str) -> None:
+        with ZipFile("z.zip", "w") as archive:
+            for name in names:
+                archive.writestr(f"{name}.py", text)
+
+    pack("found_first_9")
+    Path("relative").mkdir()
+    with pytest.raises(ProgramError):
+        load_program("found_nothing_9:main")
+    write("later")
+    write("relative")
+    pack("found_first_9", "found_second_9")
+    search_programs_in([])
+    for name in ("found_later_9", "found_second_9", "found_relative_9"):
+        load_program(f"{name}:main")
+        monkeypatch.delitem(sys.modules, name)
