@@ -1,4 +1,4 @@
-"""Driving: what a program asks its vehicle to do."""
+"""Node: what a program has of its vehicle, its receiver, radio, driving, folder, log and clock."""
 
 from __future__ import annotations
 
