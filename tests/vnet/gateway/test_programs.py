@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -260,6 +261,74 @@ def test_alarms_ring_by_emulated_time_and_end_a_wait(drive: Drive) -> None:
     assert log(run)[:-1] == ["int 0.2 0.1", "int 0.3 0.1", "0.05 1", "1.35"]
 
 
+def test_a_signal_handler_runs_as_the_main_thread(drive: Drive) -> None:
+    run = drive(
+        """
+        import signal, threading, time
+        lock, own, seen = threading.RLock(), threading.local(), set()
+        own.name = "main's"
+        def ring(number, frame):
+            with lock:
+                seen.add((threading.current_thread() is threading.main_thread(), own.name, frame.f_code.co_name))
+                now.append(f"{time.monotonic():.1f}")
+        now = []
+        signal.signal(signal.SIGALRM, ring)
+        signal.setitimer(signal.ITIMER_REAL, 0.1, 0.1)
+        with lock:
+            time.sleep(0.35)
+        print(seen, now, threading.active_count())
+        for wrong in ((signal.ITIMER_REAL, -1), (77, 1), (signal.ITIMER_REAL, 1, -1)):
+            try:
+                signal.setitimer(*wrong)
+            except signal.ItimerError:
+                print("refused")
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(1)
+        time.sleep(5)
+        """
+    )
+    lines = log(run)
+    assert lines[:4] == ["{(True, \"main's\", '<module>')} ['0.1', '0.2', '0.3'] 1", *["refused"] * 3]
+    crashed = events(run, "crashed")[0]["error"]
+    assert "-14" in crashed and "program0.py" in crashed
+
+
+def test_a_program_waits_for_signals(drive: Drive) -> None:
+    run = drive(
+        """
+        import signal, threading, time
+        def now():
+            return f"{time.monotonic():.1f}"
+        signal.signal(signal.SIGALRM, lambda number, frame: print("rang", now()))
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        print(signal.pause(), now())
+        print(signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM]))
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        print(signal.sigwait([signal.SIGALRM]), now())
+        print(signal.sigtimedwait([signal.SIGALRM], 0.2), now())
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        print(signal.sigtimedwait([signal.SIGALRM], 0.2).si_signo, now())
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        time.sleep(0.2)
+        print(signal.sigpending(), now())
+        print(signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGALRM]), signal.sigpending())
+        """
+    )
+    alarm = {signal.SIGALRM}
+    assert run.verdict == "valid"
+    assert log(run)[:-1] == [
+        "rang 0.1",
+        "None 0.1",
+        "set()",
+        f"{signal.SIGALRM} 0.2",
+        "None 0.4",
+        "14 0.5",
+        f"{alarm} 0.7",
+        "rang 0.7",
+        f"{alarm} set()",
+    ]
+
+
 def test_output_that_a_program_takes_for_itself_is_its_own(drive: Drive) -> None:
     run = drive(
         """
@@ -287,14 +356,15 @@ def test_output_that_a_program_takes_for_itself_is_its_own(drive: Drive) -> None
 def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Drive) -> None:
     run = drive(
         """
-        import multiprocessing, os, subprocess, time
+        import multiprocessing, os, subprocess, threading, time
         from concurrent.futures import ProcessPoolExecutor, as_completed
         def work(number):
             time.sleep(0.01)
             return number * number
         def tell(end):
             time.sleep(0.01)
-            end.send(work(3))
+            lock = threading.Lock()
+            end.send((work(3), lock.acquire(False), lock.acquire(False), lock.locked()))
         ours, theirs = multiprocessing.Pipe()
         child = multiprocessing.get_context("fork").Process(target=tell, args=(theirs,))
         child.start()
@@ -308,7 +378,7 @@ def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Driv
         """
     )
     lines = [line for line in log(run)[:-1] if "child processes" not in line]
-    assert lines == ["9 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]"]
+    assert lines == ["(9, True, False, True) 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]"]
 
 
 @pytest.mark.parametrize("method", ["spawn", "fork"])
@@ -330,7 +400,8 @@ def test_zenoh_of_a_child_process_opens_no_session_and_says_that_it_is_outside(d
             child.join()
             for _ in range(2):
                 code = "import zenoh; zenoh.open(zenoh.Config())"
-                done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+                command = [sys.executable, "-c", code]
+                done = subprocess.run(command, capture_output=True, text=True, env={{"PYTHONPATH": "/nowhere"}})
                 print(done.stderr.splitlines()[-1])
         """,
         vehicles=2,

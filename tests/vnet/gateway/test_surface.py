@@ -100,12 +100,18 @@ ARGUMENTS = """
     session.get("a", timeout=0)
     session.declare_querier("a", timeout=SECOND)
     session.declare_queryable("a", complete=1)
+    session.declare_queryable("a", complete=np.bool_(1))
     session.declare_subscriber("a", allowed_origin=3)
     session.declare_publisher("a", reliability=True)
     session.liveliness().get("a", timeout=SECOND)
     session.liveliness().declare_subscriber("a", history=1)
 """
-NAMES = "from datetime import timedelta\nfrom zenoh import ext, handlers\nSECOND = timedelta(seconds=1)\n"
+NAMES = """
+from datetime import timedelta
+import numpy as np
+from zenoh import ext, handlers
+SECOND = timedelta(seconds=1)
+"""
 
 
 def attempts() -> str:

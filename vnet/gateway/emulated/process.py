@@ -11,14 +11,15 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from math import ceil
-from types import ModuleType, TracebackType
+from operator import index
+from types import FrameType, ModuleType, TracebackType
 from typing import Any, NoReturn
 
 from vnet.gateway import STARTUP
-from vnet.gateway.emulated.strands import HardExit, Threads, block_on, current_strand, leave_hard, sleep
+from vnet.gateway.emulated.strands import HardExit, Threads, Waiting, current_strand, leave_hard
 
 OUTSIDE = "VNET_OUTSIDE"
 """Variable by which a child process knows that it has no radio, as its Zenoh would reach the machine's network."""
@@ -28,6 +29,7 @@ INTERRUPTED = 130
 """Status of a program that an interrupt has ended."""
 _IGNORED = (signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH)
 """Signals that do nothing to a program without a handler."""
+_TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 
 
 class OwnProcess:
@@ -38,6 +40,10 @@ class OwnProcess:
         self._handlers: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
         self._timer: asyncio.TimerHandle | None = None
         self._interval_s = 0.0
+        self._blocked: set[int] = set()
+        self._awaited: list[set[int]] = []
+        self._pending: set[int] = set()
+        self._arrivals, self._handled = Waiting(), Waiting()
         self.interrupt: BaseException | None = None
         """The last interrupt that was the program's own."""
 
@@ -60,10 +66,13 @@ class OwnProcess:
             "getsignal": lambda number: self._handlers.get(number, signal.SIG_DFL),
             "raise_signal": self.send,
             "pthread_kill": lambda thread, number: self.send(number),
-            **dict.fromkeys(["pause", "sigwait", "sigwaitinfo"], _wait_for_ever),
-            "sigtimedwait": lambda signals, timeout: sleep(timeout),
-            "pthread_sigmask": lambda how, mask: set(),
-            "alarm": lambda seconds: ceil(self._set_timer(signal.ITIMER_REAL, seconds)[0]),
+            "pause": self._pause,
+            "sigwait": lambda signals: signal.Signals(self._await(signals)),
+            "sigwaitinfo": lambda signals: _siginfo(self._await(signals)),
+            "sigtimedwait": self._await_for,
+            "sigpending": lambda: set(map(_named, self._pending)),
+            "pthread_sigmask": self._set_mask,
+            "alarm": lambda seconds: ceil(self._set_timer(signal.ITIMER_REAL, index(seconds))[0]),
             "setitimer": self._set_timer,
             "getitimer": self._timer_left,
             "set_wakeup_fd": lambda *args, **kwargs: -1,
@@ -83,6 +92,8 @@ class OwnProcess:
 
     def _set_timer(self, which: int, seconds: float, interval: float = 0.0) -> tuple[float, float]:
         """Do as `signal.setitimer`; timers of the processor's time, of which computing takes none, never ring."""
+        if which not in _TIMERS or seconds < 0 or interval < 0:
+            raise signal.ItimerError(errno.EINVAL, os.strerror(errno.EINVAL))
         before = self._timer_left(which)
         if which == signal.ITIMER_REAL:
             if self._timer is not None:
@@ -95,7 +106,52 @@ class OwnProcess:
         self._timer = None
         if not self._threads.are_over:
             self._set_timer(signal.ITIMER_REAL, self._interval_s, self._interval_s)
-            self._threads.start(self.send, (signal.SIGALRM,))
+            self._threads.start_as_main(lambda: self.send(signal.SIGALRM))
+
+    def _set_mask(self, how: int, mask: Iterable[int]) -> set[int]:
+        """Do as `signal.pthread_sigmask`; all threads have one mask."""
+        before, given = self._blocked, set(mask) - {signal.SIGKILL, signal.SIGSTOP}
+        masks = {
+            signal.SIG_BLOCK: before | given,
+            signal.SIG_UNBLOCK: before - given,
+            signal.SIG_SETMASK: given,
+        }
+        if how not in masks:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        self._blocked = masks[signal.Sigmasks(how)]
+        for number in sorted(self._pending - self._blocked):
+            self._pending.discard(number)
+            self.send(number)
+        return set(map(_named, before))
+
+    def _pause(self) -> None:
+        self._handled.wait()
+
+    def _await(self, signals: Iterable[int]) -> int:
+        """Block until one of these signals comes; it is then not handled."""
+        number = self._await_until(set(signals), -1)
+        assert number is not None
+        return number
+
+    def _await_for(self, signals: Iterable[int], timeout: float) -> signal.struct_siginfo | None:
+        if timeout < 0:
+            raise ValueError("timeout must be non-negative")
+        number = self._await_until(set(signals), timeout)
+        return None if number is None else _siginfo(number)
+
+    def _await_until(self, signals: set[int], timeout: float) -> int | None:
+        """Return a signal that has come, None after `timeout` seconds (-1: never)."""
+        end_s = asyncio.get_running_loop().time() + timeout
+        self._awaited.append(signals)
+        try:
+            while not (came := self._pending & signals):
+                left_s = -1 if timeout == -1 else max(0.0, end_s - asyncio.get_running_loop().time())
+                if not self._arrivals.wait(left_s):
+                    return None
+        finally:
+            self._awaited.remove(signals)
+        self._pending.discard(min(came))
+        return min(came)
 
     def _kill(self, pid: int, number: int) -> None:
         if pid in (PID, -PID, 0, -1):
@@ -105,6 +161,10 @@ class OwnProcess:
 
     def send(self, number: int) -> None:
         """Do what a signal to the program does. What a handler raises, its main thread gets."""
+        if number in self._blocked.union(*self._awaited):
+            self._pending.add(int(number))
+            self._arrivals.wake_all()
+            return
         handler = self._handlers.get(number, signal.SIG_DFL)
         if number in (signal.SIGKILL, signal.SIGSTOP) or (
             handler == signal.SIG_DFL and number not in (0, *_IGNORED)
@@ -113,17 +173,26 @@ class OwnProcess:
         if not callable(handler):
             return
         try:
-            handler(int(number), None)
+            handler(int(number), self._frame())
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 self.interrupt = error
             if current_strand() is self._threads.main:
                 raise
             self._threads.interrupt(error)
+        else:
+            self._handled.wake_all()
+
+    def _frame(self) -> FrameType:
+        """Return where the program is: where it runs, or else where its main thread waits."""
+        here = sys._getframe()
+        main = None if self._threads.main is None else self._threads.main.gr_frame
+        return _program_frame(here) or (main and _program_frame(main)) or here
 
     def _exit(self, status: int) -> None:
         """End the program at once: nothing of it runs any more."""
-        leave, strand = HardExit(status).with_traceback(_place()), current_strand()
+        frame, strand = self._frame(), current_strand()
+        leave = HardExit(status).with_traceback(TracebackType(None, frame, frame.f_lasti, frame.f_lineno))
         if strand is self._threads.main:
             leave_hard(leave)
         self._threads.interrupt(leave)
@@ -131,16 +200,20 @@ class OwnProcess:
             leave_hard(None)
 
 
-def _place() -> TracebackType:
-    """Return where the program is that runs."""
-    frame = sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("vnet."):
-        frame = frame.f_back
-    return TracebackType(None, frame, frame.f_lasti, frame.f_lineno)
+def _program_frame(frame: FrameType) -> FrameType | None:
+    """Return the innermost frame of the program among those that lead to `frame`, None without any."""
+    inner: FrameType | None = frame
+    while inner is not None and inner.f_globals.get("__name__", "").startswith("vnet."):
+        inner = inner.f_back
+    return inner
 
 
-def _wait_for_ever(*_: object) -> None:
-    block_on(asyncio.get_running_loop().create_future())
+def _named(number: int) -> int:
+    return signal.Signals(number) if number in set(signal.Signals) else number
+
+
+def _siginfo(number: int) -> signal.struct_siginfo:
+    return signal.struct_siginfo((number, 0, 0, PID, 0, 0, 0))
 
 
 def _refuse(*args: object, **options: object) -> NoReturn:
@@ -156,7 +229,7 @@ def children_outside() -> Iterator[None]:
     global _programs, _path_before
     if _programs == 0:
         _path_before = os.environ.get("PYTHONPATH", "")
-        os.environ |= {"PYTHONPATH": os.pathsep.join(filter(None, [str(STARTUP), _path_before])), OUTSIDE: "1"}
+        os.environ |= _outside(os.environ)
     _programs += 1
     try:
         yield
@@ -164,15 +237,25 @@ def children_outside() -> Iterator[None]:
         _programs -= 1
         if _programs == 0:
             os.environ["PYTHONPATH"] = _path_before  # empty means none
-            del os.environ[OUTSIDE]
+            os.environ.pop(OUTSIDE, None)
+
+
+def _outside(environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the variables by which Zenoh in a child process with this environment opens no session."""
+    path = [each for each in environ.get("PYTHONPATH", "").split(os.pathsep) if each not in ("", str(STARTUP))]
+    return {"PYTHONPATH": os.pathsep.join([str(STARTUP), *path]), OUTSIDE: "1"}
 
 
 def subprocess_functions(environ: Mapping[str, str], tell: Callable[[], object]) -> dict[str, Any]:
-    """Return what stands for functions of `subprocess`: child processes get the program's environment."""
+    """Return what stands for functions of `subprocess`.
+
+    Child processes get the program's environment, and in any have what `children_outside` sets.
+    """
 
     def environment(given: Any) -> Any:
         tell()
-        return environ if given is None else given
+        chosen = environ if given is None else given
+        return {**chosen, **_outside(chosen)}
 
     class Popen(subprocess.Popen[Any]):
         def __init__(self, *args: Any, **options: Any) -> None:

@@ -262,8 +262,8 @@ class MatchingListener(Listening):
     def __init__(self, owner: Sending, handler: Any = None) -> None:
         super().__init__(handler, owner.session.outlet)
         self._owner, self._matching = owner, False
-        owner.session.vehicle.on_matching.append(self._look)
         self._ends = [owner.until_undeclared(self._stop)]
+        owner.session.vehicle.on_matching.append(self._look)
         self._look()
 
     def _stop(self) -> None:

@@ -229,7 +229,7 @@ def leave_hard(leave: HardExit | None) -> None:
 def look() -> None:
     """Take note that the present strand looks at what others change; one that does nothing else is let wait."""
     strand = current_strand()
-    if strand is None:
+    if strand is None or _is_child:
         return
     now_s = asyncio.get_running_loop().time()
     strand.looks = strand.looks + 1 if now_s == strand.looked_s else 1
@@ -441,8 +441,14 @@ class Threads:
         """Start a thread, and return its number."""
         return self._begin(partial(function, *args, **(kwargs or {}))).number
 
-    def _begin(self, function: Callable[[], Any]) -> Strand:
-        strand = Strand(partial(self._run, function), self.new_number(), self.folder)
+    def start_as_main(self, function: Callable[[], Any]) -> None:
+        """Start a strand that is the main thread to who asks: its number, its context. The main strand waits."""
+        assert self.main is not None
+        self._begin(function, self.main)
+
+    def _begin(self, function: Callable[[], Any], like: Strand | None = None) -> Strand:
+        number, context = (self.new_number(), None) if like is None else (like.number, like.gr_context)
+        strand = Strand(partial(self._run, function), number, self.folder, context)
         self._alive += 1
         Task(run_strand(strand), loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
         return strand

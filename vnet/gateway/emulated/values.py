@@ -12,9 +12,11 @@ from datetime import timedelta
 from functools import lru_cache
 from math import isfinite
 from operator import index
+from types import UnionType
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import msgspec
+import numpy as np
 import zenoh
 from zenoh.handlers import Callback
 
@@ -188,9 +190,9 @@ def _count(value: int) -> None:
         raise OverflowError("can't convert negative int to unsigned")
 
 
-_TYPES: dict[str, type] = {
+_TYPES: dict[str, type | UnionType] = {
     **dict.fromkeys(["allowed_origin", "allowed_destination"], zenoh.Locality),
-    **dict.fromkeys(["complete", "detect_late_publishers", "express", "history"], bool),
+    **dict.fromkeys(["complete", "detect_late_publishers", "express", "history"], bool | np.bool_),
     "accept_replies": zenoh.ReplyKeyExpr,
     "config": zenoh.Config,
     "congestion_control": zenoh.CongestionControl,
@@ -220,7 +222,8 @@ def check(options: Mapping[str, Any]) -> None:
             _NUMBERS[name](value)
         elif not isinstance(value, kind := _TYPES.get(name, object)):
             given = type(value).__name__
-            raise TypeError(f"argument '{name}': '{given}' object cannot be converted to '{kind.__name__}'")
+            wanted = kind.__name__ if isinstance(kind, type) else "bool"
+            raise TypeError(f"argument '{name}': '{given}' object cannot be converted to '{wanted}'")
 
 
 # Between samples and what crosses the radio.
