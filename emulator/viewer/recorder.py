@@ -261,7 +261,7 @@ class Recorder:
         self._stack = ExitStack()
         self._recording = self._stack.enter_context(open_recording(sinks, name))
         self._canvas = Canvas(self._recording)
-        self._vehicle = sinks.vehicle
+        self._sinks, self._vehicle = sinks, sinks.vehicle
         self._overview: OverviewScene | None = None
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
         self._program: ProgramScene | None = None
@@ -311,7 +311,7 @@ class Recorder:
         self._vehicle = vehicle
         self._program = ProgramScene(self._canvas, scene, vehicle)
         self._recording.send_blueprint(blueprint(vehicle, content=self._content))
-        written(self._recording)  # whatever happens now, it can be looked at
+        written(self._recording, self._sinks)  # whatever happens now, it can be looked at
 
     def draw(self) -> None:
         """Draw the periods that wait, which `take` does only once there are some."""

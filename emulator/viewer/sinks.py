@@ -250,7 +250,7 @@ _broken: list[rerun.RecordingStream] = []
 """Recordings that could not be written: to disconnect one, or to forget it, would wait for ever."""
 
 
-def written(recording: rerun.RecordingStream) -> None:
+def written(recording: rerun.RecordingStream, sinks: Sinks) -> None:
     """Wait until what has been recorded is where it goes. Raises VnetError if it cannot be written."""
     import rerun
 
@@ -260,7 +260,7 @@ def written(recording: rerun.RecordingStream) -> None:
         _broken.append(recording)
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(recording.inner))  # not forgotten at the process's end, either
         rerun.unregister_shutdown()
-        raise VnetError(f"cannot write the recording: {error}") from None
+        raise VnetError(f"{sinks.save or 'Rerun'}: cannot write the recording: {error}") from None
 
 
 def _finish(recording: rerun.RecordingStream, sinks: Sinks) -> None:
@@ -268,9 +268,9 @@ def _finish(recording: rerun.RecordingStream, sinks: Sinks) -> None:
     if any(recording is broken for broken in _broken):
         return
     try:
-        written(recording)
+        written(recording, sinks)
     except VnetError as error:
-        print(f"vnet: {sinks.save or 'rerun'}: {error}", file=sys.stderr)
+        print(f"vnet: {error}", file=sys.stderr)
     else:
         recording.disconnect()
 
