@@ -9,11 +9,9 @@ import sys
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from importlib.machinery import FileFinder
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
-from zipimport import zipimporter
 
 from vnet.errors import ProgramError, did_you_mean
 from vnet.extras import missed_by
@@ -135,10 +133,4 @@ def search_programs_in(folders: Iterable[Path]) -> None:
     wanted = dict.fromkeys(str(folder) for folder in [*folders, Path.cwd()])
     _added[:] = [path for path in wanted if path not in sys.path]
     sys.path.extend(_added)
-    for place, finder in list(sys.path_importer_cache.items()):
-        if finder is None or not Path(place).is_absolute():
-            del sys.path_importer_cache[place]  # it was not there, or depends on the current folder
-        elif isinstance(finder, zipimporter) or (
-            isinstance(finder, FileFinder) and place.startswith(tuple(wanted))
-        ):  # what lies in other folders has not been written just now
-            finder.invalidate_caches()
+    importlib.invalidate_caches()
