@@ -102,13 +102,6 @@ def rooted_triangle(xx: float, xy: float, yy: float) -> Three:
     return root_xx, root_yx, math.sqrt(max(yy - root_yx * root_yx, 0.0))
 
 
-def _whitened(offset_m: tuple[float, float], root: Three) -> tuple[float, float]:
-    """Return C⁻¹ of an offset (x, y), with C (xx, yx, yy) lower triangular."""
-    c_xx, c_yx, c_yy = root
-    x = offset_m[0] / c_xx
-    return x, (offset_m[1] - c_yx * x) / c_yy
-
-
 def deviation(information: Five, belief: Belief) -> float:
     """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for what is said about c ~ N(x, P)."""
     (mean_x, mean_y), covariance_m2 = belief
@@ -226,8 +219,10 @@ class Origins:
         (mean_x, mean_y), covariance_m2 = belief
         c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
         common_m = None if is_about_lanes else self._common_m
-        off_x, off_y = _whitened(common_m or (0.0, 0.0), (c_xx, c_yx, c_yy))
         gate_of_many = SUM_GATE if common_m is None else COMPARED_GATE
+        off_x, off_y = common_m or (0.0, 0.0)
+        off_x /= c_xx
+        off_y = (off_y - c_yx * off_x) / c_yy
         within, s_xx, s_xy, s_yx, s_yy, s_x, s_y = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         then_s, keep, keep_2 = now_s, 1.0, 1.0
         nothing: Sums = (now_s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
