@@ -41,15 +41,25 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if SLOW_FILE.search(collection_path.read_text(encoding="utf-8")) else None
 
 
+MOSTLY_WAIT = ("test_zenoh.py", "test_access.py", "test_ros2.py", "test_ends_of_agents.py", "test_hosts.py")
+"""Files of tests/system whose tests take four times as long as they compute, or more."""
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what waits for processes, so that other workers compute meanwhile; end with files of quick tests.
 
-    The first worker takes the first of the tests, and those that are done take the last of others.
+    The first worker takes the first of the tests, and those that are done take the last of others. So pages, which
+    compute, come after whole runs: otherwise all workers wait at the end.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    waiting = [path for path in slow if path.parent.name in ("system", "docs")]
-    items.sort(key=lambda item: (item.path not in waiting, item.path not in slow))
+
+    def place(item: pytest.Item) -> tuple[bool, ...]:
+        path = item.path
+        is_run, is_page = path.parent.name == "system", path in slow and path.parent.name == "docs"
+        return not (is_run and path.name in MOSTLY_WAIT), not is_run, not is_page, path not in slow
+
+    items.sort(key=place)
 
 
 def pytest_collection_finish() -> None:

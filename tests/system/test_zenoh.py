@@ -22,6 +22,12 @@ WAITS = (
 )
 """A program of one line: what it does after it has connected, and for how long it stays."""
 CLIENT = "config.insert_json5('mode', json.dumps('client')); config.insert"
+SHORT = (
+    ("at_s = 3.0", "at_s = 2.0"),
+    ("duration_s = 2.0", "duration_s = 0.5"),
+    ("duration_s = 8.0", "duration_s = 3.0"),
+)
+"""The page's run without the time that it takes to show faults."""
 SLOW = (0, 3)
 """Exit statuses of a run that is as it should be: a slow machine makes one in real time unknown."""
 
@@ -105,12 +111,13 @@ def test_what_programs_say_before_the_start_is_sent_then(vnet: Vnet, tmp_path: P
         "[session.put('once/' + name, text) for text in ('first', 'last')]; "
         "[print('answered', reply.ok.key_expr) for reply in session.get('asked/**')]"
     )
-    patient = 'kind = "zenoh"', 'kind = "zenoh"\nzenoh = { query_s = 6.0 }'
+    patient = 'kind = "zenoh"', 'kind = "zenoh"\nzenoh = { query_s = 4.0 }'
     changes = (
         patient,
         ("loss = 0.1", "loss = 0.0"),
-        ("at_s = 3.0", "at_s = 7.0"),
+        ("at_s = 3.0", "at_s = 4.5"),
         ("duration_s = 2.0", "duration_s = 0.5"),
+        ("duration_s = 8.0", "duration_s = 5.0"),
     )
     done = vnet("run", scenario(tmp_path, command(does), *changes))
     assert done.status in SLOW
@@ -123,7 +130,7 @@ def test_what_programs_say_before_the_start_is_sent_then(vnet: Vnet, tmp_path: P
 
 def test_a_command_that_fails_is_a_crash_of_its_vehicle_alone(vnet: Vnet, tmp_path: Path) -> None:
     fails = command("time.sleep(1); sys.exit(3 if name == 'v02' else 0)")
-    done = vnet("run", scenario(tmp_path, fails, ("duration_s = 8.0", "duration_s = 4.0")))
+    done = vnet("run", scenario(tmp_path, fails, *SHORT))
     (death,) = done.events_of("died")
     assert (done.status, death["node"]) == (1, "v02")
     assert "status 3" in death["how"]
@@ -148,7 +155,7 @@ def test_a_session_at_another_vehicles_endpoint_is_no_isolation(vnet: Vnet, tmp_
         "time.sleep(100)\n"
     )
     words = json.dumps(["python", "cheater.py", "{id}", str(tmp_path)])
-    done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words)))
+    done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words), *SHORT))
     assert done.status == 1
     assert {event["node"] for event in done.events_of("extra_session")} == {"v02"}
     assert done.check("isolation")["verdict"] == "invalid"
@@ -170,12 +177,12 @@ def test_a_peer_that_others_find_by_multicast_is_no_isolation(vnet: Vnet, tmp_pa
         "time.sleep(100)"
     )
     words = ('["python", "talker.py", "{id}"]', json.dumps(["python", "-c", program, "{endpoint}"]))
-    done = vnet("run", scenario(tmp_path, words, ("duration_s = 8.0", "duration_s = 4.0")))
+    done = vnet("run", scenario(tmp_path, words, *SHORT))
     assert done.status == 1
     assert {event["node"] for event in done.events_of("found_session")} == {"v01", "v02", "v03", "v04"}
     assert done.check("isolation")["verdict"] == "invalid"
     client = json.dumps(["python", "-c", program.replace("config.insert", CLIENT, 1), "{endpoint}"])
-    done = vnet("run", scenario(tmp_path, (words[0], client), ("duration_s = 8.0", "duration_s = 4.0")))
+    done = vnet("run", scenario(tmp_path, (words[0], client), *SHORT))
     assert not done.events_of("found_session")
 
 
@@ -183,7 +190,7 @@ def test_programs_in_python_are_clients_of_their_vehicle_whatever_they_open(vnet
     """Two are peers by default, two connect and listen elsewhere: they reach others by the radio alone."""
     elsewhere = {"connect": {"endpoints": ["tcp/localhost:7447"]}, "listen": {"endpoints": ["tcp/127.0.0.1:0"]}}
     other = f"zenoh.Config() if name < 'v03' else zenoh.Config.from_json5(str({elsewhere}))"
-    path = scenario(tmp_path, ("duration_s = 8.0", "duration_s = 4.0"), ("loss = 0.1", "loss = 0.5"))
+    path = scenario(tmp_path, *SHORT, ("loss = 0.1", "loss = 0.5"))
     talker = tmp_path / "talker.py"
     talker.write_text(talker.read_text().replace("zenoh.Config.from_env()", other))
     done = vnet("run", path)
@@ -227,7 +234,7 @@ def test_commands_connect_by_tls_if_they_trust_the_authority_of_their_endpoint(
         'listen = "tls/127.0.0.1:0", certificate = "router.pem", private_key = "router.key", '
         'authority = "authority.pem"'
     )
-    path = scenario(tmp_path, ('kind = "zenoh"', f'kind = "zenoh"\nzenoh = {{ {options} }}'))
+    path = scenario(tmp_path, ('kind = "zenoh"', f'kind = "zenoh"\nzenoh = {{ {options} }}'), *SHORT)
     if trusted is not issued:
         refused = vnet("run", path)
         assert refused.status == 2 and "authority.pem' has issued" in refused.stderr
@@ -248,7 +255,7 @@ def test_users_and_several_commands_of_one_vehicle(vnet: Vnet, tmp_path: Path, p
     alone = '["sh", "-c", "unset ZENOH_CONFIG; exec sleep 100"]'
     words = both if program == "talker.py" else alone
     limit = [] if words == both else ["--set", "run.join_timeout_s=1"]
-    done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words), secured), *limit)
+    done = vnet("run", scenario(tmp_path, ('["python", "talker.py", "{id}"]', words), secured, *SHORT), *limit)
     assert done.status in (SLOW if words == both else (2,))
     if words == both:
         assert heard(done, "v01")["v01"] > 0
