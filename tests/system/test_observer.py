@@ -19,7 +19,7 @@ from tests.system.conftest import TIMEOUT_S, killed_at_last
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
 LONG: dict[str, dict[str, Any]] = {
-    "run": {"duration_s": 30.0, "name": "watched"},
+    "run": {"duration_s": 15.0, "name": "watched"},
     "program": {"entry": "agents.beacon:main"},
 }
 
@@ -37,7 +37,7 @@ def observer_of(folder: Path) -> int:
     raise AssertionError("there is no observer")
 
 
-def wait_for_recording(folder: Path, process: subprocess.Popen[str], growths: int = 12) -> None:
+def wait_for_recording(folder: Path, process: subprocess.Popen[str], growths: int = 5) -> None:
     """Wait until the recording has grown several times: it has its scene by then, and rows of the run."""
     path = folder / "recording.rrd"
     sizes: set[int] = set()

@@ -63,7 +63,7 @@ def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end:
 def test_a_program_that_stalls_ends_the_run_with_its_name(
     tmp_path: Path, endless: str, kind: str, status: int, processes: str
 ) -> None:
-    words = [*command(tmp_path, endless), "--set", "run.stall_timeout_s=1", "--processes", processes]
+    words = [*command(tmp_path, endless), "--set", "run.stall_timeout_s=0.3", "--processes", processes]
     done = run(words, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
     assert done.returncode == status, done.stderr
     assert "v02" in {event["node"] for event in events(tmp_path / "run") if event["kind"] == kind}
@@ -71,7 +71,7 @@ def test_a_program_that_stalls_ends_the_run_with_its_name(
 
 @pytest.mark.parametrize("end", ["while True: pass", FAULT])
 def test_what_ends_the_process_after_the_run_is_a_death_then_and_no_earlier(tmp_path: Path, end: str) -> None:
-    words = [*command(tmp_path, "pass"), "--set", "run.stall_timeout_s=1"]
+    words = [*command(tmp_path, "pass"), "--set", "run.stall_timeout_s=0.3"]
     program = PROGRAM.replace("END", "pass")
     ending = f"    finally:\n        if node.id == 'v02':\n            {end}\n"
     program = program.replace("    async for", "    try:\n     async for") + ending

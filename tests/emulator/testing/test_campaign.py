@@ -204,10 +204,10 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
 
 def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path, pytester: pytest.Pytester) -> None:
     folder = tmp_path / "campaign"
-    plan = Plan.of(planted("stubborn"), "kill", 1, seed=1, limit_s=2.0, shrink_steps=0)
+    plan = Plan.of(planted("stubborn"), "kill", 1, seed=1, limit_s=1.0, shrink_steps=0)
     assert run(plan, folder)[0] == 1
     (row,) = results_of(folder)
-    assert row["failed"] == {"hung": "not over within 2 s of wall clock; logs/stacks.txt says where it stood"}
+    assert row["failed"] == {"hung": "not over within 1 s of wall clock; logs/stacks.txt says where it stood"}
     assert load_scenario(Path(row["folder"]) / "scenario.toml").fault
     assert "hung" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)
 
