@@ -11,8 +11,8 @@ from rich.console import Console
 from emulator.drivers.session import Session
 from emulator.drivers.status import Course, Snapshot
 from emulator.scenario.loading import load_scenario
-from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.live import EVERY_S, LivePicture
+from emulator.terminal.progress import Dashboard
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "faults.toml"
 OVERRIDES = ["network.vehicles=50", "program.entry=agents.beacon:main"]

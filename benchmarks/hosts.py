@@ -25,7 +25,7 @@ from benchmarks.__main__ import ROOT, vnet
 HOSTS = ("a", "b", "c")
 ONE_WAY_S = 0.001
 CHUNK_BYTES = 2**20
-VNET = [sys.executable, "-P", "-m", "emulator.cli"]
+VNET = [sys.executable, "-P", "-m", "emulator"]
 
 
 class Forwarder(threading.Thread):

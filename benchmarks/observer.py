@@ -23,7 +23,7 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.session import Session
 from emulator.records.run_folder import RECORDING
 from emulator.scenario.scenario import Scenario
-from emulator.viewer.overview_scene import DrawnReference
+from emulator.viewer.scenes import DrawnReference
 from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, Access
 from vnet.transport.session import open_router, router_endpoint
@@ -47,7 +47,7 @@ def measure(vehicles: int = 50, duration_s: float = 35.0) -> dict[str, float]:
         credentials.write_text(access.credentials(OBSERVER).dumps())
         with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as session:
             endpoint = router_endpoint(session)
-            command = [sys.executable, "-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", RUN]
+            command = [sys.executable, "-P", "-m", "emulator", "record", "--connect", endpoint, "--run", RUN]
             command += ["--credentials", str(credentials), "--out", str(folder / RECORDING), "--rerun", "serve"]
             single = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
             with _awake(), subprocess.Popen(command, cwd=ROOT, env={**os.environ, **single}) as observer:

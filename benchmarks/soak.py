@@ -104,7 +104,7 @@ def main() -> None:
     path.write_text(dump_scenario(make_scenario(arguments.minutes, arguments.seed)))
     run = arguments.out / f"run-{arguments.seed}"
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "emulator.cli", "run", str(path), "--out", str(run), "--no-report"],
+        [sys.executable, "-P", "-m", "emulator", "run", str(path), "--out", str(run), "--no-report"],
         check=False,
     )
     if (run / "verdict.json").exists():

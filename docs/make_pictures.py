@@ -82,7 +82,7 @@ def main() -> None:
 
 def simulate(folder: Path) -> Path:
     """A run with a recording."""
-    command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", str(SCENARIO), "--out", str(folder)]
+    command = [sys.executable, "-P", "-m", "emulator", "simulate", str(SCENARIO), "--out", str(folder)]
     subprocess.run([*command, "--rerun", "save", "--rerun-vehicle", VEHICLE], check=True, stdout=subprocess.DEVNULL)
     return folder
 
@@ -107,7 +107,7 @@ def native_pictures(recording: Path, scratch: Path, out: Path) -> None:
 def web_picture(run: Path, out: Path) -> None:
     """The web viewer, as vnet view serves it."""
     place = place_to_serve()
-    command = [sys.executable, "-P", "-m", "emulator.cli", "view", str(run), "--serve"]
+    command = [sys.executable, "-P", "-m", "emulator", "view", str(run), "--serve"]
     with running([*command, "--rerun-port", str(place.port)]), Browser() as browser:
         until(lambda: urllib.request.urlopen(place.web_url).read())
         browser.look(place.web_url, DESK, dark=True)

@@ -6,11 +6,11 @@ import pytest
 import typer.main
 import yaml
 
-import emulator.cli.commands
 from emulator.cli.access import create_access
 from emulator.cli.options import host_names
 from emulator.scenario.loading import load_scenario
 from emulator.world.world import build_world
+from tests.support.command_line import app
 from tests.support.paths import ROOT
 from vnet.transport.access import OBSERVER, host_user
 
@@ -25,7 +25,7 @@ def options(service: str) -> dict[str, object]:
     """The parameters that a service's command line parses into."""
     program, *arguments = shlex.split(SERVICES[service]["command"])
     assert program == "vnet"
-    command = typer.main.get_command(emulator.cli.commands.app)
+    command = typer.main.get_command(app)
     context = command.make_context(program, arguments, resilient_parsing=False)
     assert isinstance(command, typer.core.TyperGroup)
     name, chosen, rest = command.resolve_command(context, [*context._protected_args, *context.args])

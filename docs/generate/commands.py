@@ -12,10 +12,10 @@ import typer
 import typer.main
 
 import agents.cli
-import emulator.cli.commands
 from docs.generate.markdown import page as whole_page
 from docs.generate.markdown import table
 from emulator.checks.judge import Verdict
+from emulator.cli.application import build_app
 
 INTRODUCTION = """
 `vnet` runs scenarios and judges runs. `vnet-agent` is one process with vehicles; `vnet run` starts these processes
@@ -41,7 +41,7 @@ CHAPTERS = {
     "Networks and maps": ("analyze", "map"),
 }
 """Commands of `vnet` by chapter. `vnet experiment` is not vnet's own: `studies/` registers it."""
-PROGRAMS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
+PROGRAMS = {"vnet": build_app(), "vnet-agent": agents.cli.app}
 Command = Any
 """A command of typer's; typer brings a click of its own, whose classes it does not export."""
 

@@ -12,8 +12,7 @@ from docs.generate.keys import HEADER, key_docstrings, key_rows, option_table, s
 from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.program import ProgramException, RoadsideUnit
-from emulator.scenario.scenario import Scenario
-from emulator.scenario.world import OwnSensor
+from emulator.scenario.scenario import OwnSensor, Scenario
 
 INTRODUCTION = """
 A scenario is a TOML file. Every key has a default, so an empty file is a run; an unknown key is refused.

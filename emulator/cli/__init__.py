@@ -30,7 +30,7 @@ def main() -> None:
     if command is not None and (problem := too_little_address_space(command.needed_mb)):
         sys.exit(_refuse(problem))
     if command is not None and command.runs_programs:
-        fix_hash_seed("emulator.cli")  # before any import that takes long, because it starts this process again
+        fix_hash_seed("emulator")  # before any import that takes long, because it starts this process again
     from emulator.cli.application import build_app
     from emulator.cli.own_child import leave, this_process_is_a_command
     from emulator.terminal import console

@@ -18,8 +18,8 @@ from emulator.drivers.control import ask
 from emulator.drivers.status import Snapshot
 from emulator.scenario.faults import KINDS, OwnRule, parse_fault
 from emulator.terminal.console import one_line_errors
-from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.live import LivePicture, SafeConsole, terminal
+from emulator.terminal.progress import Dashboard
 from vnet.errors import ScenarioError, VnetError, first_names
 
 app = group("Inject faults into a running emulator, and heal them.")

@@ -32,7 +32,7 @@ MOST_LIVE = 100
 LAYOUTS, PORTABLE = "layouts", "portable"
 """Comparisons: of layouts of processes and addresses, and beyond them with another hash seed."""
 OTHER_HASH_SEED = "1"
-_MODULE = ("-m", "emulator.cli")
+_MODULE = ("-m", "emulator")
 _AS_IT_IS = (
     "-c",
     "import sys; from emulator.cli.application import build_app; from emulator.terminal.console import run_app; "

@@ -29,9 +29,8 @@ from pydantic import ValidationError
 from emulator.scenario.faults import DEFAULT_RULE, RENAMED_SELECTORS, Fault, OwnRule
 from emulator.scenario.network import LIBSUMO, input_files, libsumo_build
 from emulator.scenario.program import Program, from_here, split_file, with_programs
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.scenario import Scenario, WorldSection
 from emulator.scenario.sections import first_problem
-from emulator.scenario.world import WorldSection
 from vnet.bounded import read_bounded
 from vnet.errors import OverrideError, ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.runtime.own_packages import OWN

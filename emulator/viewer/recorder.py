@@ -20,10 +20,8 @@ import rerun.blueprint as rrb
 
 from emulator.records.period_figures import NO_VIEWS, Estimate, Views, views_of
 from emulator.viewer.drawing import POSITION, TIMELINE, Canvas, PeriodArrays
-from emulator.viewer.overview_scene import OverviewScene
-from emulator.viewer.radio_scene import WINDOW_S, RadioScene
+from emulator.viewer.scenes import WINDOW_S, OverviewScene, ProgramScene, RadioScene, VehicleScene, entity, titled
 from emulator.viewer.sinks import Sinks, open_recording, written
-from emulator.viewer.vehicle_scene import ProgramScene, VehicleScene, entity, titled
 from vnet.errors import VnetError, first_names
 
 T = TypeVar("T")

@@ -20,7 +20,7 @@ from emulator.scenario import own_functions
 from emulator.scenario.own_functions import NonsenseError, load_function
 from emulator.scenario.program import Program
 from emulator.scenario.random_streams import frame_stream
-from emulator.scenario.world import OwnSensor
+from emulator.scenario.scenario import OwnSensor
 from vnet.errors import shown
 from vnet.runtime.programs import search_programs_in
 from vnet.types import Array, Mask

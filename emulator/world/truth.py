@@ -20,9 +20,8 @@ from emulator.fault_plan import PlannedFault, fault_stream
 from emulator.scenario.faults import Drift, GnssFault, GnssFreeze, GnssOutage, RandomPos, Skew
 from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.random_streams import stream
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.scenario import Gnss, Scenario
 from emulator.scenario.sections import WILD_M
-from emulator.scenario.world import Gnss
 from emulator.world.input_files import open_csv
 from emulator.world.own_sensors import OwnSensors, Reading, SensedTruth
 from emulator.world.projection import CoordinateFrame

@@ -18,12 +18,12 @@ from typing import Any
 import typer.main
 
 import agents.cli
-import emulator.cli.commands
 from tests.support import forked_commands
+from tests.support.command_line import app
 from tests.support.forked_commands import MODULE, VNET
 from tests.support.paths import ROOT
 
-APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
+APPS = {"vnet": app, "vnet-agent": agents.cli.app}
 HERE = (
     "simulate",
     "check",
@@ -47,7 +47,7 @@ APART = (
 """Commands of vnet that are run in a process of their own."""
 PYTHON = {"python": [], "pytest": ["-m", "pytest"]}
 """Run by this Python, with these arguments first."""
-MODULES = {"vnet": "emulator.cli", "vnet-agent": "agents.cli"}
+MODULES = {"vnet": "emulator", "vnet-agent": "agents.cli"}
 ONLY_PARSED = {
     r"--debug ": "asks its user; tests/system/test_debugging.py has one",
     r"--rerun spawn": "opens a window",

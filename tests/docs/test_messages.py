@@ -22,9 +22,8 @@ from vnet.errors import WireError
 from vnet.node import Action
 from vnet.radio import SentFrame, UnitAbilities
 from vnet.reports import Report
-from vnet.transport import backbone_keys, keys, wire
-from vnet.transport.backbone_keys import Arrived, Sent
-from vnet.transport.wire import Deviation, MessageRef, Order, WireSendResult
+from vnet.transport import keys, wire
+from vnet.transport.wire import Arrived, Deviation, MessageRef, Order, Sent, WireSendResult
 
 PAGE = Layouts()
 OF_AGENTS = {kind.__name__: kind for kind in (wire.Hello, wire.Yield, wire.Frames, wire.Final, wire.StackDump)}
@@ -35,8 +34,8 @@ ON_THE_BACKBONE = {"Sent": Sent, "Arrived": Arrived}
 DECODERS = {
     **dict.fromkeys(OF_AGENTS, wire.decode_tx),
     **dict.fromkeys(OF_THE_EMULATOR, wire.decode_rx),
-    "Sent": backbone_keys.decode_sent,
-    "Arrived": backbone_keys.decode_arrived,
+    "Sent": wire.decode_sent,
+    "Arrived": wire.decode_arrived,
 }
 PARTS = {
     "Step": wire.Step,

@@ -187,9 +187,7 @@ def test_a_process_that_is_not_fit_has_a_worker_run_the_program(tmp_path: Path) 
         "--no-report",
         "--quiet",
     ]
-    subprocess.run(
-        [sys.executable, "-m", "emulator.cli", *command], check=True, cwd=ROOT, stdout=subprocess.DEVNULL
-    )
+    subprocess.run([sys.executable, "-m", "emulator", *command], check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
     there = emulator.Run.open(tmp_path / "command")
     assert here.trace.equals(there.trace)
     assert [each.reason for each in here.not_applicable if each.name == "replay"] == [

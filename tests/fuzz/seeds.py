@@ -15,7 +15,7 @@ from tests.support import maps
 from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire
-from vnet.transport.backbone_keys import Sent
+from vnet.transport.wire import Sent
 
 OVERRIDE = b"\n--set "
 """Separator between a scenario file and each override in one input of the scenario target."""

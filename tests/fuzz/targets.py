@@ -74,7 +74,7 @@ from tests.fuzz.seeds import (
 )
 from vnet.errors import LONGEST_MESSAGE, ScenarioError, TransportError, VnetError, WireError
 from vnet.roads.road_map import RoadMap
-from vnet.transport import backbone_keys, wire
+from vnet.transport import wire
 from vnet.transport.access import Access
 from vnet.transport.credentials import Credentials
 from vnet.types import Mask
@@ -115,8 +115,8 @@ def _read_host_tx(data: bytes) -> None:
 
 
 def _read_unit_tx(data: bytes) -> None:
-    sent = backbone_keys.decode_sent(data)
-    assert backbone_keys.decode_sent(backbone_keys.encode(sent)) == sent
+    sent = wire.decode_sent(data)
+    assert wire.decode_sent(wire.encode(sent)) == sent
     sent.message("rsu01")
 
 
@@ -314,6 +314,6 @@ TARGETS = (  # the slowest first
     Target("report", _read_report, WireError, (wire.encode(TRAFFIC.reports[0]),), MSGPACK_WORDS),
     Target("tx", _read_tx, WireError, tuple(map(wire.encode, TX)), MSGPACK_WORDS),
     Target("host tx", _read_host_tx, WireError, tuple(map(messages.encode, HOST_TX)), MSGPACK_WORDS),
-    Target("unit tx", _read_unit_tx, WireError, (backbone_keys.encode(UNIT_SENT),), MSGPACK_WORDS),
+    Target("unit tx", _read_unit_tx, WireError, (wire.encode(UNIT_SENT),), MSGPACK_WORDS),
     Target("rx", _read_rx, WireError, tuple(map(wire.encode, RX)), MSGPACK_WORDS),
 )

@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from studies import city
 from tests.emulator.world.maps.test_city_map import driving
 from tests.support.cells import compute_here
+from tests.support.command_line import app
 
 pytestmark = pytest.mark.slow
 

@@ -10,10 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cells import cells as cells_module
-from emulator.cli.commands import app
 from emulator.records.metrics import anees_band
 from studies import divergence, paper
 from studies.paper import PAPER_VEHICLES
+from tests.support.command_line import app
 
 pytestmark = pytest.mark.slow
 

@@ -27,7 +27,7 @@ def main(folder: Path) -> None:
     from emulator.report.write import write_report
     from emulator.scenario.loading import load_scenario
     from emulator.stream import event_message
-    from emulator.viewer.overview_scene import OverviewScene
+    from emulator.viewer.scenes import OverviewScene
 
     session = Session(load_scenario(ROOT / "scenarios" / "beacon.toml", ["run.duration_s=1"]), folder).open()
     session.run()

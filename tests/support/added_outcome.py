@@ -62,7 +62,7 @@ def legend(vehicles: int) -> list[str]:
     """The names in the legend of a recording's map."""
     from emulator.scenario.loading import dump_scenario
     from emulator.scenario.scenario import Scenario
-    from emulator.viewer.overview_scene import draw_legend
+    from emulator.viewer.scenes import draw_legend
 
     canvas = Mock()
     names = [f"v{number}" for number in range(vehicles)]
@@ -76,11 +76,11 @@ def main(folder: Path) -> None:
 
     from docs.generate.files import page
     from emulator.checks.channel import IN_TRACE
-    from emulator.cli.commands import app
     from emulator.radio.outcomes import Outcome
     from emulator.records.recorded_run import ON_AIR
     from emulator.viewer.drawing import outcome_colours
     from tests.emulator.terminal.test_dashboard import make, rows
+    from tests.support.command_line import app
 
     scenario = str(ROOT / "scenarios" / "beacon.toml")
     arguments = ["simulate", scenario, "--duration", "2", "--out", str(folder)]

@@ -9,7 +9,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from emulator.checks.judge import check_run
-from emulator.cli.commands import app
 from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
@@ -18,6 +17,7 @@ from emulator.report.comparison import Comparison, print_comparison
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from emulator.stream import messages
+from tests.support.command_line import app
 from tests.support.recordings import Entity, read_back
 
 READERS = ("check", "report", "play", "compare", "pcapng", "mcap", "csv", "radio")

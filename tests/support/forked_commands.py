@@ -28,7 +28,7 @@ from vnet.runtime.environment import use_same_arithmetic
 from vnet.runtime.outside_loop import end_forked
 
 PYTHON = [sys.executable, "-P", "-m"]
-VNET = [*PYTHON, "emulator.cli"]
+VNET = [*PYTHON, "emulator"]
 MODULE = [*PYTHON, "runpy"]
 WORKER = "emulator.cells.worker"
 CHECK = "agents.program_check"
@@ -227,7 +227,6 @@ if __name__ == "__main__":
     import agents.program_check
     import emulator.cells.sweep
     import emulator.cli
-    import emulator.cli.commands
     import emulator.cli.execution
     import emulator.drivers.live.processes
     import emulator.pages.canvas

@@ -18,6 +18,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from agents.host import RunAhead
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.lockstep import Lockstep, run_in_lockstep
@@ -26,14 +27,12 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from vnet.runtime.ahead import RunAhead
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.host import Disks, Host
 from vnet.runtime.programs import load_programs
 from vnet.runtime.virtual_time import VirtualTimeLoop
-from vnet.transport import backbone_keys, wire
-from vnet.transport.backbone_keys import Contents
-from vnet.transport.wire import SentMessage, WireMessage
+from vnet.transport import wire
+from vnet.transport.wire import Contents, SentMessage, WireMessage
 
 _folders = TemporaryDirectory(prefix="vnet-apart-")
 atexit.register(_folders.cleanup)
@@ -158,16 +157,16 @@ class _Process:
         units = [unit for unit, _ in self._sent]
         sent: Contents[SentMessage] = Contents()
         for unit, content in zip(units, message[1:], strict=True):
-            sent.add(backbone_keys.decode_sent(content).message(unit))
+            sent.add(wire.decode_sent(content).message(unit))
         decoded = wire.decode_tx(message[0])
         assert isinstance(decoded, wire.Yield)
-        return backbone_keys.join_yield(decoded, sent)
+        return wire.join_yield(decoded, sent)
 
     def put_grant(self, grant: wire.Grant) -> None:
         """Have the process take a grant, with the messages of its units beside it."""
-        split, contents = backbone_keys.split_grant(grant)
+        split, contents = wire.split_grant(grant)
         self._arrived = [unit for unit, _ in contents]
-        self.grants.put([wire.encode(split), *(backbone_keys.encode(content) for _, content in contents)])
+        self.grants.put([wire.encode(split), *(wire.encode(content) for _, content in contents)])
 
     def end(self, killed: bool) -> list[wire.Traffic]:
         """End it from the emulator's side, and wait until it has; returns what it said last, if it could."""
@@ -192,15 +191,15 @@ class _Process:
         assert isinstance(grant, wire.Grant)
         arrived: Contents[WireMessage] = Contents()
         for unit, content in zip(self._arrived, item[1:], strict=True):
-            arrived.add(backbone_keys.decode_arrived(content).message(unit))
+            arrived.add(wire.decode_arrived(content).message(unit))
         grant = replace(grant, messages=arrived.split(grant.messages)[0])
         self._seq = grant.seq
         self._host.apply_clock_error(grant.clocks, self._loop)
         return self._ahead.open_window(grant)
 
     def _swap(self, next_timer_ns: int | None) -> int:
-        message, self._sent = backbone_keys.split_yield(self._host.make_yield(b"n", self._seq, next_timer_ns))
-        self.yields.put([wire.encode(message), *(backbone_keys.encode(content) for _, content in self._sent)])
+        message, self._sent = wire.split_yield(self._host.make_yield(b"n", self._seq, next_timer_ns))
+        self.yields.put([wire.encode(message), *(wire.encode(content) for _, content in self._sent)])
         return self._next_grant()
 
     def _host_programs(self) -> None:

@@ -15,9 +15,9 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.cli.commands import app
 from emulator.terminal.console import run_app
 from tests.support import forked_commands, processes
+from tests.support.command_line import app
 from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
 from tests.support.processes import wait_until

@@ -12,7 +12,7 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-VNET = shlex.join([sys.executable, "-P", "-m", "emulator.cli"])
+VNET = shlex.join([sys.executable, "-P", "-m", "emulator"])
 OPTIONS = "--quiet --no-report"
 FEW = "--set program.options.particles=20"
 

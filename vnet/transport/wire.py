@@ -5,18 +5,21 @@
 `WireError`. All times are integer nanoseconds from the start of the run.
 
 Within a process a yield or a grant holds the messages of the backbone themselves. On Zenoh it holds references, and
-the messages are on keys of the units' own (`vnet/transport/backbone_keys.py`).
+the messages are on keys of the units' own (`Sent`, `Arrived`). Whoever says something to the other end puts the
+messages of units on their keys first, and references to them in what it says. The other end resolves the
+references, whatever comes first: nothing depends on an order between keys.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from vnet.errors import WireError, printable
 from vnet.node import NOTHING_SENSED, Action, Fix, Reading
@@ -503,7 +506,7 @@ _emulator_decoder: msgspec.msgpack.Decoder[EmulatorMessage] = msgspec.msgpack.De
 _report_decoder: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Report)
 
 
-def encode(message: AgentMessage | EmulatorMessage | Report) -> bytes:
+def encode(message: AgentMessage | EmulatorMessage | Report | Sent | Arrived) -> bytes:
     """Encode a message."""
     return _encoder.encode(message)
 
@@ -580,3 +583,135 @@ def boot_id() -> str:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
         return ""
+
+
+# Messages of the backbone on keys of the units' own.
+
+
+class Sent(Message, frozen=True):
+    """A message that a unit sends, on its `tx`; `nonce` is that of its process."""
+
+    nonce: bytes
+    number: Count
+    to: str | None
+    payload: bytes
+
+    def message(self, unit: str) -> SentMessage:
+        """Return the message, as what `unit` has put."""
+        return SentMessage(unit, self.number, self.to, self.payload)
+
+
+class Arrived(Message, frozen=True):
+    """A message for a unit, on its `rx`."""
+
+    number: Count
+    sender: str
+    sent_ns: TimeNs
+    time_ns: TimeNs
+    payload: bytes
+
+    def message(self, unit: str) -> WireMessage:
+        """Return the message, as what came for `unit`."""
+        return WireMessage(unit, self.number, self.sender, self.sent_ns, self.time_ns, self.payload)
+
+
+_sent_decoder: msgspec.msgpack.Decoder[Sent] = msgspec.msgpack.Decoder(Sent)
+_arrived_decoder: msgspec.msgpack.Decoder[Arrived] = msgspec.msgpack.Decoder(Arrived)
+
+
+def decode_sent(data: bytes) -> Sent:
+    """Decode what is on a unit's `tx`. Raise WireError for a bad one, or one above `LARGEST_MESSAGE_BYTES`."""
+    check_size(data)
+    return decode(_sent_decoder, data)
+
+
+def decode_arrived(data: bytes) -> Arrived:
+    """Decode what is on a unit's `rx`. Raise WireError for a bad one."""
+    return decode(_arrived_decoder, data)
+
+
+# Splitting, before a message is put.
+
+
+def _split(traffic: Traffic, nonce: bytes) -> tuple[Traffic, list[tuple[str, Sent]]]:
+    """Return traffic with references in the place of its messages, and these."""
+    contents = [
+        (each.node, Sent(nonce, each.number, each.to, each.payload)) for each in sent_in_full(traffic.messages)
+    ]
+    return replace(traffic, messages=_refs(traffic.messages)), contents
+
+
+def split_yield(message: Yield) -> tuple[Yield, list[tuple[str, Sent]]]:
+    """Return a yield with references in the place of its messages, and what its units are to put on their `tx`."""
+    parts = [_split(step.traffic, message.nonce) for step in message.steps]
+    steps = [replace(step, traffic=part) for step, (part, _) in zip(message.steps, parts, strict=True)]
+    return replace(message, steps=steps), [content for _, contents in parts for content in contents]
+
+
+def split_frames(message: Frames) -> tuple[Frames, list[tuple[str, Sent]]]:
+    """Return frames with references in the place of their messages, as `split_yield` does."""
+    traffic, contents = _split(message.traffic, message.nonce)
+    return replace(message, traffic=traffic), contents
+
+
+def split_grant(message: Grant | Batch) -> tuple[Grant | Batch, list[tuple[str, Arrived]]]:
+    """Return a grant or a batch with references to its messages, and what is to be put on its units' `rx`."""
+    contents = [
+        (each.node, Arrived(each.number, each.sender, each.sent_ns, each.time_ns, each.payload))
+        for each in arrived_in_full(message.messages)
+    ]
+    return replace(message, messages=_refs(message.messages)), contents
+
+
+def _refs(messages: Sequence[MessageRef]) -> list[MessageRef]:
+    return [MessageRef(each.node, each.number) for each in messages]
+
+
+# Joining, at the other end.
+
+_R = TypeVar("_R", bound=MessageRef)
+
+
+class Contents(Generic[_R]):
+    """Messages that have come on units' keys and to which nothing has referred yet."""
+
+    def __init__(self) -> None:
+        self._messages: dict[tuple[str, int], _R] = {}
+
+    def add(self, message: _R) -> None:
+        """Add a message."""
+        self._messages[message.node, message.number] = message
+
+    def split(self, refs: Sequence[MessageRef]) -> tuple[list[_R], list[MessageRef]]:
+        """Remove and return the messages that have come of these; second, the references to those that have not."""
+        found, missing = [], []
+        for ref in refs:
+            message = self._messages.pop((ref.node, ref.number), None)
+            if message is None:
+                missing.append(ref)
+            else:
+                found.append(message)
+        return found, missing
+
+    def missing(self, refs: Sequence[MessageRef]) -> list[MessageRef]:
+        """Return the references to messages that have not come."""
+        return [ref for ref in refs if (ref.node, ref.number) not in self._messages]
+
+    def drop(self, units: Collection[str]) -> None:
+        """Forget the messages of these units."""
+        self._messages = {key: each for key, each in self._messages.items() if key[0] not in units}
+
+
+def refs_of(message: Yield) -> list[MessageRef]:
+    """Return all references of a yield, in order."""
+    return [ref for step in message.steps for ref in step.traffic.messages]
+
+
+def join_yield(message: Yield, sent: Contents[SentMessage]) -> Yield:
+    """Return a yield with messages that have come in the place of its references: the reverse of `split_yield`."""
+    messages = [sent.split(step.traffic.messages)[0] for step in message.steps]
+    steps = [
+        replace(step, traffic=replace(step.traffic, messages=own))
+        for step, own in zip(message.steps, messages, strict=True)
+    ]
+    return replace(message, steps=steps)

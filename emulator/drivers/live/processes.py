@@ -34,10 +34,9 @@ from emulator.viewer.sinks import Sinks
 from vnet.errors import ProgramError, TransportError, VnetError, WireError, counted, first_names
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
-from vnet.transport import backbone_keys, keys, wire
+from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, host_user
-from vnet.transport.backbone_keys import Contents, refs_of
-from vnet.transport.wire import MessageRef, SentMessage
+from vnet.transport.wire import Contents, MessageRef, SentMessage, refs_of
 
 LEASE_MS = 60_000
 """Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
@@ -235,7 +234,7 @@ class LiveProcesses(Processes):
 
     def _take_backbone(self, unit: str, payload: bytes) -> None:
         try:
-            sent = backbone_keys.decode_sent(payload)
+            sent = wire.decode_sent(payload)
             if not self.members.is_of(unit, sent.nonce):
                 raise ProtocolError("a message without the nonce of its process")
             self._take_sent(sent.message(unit))
@@ -363,7 +362,7 @@ class LiveProcesses(Processes):
         """Start the hosts that are processes of this machine."""
         access = self._options.access
         for host in access.hosts if self._options.start_hosts else ():
-            arguments = ["-P", "-m", "emulator.cli", "host", "--connect", endpoint, "--run", access.run]
+            arguments = ["-P", "-m", "emulator", "host", "--connect", endpoint, "--run", access.run]
             for folder in self._emulation.scenario.program.folders:
                 arguments += ["--path", str(folder)]
             self._launcher.start(
@@ -371,7 +370,7 @@ class LiveProcesses(Processes):
             )
 
     def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
-        arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._options.access.run]
+        arguments = ["-P", "-m", "emulator", "record", "--connect", endpoint, "--run", self._options.access.run]
         arguments += ["--out", str(sinks.save), *sinks.arguments]
         credentials = self._options.access.credentials(OBSERVER)
         self._launcher.start(RECORDER, arguments, credentials, {}, own_session=True)
@@ -399,9 +398,9 @@ class LiveProcesses(Processes):
         """Say something to a node, having put the messages of units in it on their keys."""
         way = self.gateways or self.fleet or self.attachment
         if isinstance(message, wire.Grant | wire.Batch) and message.messages:
-            message, contents = backbone_keys.split_grant(message)
+            message, contents = wire.split_grant(message)
             for unit, content in contents:
-                way.send_content(unit, backbone_keys.encode(content))
+                way.send_content(unit, wire.encode(content))
         way.send(node, message)
 
     async def receive(self, timeout_s: float = math.inf) -> Heard | None:
@@ -443,7 +442,7 @@ class LiveProcesses(Processes):
             if self._sent.missing(refs):
                 self._incomplete[process_id] = message
                 return
-            message = backbone_keys.join_yield(message, self._sent)
+            message = wire.join_yield(message, self._sent)
         del self._granted[process_id]
         self._heard.append(Heard(process_id, message))
         if not self._granted:

@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 import emulator
 from emulator.checks.judge import judge
 from emulator.checks.own import own_findings
-from emulator.cli.commands import app
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
@@ -22,6 +21,7 @@ from emulator.report.write import write_report
 from emulator.scenario.program import Program
 from tests.emulator.checks.test_judge import run as simulate_in
 from tests.support.answers import answers
+from tests.support.command_line import app
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow

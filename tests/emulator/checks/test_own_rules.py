@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.checks.judge import Verdict, check_run, judge
-from emulator.cli.commands import app
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.loading import load_scenario, recorded_code
 from emulator.scenario.scenario import Scenario
@@ -20,6 +19,7 @@ from emulator.testing.harness import RunHarness
 from emulator.testing.scenarios import make_scenario
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support import rules
+from tests.support.command_line import app
 from vnet.errors import ScenarioError
 
 pytestmark = pytest.mark.slow

@@ -12,14 +12,14 @@ import typer
 import typer.main
 
 from docs.generate.commands import contexts
-from emulator.cli import commands
 from emulator.cli.application import build_app
 from emulator.cli.table import COMMANDS, find
 from emulator.learning.environment import environment
 from emulator.terminal.console import run_app
+from tests.support.command_line import app
 from tests.support.paths import ROOT
 
-ALL = {context.command_path: context.command for context in contexts("vnet", typer.main.get_command(commands.app))}
+ALL = {context.command_path: context.command for context in contexts("vnet", typer.main.get_command(app))}
 SLOW_TO_IMPORT = [
     "numpy",
     "scipy",

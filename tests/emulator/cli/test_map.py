@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.world.maps.files import read_roads
 from emulator.world.maps.problems import examine
 from emulator.world.maps.roads import RoadsBuilder
 from tests.support import maps
+from tests.support.command_line import app
 
 
 @pytest.fixture

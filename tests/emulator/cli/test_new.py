@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.cli.new import examples
 from emulator.scenario.loading import load_scenario
+from tests.support.command_line import app
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from emulator.cli import options
-from emulator.cli.commands import app
 from emulator.terminal.console import run_app
 from tests.support import maps
+from tests.support.command_line import app
 from tests.support.paths import ROOT
 from tests.support.recorded import recorded
 

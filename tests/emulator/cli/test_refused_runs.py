@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
+from tests.support.command_line import app
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow

@@ -8,13 +8,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.cli.commands import app
 from emulator.drivers.conclude import conclude
 from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.recorded_run import RecordedRun
 from emulator.terminal.console import run_app
+from tests.support.command_line import app
 from tests.support.multi_loop_driver import run_together, scenario_of
 from vnet.node import Node
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
 from tests.emulator.test_playback import Watched, watch
+from tests.support.command_line import app
 
 pytestmark = pytest.mark.slow
 

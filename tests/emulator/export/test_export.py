@@ -13,7 +13,6 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.export.mcap_file import SCHEMAS, write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import measured_links, write_csv
@@ -21,6 +20,7 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
 from emulator.world.radio_inputs import read_link_table
 from tests.emulator.checks.test_judge import run_scenario
+from tests.support.command_line import app
 from tests.support.exchange_programs import COPYING, exchange_run
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 

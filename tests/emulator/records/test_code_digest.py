@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.records.code_digest import changed_code, digests_of, entries_of, program_digest, vnet_digest
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Scenario
+from tests.support.command_line import app
 
 MAIN = """
 import json, numpy

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from emulator.api import simulate_into
-from emulator.cli.commands import app
 from emulator.records.parting import (
     FRAME,
     RECEPTION,
@@ -28,6 +27,7 @@ from emulator.records.parting import (
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.tables import TRACE
 from emulator.scenario.scenario import Scenario
+from tests.support.command_line import app
 
 
 def simulated(folder: Path, **sections: Any) -> OpenedRun:

@@ -28,7 +28,7 @@ from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.stream import messages, pack
 from emulator.terminal import summary
-from emulator.terminal.dashboard import Dashboard
+from emulator.terminal.progress import Dashboard
 from emulator.viewer.drawing import PeriodArrays
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks

@@ -13,12 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cli import folders as report_cli
-from emulator.cli.commands import app
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.index import write_index
 from emulator.report.write import key_figures, write_report
+from tests.support.command_line import app
 from tests.support.forked_commands import NO_CHARTS
 from tests.support.paths import ROOT
 from vnet.errors import VnetError

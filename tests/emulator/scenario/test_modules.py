@@ -11,12 +11,12 @@ from zipfile import ZipFile
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
+from tests.support.command_line import app
 from vnet.errors import ProgramError
 from vnet.runtime.programs import load_program, search_programs_in
 

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.records.events import Event
-from emulator.terminal.dashboard import Dashboard
+from emulator.terminal.progress import Dashboard
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
 FAULTS = (

@@ -19,9 +19,9 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.live import MOST_WAITING, LivePicture, SafeConsole
+from tests.support.command_line import app
 from tests.support.recorded import recorded
 from tests.support.screen import Screen
 

@@ -67,7 +67,7 @@ def test_a_simulation_in_json_is_one_object(tmp_path: Path) -> None:
     command = ["simulate", scenario, "--program", "talkative:main", "--duration", "0.5", "--out", "run"]
     command += ["--log-format", "json", "--no-report", "--set", "network.vehicles=2"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    words = [sys.executable, "-P", "-m", "emulator.cli", *command]
+    words = [sys.executable, "-P", "-m", "emulator", *command]
     done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert json.loads(done.stdout)["vehicles"] == 2, done.stderr
     assert done.stdout.count("\n") == 1

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.terminal.summary import as_typed
+from tests.support.command_line import app
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from emulator.viewer.drawing import (
     ellipses,
     link_states,
 )
-from emulator.viewer.radio_scene import STROKES
 from emulator.viewer.recorder import Recorder
+from emulator.viewer.scenes import STROKES
 from emulator.viewer.sinks import Sinks, is_closed
 from tests.support.recorded import prepared
 from tests.support.recordings import Entity, read_back, rrd

@@ -9,7 +9,7 @@ import pytest
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.scenario.scenario import Scenario
-from emulator.viewer.overview_scene import DrawnReference
+from emulator.viewer.scenes import DrawnReference
 from tests.support.recorded import prepared
 from vnet.node import Node
 

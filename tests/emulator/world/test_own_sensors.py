@@ -12,7 +12,7 @@ from emulator import SensedTruth
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.program import Program
-from emulator.scenario.world import OwnSensor
+from emulator.scenario.scenario import OwnSensor
 from emulator.world.own_sensors import OwnSensors
 from tests.support.answers import answers
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of

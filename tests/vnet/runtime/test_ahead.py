@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from agents.host import RunAhead, Swap
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet import Node
-from vnet.runtime.ahead import RunAhead, Swap
 from vnet.runtime.host import Host
 from vnet.runtime.programs import Program
 from vnet.runtime.virtual_time import VirtualTimeLoop

@@ -53,7 +53,7 @@ class Spy(MetaPathFinder):
 sys.meta_path.insert(0, Spy())
 """
 ENTRY_POINTS = {
-    "vnet": ["-m", "emulator.cli", "simulate", "scenarios/beacon.toml"],
+    "vnet": ["-m", "emulator", "simulate", "scenarios/beacon.toml"],
     "vnet-agent": ["-m", "agents.cli", "--connect", "tcp/127.0.0.1:1", "--run", "r", "--node", "v01"],
 }
 

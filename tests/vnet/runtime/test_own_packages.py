@@ -92,7 +92,7 @@ def test_a_file_that_is_found_in_place_of_vnet_s_own_package(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("package", "arguments"),
     [
-        ("emulator", ["-m", "emulator.cli", "simulate", "beacon.toml"]),
+        ("emulator", ["-m", "emulator", "simulate", "beacon.toml"]),
         ("agents", ["-m", "agents.cli", "--connect", "tcp/127.0.0.1:1", "--run", "r", "--node", "v01"]),
     ],
 )

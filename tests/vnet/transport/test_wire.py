@@ -10,8 +10,7 @@ from vnet.node import Action, Fix
 from vnet.radio import SentFrame
 from vnet.reports import Report
 from vnet.transport import wire
-from vnet.transport.backbone_keys import Arrived, Sent
-from vnet.transport.wire import Deviation, MessageRef, WireSendResult
+from vnet.transport.wire import Arrived, Deviation, MessageRef, Sent, WireSendResult
 
 times = st.integers(min_value=0, max_value=2**62)
 names = st.text(min_size=1, max_size=8)

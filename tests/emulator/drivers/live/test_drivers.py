@@ -12,9 +12,8 @@ from emulator.drivers.processes import Stalled
 from emulator.drivers.realtime import RealTime, run_in_real_time
 from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
 from vnet.radio import SentFrame
-from vnet.transport import backbone_keys, wire
-from vnet.transport.backbone_keys import Sent
-from vnet.transport.wire import MessageRef, SentMessage
+from vnet.transport import wire
+from vnet.transport.wire import MessageRef, Sent, SentMessage
 
 MS = 1_000_000
 RUN = {"duration_s": 0.6, "settle_s": 0.1, "stall_timeout_s": 1.0, "join_timeout_s": 1.0}
@@ -289,10 +288,10 @@ async def test_a_yield_waits_for_the_messages_of_the_backbone_to_which_it_refers
         sent = SentMessage("v03", message.seq, None, b"x")
         step = wire.Step(message.time_ns, wire.Traffic(messages=[sent]))
         whole = wire.Yield(b"1", message.seq, message.time_ns + 100 * MS, (), (), [step], 1)
-        said, contents = backbone_keys.split_yield(whole)
+        said, contents = wire.split_yield(whole)
         puts: list[tuple[str, str, bytes]]
         puts = [("message", "v03", wire.encode(said))]
-        puts += [("backbone", unit, backbone_keys.encode(each)) for unit, each in contents]
+        puts += [("backbone", unit, wire.encode(each)) for unit, each in contents]
         for put in reversed(puts) if first == "message" else puts:
             play.hear(*put)
         return None
@@ -319,7 +318,7 @@ async def test_a_message_of_the_backbone_that_never_comes_is_named(unit: str, no
         if node != "v03" or not isinstance(message, wire.Grant):
             return yields(node, message)
         if unit:
-            play.hear("backbone", unit, backbone_keys.encode(Sent(nonce, 7, None, b"x")))
+            play.hear("backbone", unit, wire.encode(Sent(nonce, 7, None, b"x")))
         if unit == "v04":
             other = wire.Step(message.time_ns, wire.Traffic(messages=[MessageRef(unit, 7)]))
             play.hear("message", "v03", wire.encode(wire.Yield(b"1", message.seq, None, (), (), [other], 1)))
@@ -422,7 +421,7 @@ async def test_in_real_time_a_message_of_the_backbone_comes_after_its_frames_or_
         refs = [MessageRef("v03", said.seq), MessageRef("v03", 1000)] if said.seq < 2 else []
         play.hear("message", "v03", wire.encode(replace(said, traffic=wire.Traffic(messages=refs))))
         if said.seq < 2:
-            play.hear("backbone", "v03", backbone_keys.encode(Sent(b"1", said.seq, "v04", b"x")))
+            play.hear("backbone", "v03", wire.encode(Sent(b"1", said.seq, "v04", b"x")))
         return None
 
     play = Play("realtime", answer, **UNITS)
@@ -446,7 +445,7 @@ async def test_in_real_time_a_message_of_the_backbone_may_come_after_the_last_fr
         last = wire.Frames(b"1", seq, seq, [], wire.Traffic(messages=refs), final=True)
         play.hear("message", node, wire.encode(last))
     if not ended:
-        content = backbone_keys.encode(Sent(b"1", 0, None, b"x"))
+        content = wire.encode(Sent(b"1", 0, None, b"x"))
         asyncio.get_running_loop().call_later(0.1, play.hear, "backbone", "v03", content)
     await play.finish(3600.0)
     assert play.stage.events("transport_gap", "refused") == []

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from emulator.cli.commands import app
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
@@ -23,6 +22,7 @@ from emulator.world.maps.roads import Roads
 from emulator.world.trips.generate import LATERAL_MPS2, LEFT, Side, StreetNetwork, generate_motion
 from emulator.world.trips.motion import Motion
 from emulator.world.world import build_world
+from tests.support.command_line import app
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap

@@ -1,6 +1,0 @@
-"""`python -m emulator.cli`: the command `vnet`."""
-
-from emulator.cli import main
-
-if __name__ == "__main__":
-    main()
