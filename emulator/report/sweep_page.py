@@ -37,6 +37,8 @@ ASIDE = 0.012
 """Step between the intervals of two curves, as a share of the axis."""
 PLAIN = (1e-9, 1e9)
 """Halves of intervals that are written without an exponent."""
+ROUNDING = 1e-12
+"""Share of a number below which a spread is that of its rounding."""
 NO_FIGURES = ("seed", "vehicles", "emulated_s", "wall_s", "real_time_factor")
 """Numbers of a row that are no results."""
 Rows = Sequence[Mapping[str, Any]]
@@ -61,12 +63,17 @@ class Mean:
         return " ± ".join(f"{round(number, place) + 0.0:.{max(0, place)}f}" for number in (self.value, half))
 
 
-def mean_of(values: Sequence[float]) -> Mean:
-    """Return the mean of one number or more, with the interval of Student's t distribution."""
+def mean_of(values: Sequence[float], size: float = 0.0) -> Mean:
+    """Return the mean of one number or more, with the interval of Student's t distribution.
+
+    `size` is the largest number of which values are differences: what its rounding alone explains is no spread.
+    """
     count = len(values)
     if count == 1:
         return Mean(float(values[0]), None, 1)
     half = float(student_quantile((1 + CONFIDENCE) / 2, count - 1) * np.std(values, ddof=1) / np.sqrt(count))
+    if half <= ROUNDING * max(size, *map(abs, values)):
+        half = 0.0
     return Mean(float(np.mean(values)), half, count)
 
 
@@ -177,10 +184,11 @@ def differences(rows: Rows, varied: Sequence[str], titles: Mapping[str, str]) ->
 
 
 def _difference(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], name: str) -> str:
-    values = [
-        one[name] - two[name] for one, two in pairs if _is_number(one.get(name)) and _is_number(two.get(name))
+    numbers = [
+        (one[name], two[name]) for one, two in pairs if _is_number(one.get(name)) and _is_number(two.get(name))
     ]
-    return str(mean_of(values)) if values else ""
+    size = max((abs(number) for pair in numbers for number in pair), default=0.0)
+    return str(mean_of([one - two for one, two in numbers], size)) if numbers else ""
 
 
 def _failed(rows: Rows, varied: Sequence[str]) -> list[dict[str, Any]]:
