@@ -82,8 +82,8 @@ def new(
 ) -> None:
     """Write a folder to begin with: a scenario, its program, a check of what it promises, and a test.
 
-    NAME becomes a module of Python's: letters, digits and _. With --example it is a copy of an example, which a
-    page of the documentation explains.
+    NAME becomes a module of Python's: letters of ASCII, digits and _. With --example it is a copy of an example,
+    which a page of the documentation explains.
     """
     with one_line_errors():
         if name is None and example is None:
@@ -159,7 +159,9 @@ def _check_name(name: str) -> None:
     """The program is a module: its name must be one, and hide no other."""
     reserved = keyword.iskeyword(name) or name.startswith("test_") or name.endswith("_check")
     if reserved or not (name.isidentifier() and name.isascii()):
-        raise VnetError(f"{name}: no name for a program; letters, digits and _, and neither test_… nor …_check")
+        raise VnetError(
+            f"{name}: no name for a program; letters of ASCII, digits and _, and neither test_… nor …_check"
+        )
     found = importlib.util.find_spec(name)
     if found is not None and found.origin is not None:
         raise VnetError(f"{name}: Python has a module of this name ({found.origin}); choose another")

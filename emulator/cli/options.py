@@ -327,7 +327,9 @@ def load(
     if not all(map(str.strip, checks or ())):
         raise ScenarioError("--check '': write it as my_checks.py:check")
     try:
-        return load_scenario(path, [*(overrides or []), *own, *given], [from_here(each) for each in checks or ()])
+        scenario = load_scenario(
+            path, [*(overrides or []), *own, *given], [from_here(each) for each in checks or ()]
+        )
     except OverrideError as error:
         chosen = next(
             (option for key, option in _OPTIONS.items() if options[key] is not None and error.key == key), "--set"
@@ -335,6 +337,9 @@ def load(
         if any(each.startswith(f"{error.key}=") for each in own):
             chosen = "--option"
         raise ScenarioError(f"{chosen}: {error}") from None
+    if order_seed is not None and scenario.run.order == "fifo" and not scenario.run.order_slack_us:
+        raise ScenarioError(f"--order-seed {order_seed}: the order is FIFO, which has no seed; add --order shuffle")
+    return scenario
 
 
 _OPTIONS = {

@@ -55,3 +55,8 @@ def test_all_pages_are_listed_and_printed_as_they_are() -> None:
     for name in ("how-to/debugging", "debugging", "docs/how-to/debugging.md"):
         assert runner.invoke(app, ["docs", name]).output == (ROOT / "docs" / "how-to" / "debugging.md").read_text()
     assert Path(runner.invoke(app, ["docs", "--path"]).output.strip()) == ROOT / "docs"
+
+
+def test_a_name_that_is_not_ascii_is_refused_with_what_is_allowed(tmp_path: Path) -> None:
+    status, output = new(tmp_path / "ünï")[:2]
+    assert status == 2 and "letters of ASCII, digits and _" in output

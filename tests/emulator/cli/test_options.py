@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
-from emulator.cli.options import Order, Pacing, RunOptions
+import pytest
+
+from emulator.cli.options import Order, Pacing, RunOptions, load
 from tests.support.paths import ROOT
+from vnet.errors import ScenarioError
 
 BEACON = ROOT / "scenarios" / "beacon.toml"
 
@@ -34,3 +37,9 @@ def test_a_tape_is_that_of_the_present_folder(tmp_path: Path) -> None:
 def test_what_is_shown_is_what_was_asked_for() -> None:
     shown = RunOptions(scenario=BEACON, quiet=True, verbose=True, report=False).output()
     assert (shown.quiet, shown.verbose, shown.report) == (True, True, False)
+
+
+def test_seed_of_an_order_is_refused_where_the_order_is_fifo() -> None:
+    with pytest.raises(ScenarioError, match="--order-seed 3: the order is FIFO"):
+        load(Path("beacon"), None, order_seed=3)
+    assert load(Path("beacon"), ["run.order_slack_us=10"], order_seed=3).run.order_seed == 3
