@@ -305,6 +305,10 @@ class Network(Section):
         return self
 
 
+OSM_ENDINGS = (".osm", ".pbf")
+"""Endings of files of OpenStreetMap."""
+
+
 class Map(Section):
     """`[map]`: the roads on which vehicles drive, as programs know them. Without it they know none."""
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
-from emulator.scenario.network import Driven, Map, Network, Ranging, control_step_ns
+from emulator.scenario.network import LIBSUMO, OSM_ENDINGS, Driven, Map, Network, Ranging, control_step_ns
 from emulator.scenario.program import PYTHON_NAME, Backbone, Entry, Program, RoadsideUnit, Ros2Topics, with_names
 from emulator.scenario.radio import (
     RATES_MBPS,
@@ -519,6 +519,10 @@ class Scenario(Section):
             require("a physical radio (radio.path_loss, radio.mac)", "scipy", error=ScenarioError)
         if self.network.kind == "city":
             require("a generated city", "scipy", error=ScenarioError)
+        if self.network.step:
+            require("network.step = true", LIBSUMO, error=ScenarioError)
+        if self.map is not None and self.map.path.suffix in OSM_ENDINGS:
+            require(f"{self.map.path}: a file of OpenStreetMap", "osmium", "pyproj", error=ScenarioError)
 
     def options_of(self, node: str) -> dict[str, Any]:
         """Return the options of a node's program: those of the scenario, or what a Zenoh program is run with."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 import numpy as np
 
-from emulator.scenario.network import Map
+from emulator.scenario.network import OSM_ENDINGS, Map
 from emulator.world.buildings import LEAST_CORNERS, Buildings
 from emulator.world.input_files import check_columns, number_within, open_csv
 from emulator.world.maps.formats import (
@@ -195,7 +195,7 @@ def read_buildings(path: Path, frame: Callable[[], CoordinateFrame]) -> Building
         return Buildings.of(_some(path, _read_csv(path)))
     if path.name.lower().endswith(".poly.xml"):
         return Buildings.of(_some(path, [[np.array(corners)] for corners in read_sumo_polygons(path)]))
-    if ending in (".osm", ".pbf"):
+    if ending in OSM_ENDINGS:
         found = _read_osm(path)
     elif ending in (".geojson", ".json"):
         found = _read_geojson(path)

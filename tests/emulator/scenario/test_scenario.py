@@ -3,6 +3,7 @@
 import math
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -10,7 +11,9 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from emulator.scenario.loading import dump_scenario, input_digests, load_scenario
+from emulator.scenario.network import Map
 from emulator.scenario.scenario import Scenario
+from vnet import extras
 from vnet.errors import ScenarioError, did_you_mean
 
 CSV = "id,x_m,y_m,heading_rad\na,0,0,0\n"
@@ -250,3 +253,25 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     path.write_text("[network]\nvehicles = 7\n", encoding="utf-8-sig")
     assert load_scenario(path).network.vehicles == 7
+
+
+@pytest.mark.parametrize(
+    ("changes", "library"),
+    [
+        ({"map": {"path": "town.osm"}}, "osmium and pyproj"),
+        ({"network": {"kind": "sumo", "step": True}}, "libsumo"),
+    ],
+)
+def test_missing_extras_of_maps_and_sumo_are_named_before_the_world_is_built(
+    changes: dict[str, Any], library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "is_installed", lambda name: False)
+    parts = {name: getattr(Scenario(), name) for name in ("network", "map")}
+    scenario = Scenario().model_copy(
+        update={
+            "map": Map(**changes["map"]) if "map" in changes else parts["map"],
+            "network": parts["network"].model_copy(update=changes.get("network", {})),
+        }
+    )
+    with pytest.raises(ScenarioError, match=library):
+        scenario.require_extras()
