@@ -165,6 +165,8 @@ def report(
             tell(f"{run}: has no verdict: the run is still going on, or was ended from outside")
         if show and not webbrowser.open(path.resolve().as_uri()):
             raise VnetError(f"--open: no browser was found here; open {path}")
+        if index is None and (lost := _damages(run)):
+            raise VnetError(f"{run}: its verdict stands on files that cannot be read: {'; '.join(lost)}")
 
 
 def report_at_end(folder: Path) -> None:
@@ -203,6 +205,13 @@ def _write_report(folder: Path) -> Path:
     from emulator.report.write import write_report  # slow to import
 
     return write_report(folder)
+
+
+def _damages(folder: Path) -> list[str]:
+    from emulator.report.source import Source
+    from emulator.report.write import damages
+
+    return damages(Source(folder))
 
 
 def _write_index(folder: Path) -> Path:

@@ -21,7 +21,7 @@ from emulator.report.map_figures import map_charts
 from emulator.report.program_figures import Drawers, program_charts
 from emulator.report.source import NothingToShow, Source, maybe
 from emulator.report.write import key_figures
-from vnet.errors import VnetError
+from vnet.errors import VnetError, counted
 from vnet.extras import require
 
 if TYPE_CHECKING:
@@ -114,14 +114,19 @@ def _drawn(drawers: Drawers, width_px: int, problems: list[str]) -> Iterator[_Dr
 
     for title, draw in drawers.values():
         try:
-            figure = draw().canvas.figure
+            made = draw().canvas
         except NothingToShow:
             continue
         except VnetError as error:
             problems.append(f"{title} not shown: {error}")
             continue
+        if (
+            made.unnamed
+            and (note := f"{counted(made.unnamed, 'fault')} more in the curves than are named") not in problems
+        ):
+            problems.append(note)
         file = io.BytesIO()
-        figure.savefig(file, format="png", dpi=DPI * width_px / WIDTH_PX, transparent=True)
+        made.figure.savefig(file, format="png", dpi=DPI * width_px / WIDTH_PX, transparent=True)
         file.seek(0)
         yield title, imread(file)
 
@@ -143,7 +148,9 @@ def _events(source: Source) -> list[str]:
     events = [event for event in maybe(lambda: source.events) or () if not event.has(SAMPLES)]
     said = [event for event in events if event.has(SAID)][-MOST_SAID:]
     shown = [event for event in events if not event.has(SAID)][-MOST_EVENTS:] + said
-    return [_line(event) for event in sorted(shown, key=lambda event: event.time_ns)] or ["none"]
+    lines = [_line(event) for event in sorted(shown, key=lambda event: event.time_ns)] or ["none"]
+    left = len(events) - len(shown)
+    return [*lines, *([f"and {counted(left, 'event')} before, of which report.html tells more"] if left else [])]
 
 
 def _line(event: Event) -> str:

@@ -65,7 +65,7 @@ def report_page(source: Source) -> str:
     return render(
         "report.html.j2",
         name=source.folder.resolve().name,
-        verdict=record.verdict if record else None,
+        verdict=record.verdict if record and not damages(source) else None,
         facts=list(_facts(source, record)),
         note=_note(source, record),
         summary=_summary(source, record),
@@ -88,6 +88,20 @@ def report_page(source: Source) -> str:
     )
 
 
+def damages(source: Source) -> list[str]:
+    """Return what is wrong with the files on which a run's verdict stands; nothing where there is no verdict."""
+    if maybe(lambda: source.record) is None:
+        return []
+    reads = (
+        lambda: source.scenario,
+        lambda: source.trace,
+        lambda: source.states,
+        lambda: source.metrics,
+        lambda: source.events,
+    )
+    return list(dict.fromkeys(reason for read in reads if (reason := why_not(read))))
+
+
 def _facts(source: Source, record: Record | None) -> Iterator[str]:
     if record is not None:
         yield counted(record.vehicles, "vehicle")
@@ -105,6 +119,8 @@ def _facts(source: Source, record: Record | None) -> Iterator[str]:
 def _note(source: Source, record: Record | None) -> str:
     """The reason for a missing verdict or an early end; "" for a run that has both."""
     if record is not None:
+        if lost := damages(source):
+            return f"The verdict, {record.verdict.value}, stood on files that cannot be read: {'; '.join(lost)}."
         cut = source.cut
         return f"The run was {cut.kind} at {cut.time_ns / 1e9:.1f} s." if cut else ""
     if source.has_record:  # the checks' section says why

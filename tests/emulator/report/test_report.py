@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from emulator.cli import folders as report_cli
@@ -327,3 +328,16 @@ def test_compare_refuses_an_unfinished_run(beacon_run: Path, beacon: Path) -> No
     (beacon / "states.parquet").unlink()
     with pytest.raises(VnetError, match=r"states\.parquet"):
         Comparison.of(beacon_run, beacon)
+
+
+@pytest.mark.usefixtures("no_charts")
+@pytest.mark.parametrize("damaged", ["trace.parquet", "states.parquet", "scenario.toml"])
+def test_report_of_a_damaged_run_bears_no_verdict_and_ends_with_an_error(
+    beacon: Path, damaged: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = (beacon / damaged).read_bytes()
+    (beacon / damaged).write_bytes(content[: len(content) // 2])
+    assert "The verdict, valid, stood on files that cannot be read" in page_of(beacon).text
+    with pytest.raises(typer.Exit) as ended:
+        report_cli.report(beacon)
+    assert ended.value.exit_code == 2 and damaged.split(".")[0] in capsys.readouterr().err
