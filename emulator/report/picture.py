@@ -150,7 +150,7 @@ def _events(source: Source) -> list[str]:
     shown = [event for event in events if not event.has(SAID)][-MOST_EVENTS:] + said
     lines = [_line(event) for event in sorted(shown, key=lambda event: event.time_ns)] or ["none"]
     left = len(events) - len(shown)
-    return [*lines, *([f"and {counted(left, 'event')} before, of which report.html tells more"] if left else [])]
+    return [*lines, *([f"and {counted(left, 'event')} more: see report.html"] if left else [])]
 
 
 def _line(event: Event) -> str:

@@ -3,6 +3,7 @@
 import struct
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,18 @@ from matplotlib.figure import Figure
 
 from emulator.drivers.session import Session
 from emulator.pages.canvas import BLUE
+from emulator.records.events import SAID, SAMPLES
 from emulator.report.drawing import Line, time_figure
-from emulator.report.picture import COLUMNS, CURVE_PX, MAP_PX, _heading, _picture, write_picture
+from emulator.report.picture import (
+    COLUMNS,
+    CURVE_PX,
+    MAP_PX,
+    MOST_EVENTS,
+    _events,
+    _heading,
+    _picture,
+    write_picture,
+)
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
@@ -85,3 +96,9 @@ def test_what_cannot_be_a_picture_is_one_line(run: Path, tmp_path: Path) -> None
     with pytest.raises(VnetError, match="cannot write"):
         write_picture(run, tmp_path / "none" / "run.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_events_that_are_left_out_are_counted(run: Path) -> None:
+    event = next(event for event in Source(run).events if not event.has(SAID) and not event.has(SAMPLES))
+    source: Any = SimpleNamespace(events=[event] * (MOST_EVENTS + 3))
+    assert _events(source)[MOST_EVENTS:] == ["and 3 events more: see report.html"]
