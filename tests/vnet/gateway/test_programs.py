@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from textwrap import dedent
 from types import ModuleType
 from typing import Any
 
@@ -168,6 +169,12 @@ def test_chance_of_numpy_is_the_vehicles_own(drive: Drive) -> None:
         "while not lock.acquire(blocking=False): pass",
         "while lock.locked(): pass",
         "while not wait([pool], timeout=0)[0]: pass",
+        "while not items.qsize(): pass",
+        "while not items.full(): pass",
+        "while not semaphore.acquire(blocking=False): pass",
+        "while not semaphore.acquire(timeout=0): pass",
+        "while threading.active_count() > 2: pass",
+        "while thread in threading.enumerate(): pass",
     ],
 )
 def test_a_program_that_polls_without_a_pause_comes_to_its_time(drive: Drive, waits: str) -> None:
@@ -175,13 +182,15 @@ def test_a_program_that_polls_without_a_pause_comes_to_its_time(drive: Drive, wa
         import queue, threading, time, zenoh
         from concurrent.futures import ThreadPoolExecutor, wait
         session, lock = zenoh.open(zenoh.Config()), threading.Lock()
-        samples, came, items = session.declare_subscriber("a"), threading.Event(), queue.Queue()
+        samples, came, items = session.declare_subscriber("a"), threading.Event(), queue.Queue(1)
+        semaphore = threading.Semaphore(0)
         def put():
             time.sleep(0.1)
             session.put("a", "b")
             came.set()
             items.put(1)
             lock.release()
+            semaphore.release()
         lock.acquire()
         thread, pool = threading.Thread(target=put), ThreadPoolExecutor(1).submit(time.sleep, 0.1)
         thread.start()
@@ -737,3 +746,113 @@ def test_sys_exit_in_a_callback_ends_nothing_and_is_told(drive: Drive) -> None:
     assert run.verdict == "invalid"
     assert any("SystemExit(5)" in line for line in log(run))
     assert "goes on" in log(run)
+
+
+SLOW = """
+    import sys, time, zenoh
+    from zenoh.handlers import Callback, FifoChannel
+
+    heard = {"slow": [], "fast": []}
+
+    def slow(sample):
+        heard["slow"].append(f"{time.monotonic():.1f}")
+        time.sleep(0.2)
+
+    here, there = (zenoh.open(zenoh.Config.from_env()) for _ in range(2))
+"""
+
+
+@pytest.mark.parametrize(
+    ("handler", "samples", "at_once", "slow", "last_s"),
+    [
+        ("slow", 10, 10, 10, "0.0"),
+        ("slow", 300, 257, 300, "8.6"),
+        ("Callback(slow, indirect=False)", 10, 0, 10, "2.0"),
+        ("FifoChannel(3)", 10, 3, 0, "0.0"),
+        ("None", 300, 256, 0, "0.0"),
+        ("zenoh.handlers.RingChannel(3)", 300, 300, 0, "0.0"),
+    ],
+)
+def test_what_takes_no_more_stops_its_session_as_at_zenoh_itself(
+    drive: Drive, handler: str, samples: int, at_once: int, slow: int, last_s: str
+) -> None:
+    program = f"""
+        first = there.declare_subscriber("k", {handler})
+        there.declare_subscriber("k", lambda sample: heard["fast"].append(f"{{time.monotonic():.1f}}"))
+        for number in range({samples}):
+            here.put("k", str(number))
+        time.sleep(70)
+        print(heard["fast"].count("0.0"), len(heard["slow"]), heard["fast"][-1])
+        if not heard["slow"] and len(heard["fast"]) < {samples}:
+            before = len(heard["fast"])
+            print(first.recv().payload.to_string())
+            time.sleep(0.1)
+            print(len(heard["fast"]) - before)
+        """
+    run = drive(dedent(SLOW) + dedent(program), duration_s=80.0, radio={"keys": ["none"]})
+    more = ["0", "1"] if not slow and at_once < samples else []
+    assert log(run)[:-1] == [f"{at_once} {slow} {last_s}", *more]
+
+
+def test_who_puts_into_a_full_channel_of_the_same_session_waits(drive: Drive) -> None:
+    run = drive(
+        dedent(SLOW)
+        + dedent("""
+        import threading
+        channel, puts = here.declare_subscriber("k"), []
+        def put():
+            for number in range(300):
+                here.put("k", str(number))
+                puts.append(number)
+        threading.Thread(target=put).start()
+        time.sleep(0.1)
+        print(len(puts), channel.recv().payload.to_string())
+        time.sleep(0.1)
+        print(len(puts))
+        there.declare_subscriber("d", Callback(slow, indirect=False))
+        there.put("d", "")
+        print(heard["slow"], f"{time.monotonic():.1f}")
+        channel.undeclare()
+        """)
+    )
+    assert log(run)[:-1] == ["256 0", "257", "['0.2'] 0.4"]
+
+
+def test_a_querier_that_is_undeclared_ends_its_queries(drive: Drive) -> None:
+    run = drive("""
+        import time, zenoh
+        session, held = zenoh.open(zenoh.Config.from_env()), []
+        queryable = session.declare_queryable("q", held.append)
+        querier = session.declare_querier("q", timeout=3.0)
+        channel = querier.get()
+        querier.get(zenoh.handlers.Callback(print, lambda: print("dropped", time.monotonic())))
+        time.sleep(0.5)
+        querier.undeclare()
+        print(list(channel))
+        time.sleep(0.1)
+        publisher = session.declare_publisher("p")
+        for _ in range(50):
+            publisher.declare_matching_listener(lambda status: None).undeclare()
+        print(len(publisher._ends))
+        try:
+            publisher.declare_matching_listener(3)
+        except ValueError as error:
+            print(error)
+        """)
+    assert log(run)[:-1] == ["[]", "dropped 0.5", "0", "Invalid handler type int"]
+
+
+def test_timers_ring_at_fractions_of_a_second_again_and_again(drive: Drive) -> None:
+    run = drive(
+        """
+        import signal, time
+        signal.signal(signal.SIGALRM, lambda number, frame: print("rings", time.monotonic()))
+        signal.setitimer(signal.ITIMER_REAL, 1.5, 1.5)
+        time.sleep(3.2)
+        left = [round(each, 3) for each in signal.setitimer(signal.ITIMER_REAL, 0)]
+        print(left, signal.alarm(1), signal.alarm(0))
+        time.sleep(2)
+        """,
+        duration_s=6.0,
+    )
+    assert log(run)[:-1] == ["rings 1.5", "rings 3.0", "[1.3, 1.5] 0 1"]

@@ -1,6 +1,7 @@
 """The surface of `import zenoh` on virtual time is that of the installed Zenoh."""
 
 import ast
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -107,22 +108,82 @@ ARGUMENTS = """
     session.liveliness().declare_subscriber("a", history=1)
 """
 NAMES = """
+import time
 from datetime import timedelta
 import numpy as np
+import zenoh
 from zenoh import ext, handlers
 SECOND = timedelta(seconds=1)
+asked = []
 """
+AT = {
+    "CacheConfig": "ext.CacheConfig",
+    "CancellationToken": "zenoh.CancellationToken",
+    "FifoChannel": "handlers.FifoChannel",
+    "HistoryConfig": "ext.HistoryConfig",
+    "Liveliness": "session.liveliness()",
+    "MissDetectionConfig": "ext.MissDetectionConfig",
+    "Publisher": "session.declare_publisher('a')",
+    "Querier": "session.declare_querier('a')",
+    "Query": "asked[0]",
+    "RecoveryConfig": "ext.RecoveryConfig",
+    "RepliesConfig": "ext.RepliesConfig",
+    "RingChannel": "handlers.RingChannel",
+    "Session": "session",
+}
+"""Expression for an object of each class, or for the class, in a program."""
+VALUES = [
+    *("3", "-1", "1e30", "1e400", "float('nan')", "'x'", "object()", "True", "[]", "()", "{}", "2**70", "1.5"),
+    *("SECOND", "None", "zenoh.Priority.DATA"),
+]
+GIVEN = {"key_expr": "'a'", "selector": "'a'", "payload": "'x'", "capacity": "3", "session": "session"}
+"""Arguments that a call needs."""
+
+
+def calls_of(target: str, function: ast.FunctionDef) -> list[str]:
+    """Return calls of a function with each value for each of its arguments, and with one that it does not have."""
+    names = [each.arg for each in function.args.args if each.arg not in ("self", "cls")]
+    needed = names[: len(names) - len(function.args.defaults)]
+    given = {name: GIVEN.get(name, "None") for name in needed}
+    named = [each.arg for each in function.args.kwonlyargs if each.arg != "timestamp_instrumentation"]
+    tried = [*((name, value) for name in [*needed, *named] for value in VALUES), ("nonsense", "1")]
+    return [
+        f"{target}({', '.join(f'{each}={it}' for each, it in {**given, name: value}.items())})"
+        for name, value in tried
+    ]
+
+
+def generated() -> list[str]:
+    """Return right and wrong calls of the functions in the stubs of the installed Zenoh."""
+    calls = []
+    for module in ("__init__", "ext", "handlers"):
+        tree = ast.parse(Path(zenoh.__file__).with_name(f"{module}.pyi").read_text())
+        for each in tree.body:
+            if isinstance(each, ast.FunctionDef) and each.name.startswith("declare_advanced"):
+                calls += calls_of(f"ext.{each.name}", each)
+            if not isinstance(each, ast.ClassDef) or each.name not in AT:
+                continue
+            for method in each.body:
+                if not isinstance(method, ast.FunctionDef) or method.name in ("close", "undeclare", "__exit__"):
+                    continue
+                if method.name in ("__new__", "__init__"):
+                    calls += calls_of(AT[each.name], method)
+                elif method.name.startswith(("declare", "get", "put", "delete", "reply")):
+                    calls += calls_of(f"{AT[each.name]}.{method.name}", method)
+    return [call.replace("key_expr='a'", "key_expr='asked'") if "asked" in call else call for call in calls]
 
 
 def attempts() -> str:
     """Return a program that collects in `answers` what becomes of each of these calls at a `session`."""
     return f"""
+queryable, pending = session.declare_queryable("asked", asked.append), session.get("asked", timeout=60)
+time.sleep(0.2)
 answers = []
-for call in {ARGUMENTS.split(chr(10))[1:-1]!r}:
+for call in {[*map(str.strip, ARGUMENTS.split(chr(10))[1:-1]), *generated()]!r}:
     try:
-        eval(call.strip())
+        eval(call)
     except Exception as error:
-        answers.append(f"{{call.strip()}}: {{type(error).__name__}}")
+        answers.append(f"{{call}}: {{type(error).__name__}}")
 """
 
 
@@ -132,8 +193,13 @@ def test_arguments_are_refused_as_by_zenoh_itself(drive: Drive) -> None:
     for key in ("scouting/multicast/enabled", "scouting/gossip/enabled"):
         config.insert_json5(key, "false")
     config.insert_json5("listen/endpoints", "[]")
+    config.insert_json5("timestamping/enabled", "true")
     with zenoh.open(config) as session:
         there: dict[str, Any] = {"session": session}
-        exec(NAMES + attempts(), there)
-    run = drive(f"import zenoh\n{NAMES}session = zenoh.open(zenoh.Config()){attempts()}print(*answers, sep='\\n')")
+        with warnings.catch_warnings(action="ignore"):  # which pytest makes errors of
+            exec(NAMES + attempts(), there)
+    opened = (
+        'config = zenoh.Config()\nconfig.insert_json5("timestamping/enabled", "true")\nsession = zenoh.open(config)'
+    )
+    run = drive(f"{NAMES}{opened}{attempts()}print(*answers, sep='\\n')")
     assert log(run)[:-1] == there["answers"] != []

@@ -455,3 +455,15 @@ def test_the_words_of_a_command_are_read_by_the_standard_library_too(drive: Driv
         print(fileinput.input().__dict__["_files"])
         """
     assert log(drive(text))[:2] == ["program0.py v01 ['v01']", "('v01',)"]
+
+
+def test_a_module_of_a_program_is_loaded_again(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "settings.py").write_text("import time\nnumber = int(10 * time.monotonic())\n")
+    run = drive("""
+        import importlib, json, settings, time
+        from importlib import reload
+        before = settings.number
+        time.sleep(0.5)
+        print(before, importlib.reload(settings) is settings, settings.number, reload(json) is json)
+        """)
+    assert log(run)[0] == "0 True 5 True"

@@ -25,7 +25,7 @@ from vnet.gateway.emulated.modules import ENDPOINT, ProgramModules
 from vnet.gateway.emulated.process import children_outside
 from vnet.gateway.emulated.shown import Facade
 from vnet.gateway.emulated.strands import go_no_further_if_ended
-from vnet.gateway.emulated.values import Outlet, refused
+from vnet.gateway.emulated.values import Intake, Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.gateway.ros2 import Ros2
 from vnet.node import Node
@@ -55,17 +55,19 @@ def _own_names(real: ModuleType) -> dict[str, Any]:
 
 def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, ModuleType]:
     """Return the package `zenoh` of a program, by the names of its modules."""
-    outlet = Outlet(vehicle.due, program.threads)
+
+    def new_outlet() -> Outlet:
+        return Outlet(vehicle.due, program.threads, Intake())
 
     def open_session(config: zenoh.Config, *, timestamp_callback: object = None) -> sessions.Session:
         if timestamp_callback is not None:
             raise zenoh.ZError("timestamp_callback is not available on virtual time")
         go_no_further_if_ended()
         program.has_session = True
-        return sessions.Session(vehicle, outlet, config)
+        return sessions.Session(vehicle, new_outlet(), config)
 
     def scout(handler: Any = None, what: Any = None, config: zenoh.Config | None = None) -> sessions.Scout:
-        return sessions.Scout(vehicle, outlet, handler, what)
+        return sessions.Scout(vehicle, new_outlet(), handler, what)
 
     # Values that Python can construct are Zenoh's own.
     handlers, ext = (Facade(real, **_own_names(real)) for real in (zenoh.handlers, zenoh.ext))

@@ -24,6 +24,7 @@ from vnet.gateway.emulated.modules import EPOCH_NS
 from vnet.gateway.emulated.queries import ALL_REPLIES, ANY_KEY, Asking, Entity, Query
 from vnet.gateway.emulated.sessions import Listening, LivelinessToken, Publisher, Session, Subscriber, Watcher
 from vnet.gateway.emulated.values import (
+    BOOL,
     Direct,
     EntityGlobalId,
     Reply,
@@ -46,7 +47,7 @@ _WITHOUT_ID = "uhlc"
 @dataclass(frozen=True)
 class _Config:
     def __post_init__(self) -> None:
-        check(vars(self))
+        check(vars(self), **_KINDS)
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,20 @@ class RecoveryConfig(_Config):
     heartbeat: Literal[True] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check(vars(self), heartbeat=BOOL)
         if (self.periodic_queries is None) == (not self.heartbeat):
             raise ValueError("invalid parameters")
+
+
+_KINDS = {
+    "cache": CacheConfig,
+    "history": HistoryConfig,
+    "recovery": RecoveryConfig,
+    "replies_config": RepliesConfig,
+    "sample_miss_detection": MissDetectionConfig,
+    "session": Session,
+}
+"""Types of options that are of this module."""
 
 
 class Miss(msgspec.Struct, frozen=True):
@@ -137,6 +149,8 @@ class AdvancedPublisher(Publisher):
         publisher_detection: bool | None = None,
         **options: Any,
     ) -> None:
+        given = {"cache": cache, "sample_miss_detection": sample_miss_detection, "session": session}
+        check({**given, "publisher_detection": publisher_detection}, **_KINDS)
         super().__init__(session, key_expr, **options)
         misses = sample_miss_detection
         if misses is None and cache is not None and not session.stamps:
@@ -272,6 +286,8 @@ class AdvancedSubscriber(Subscriber):
         recovery: RecoveryConfig | None = None,
         subscriber_detection: bool | None = None,
     ) -> None:
+        given = {"history": history, "recovery": recovery, "session": session}
+        check({**given, "subscriber_detection": subscriber_detection}, **_KINDS)
         self._history, self._recovery = history or HistoryConfig(), recovery
         for name in ("max_samples", "max_age"):
             if getattr(self._history, name) == 0:
@@ -286,7 +302,8 @@ class AdvancedSubscriber(Subscriber):
         publishers = key_of(f"{self.key_expr}/@adv/pub/**")
 
         def declare(kind: Literal["subscriber", "watcher"], take: Callable[[Sample], None]) -> Entity:
-            entity = Entity(kind, session, self.id, publishers, Direct(take), allowed_origin)
+            sink = Direct(take, has_room=self._sink.has_room)
+            entity = Entity(kind, session, self.id, publishers, sink, allowed_origin)
             ends.append(session.declare(entity))
             return entity
 
@@ -302,7 +319,7 @@ class AdvancedSubscriber(Subscriber):
         self._ends = ends
 
     def _intake(self) -> Sink:
-        return Direct(self._take, self._sink.close)
+        return Direct(self._take, self._sink.close, self._sink.has_room)
 
     sample_miss_listener = partialmethod(SampleMissListener)
 
@@ -393,7 +410,8 @@ class AdvancedSubscriber(Subscriber):
 
     def _ask(self, key: str, parameters: str, on_end: Callable[[], object]) -> None:
         parameters = f"{parameters};{ANY_KEY}" if parameters else ANY_KEY
-        asking = Asking(zenoh.Selector(key, parameters), self._replied, on_end, **ALL_REPLIES)
+        sink = Direct(self._replied, on_end, self._sink.has_room)
+        asking = Asking(zenoh.Selector(key, parameters), sink, **ALL_REPLIES)
         asking.expire_after(RECOVERY_TIMEOUT_S)
         self.session.vehicle.ask(asking, self.session, to_own=True, to_others=True)
 

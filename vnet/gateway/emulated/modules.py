@@ -254,9 +254,9 @@ class ProgramModules:
         places = None if spec is None else spec.submodule_search_locations
         return places is not None and _has_compiled(tuple(places))
 
-    def _execute(self, spec: ModuleSpec) -> ModuleType:
+    def _execute(self, spec: ModuleSpec, again: ModuleType | None = None) -> ModuleType:
         name = spec.name
-        module = self.modules[name] = importlib.util.module_from_spec(spec)
+        module = self.modules[name] = again or importlib.util.module_from_spec(spec)
         vars(module)["__builtins__"] = self._builtins
         try:
             if isinstance(spec.loader, SourceFileLoader):  # else a folder without code
@@ -275,7 +275,14 @@ class ProgramModules:
         def import_module(name: str, package: str | None = None) -> ModuleType:
             return self.load(importlib.util.resolve_name(name, package))
 
-        return Facade(importlib, import_module=import_module, __import__=self._builtins["__import__"])
+        def reload(module: ModuleType) -> ModuleType:
+            spec = module.__spec__
+            if spec is None or self.modules.get(spec.name) is not module or not _is_python(spec):
+                return importlib.reload(module)
+            return self._execute(spec, module)
+
+        own_import = self._builtins["__import__"]
+        return Facade(importlib, import_module=import_module, reload=reload, __import__=own_import)
 
     def _sys(self) -> ModuleType:
         own: dict[str, Any] = {"argv": self.argv, "path": self.path, "modules": self.modules}
@@ -376,7 +383,10 @@ class ProgramModules:
             return lambda thread: None if isinstance(sys.exception(), GreenletExit) else hook(thread)
 
         module._make_invoke_excepthook = make_silent_hook
-        module.Event.is_set = module.Event.isSet = _looking(module.Event.is_set, nothing=False)
+        module.Event.is_set = module.Event.isSet = _looking(module.Event.is_set)
+        module.active_count = module.activeCount = _looking(module.active_count)
+        module.enumerate = _looking(module.enumerate)
+        module.Semaphore.acquire = _looking(module.Semaphore.acquire)
 
     def _prepare_queue(self, module: Any) -> None:
         """Have what finds a queue empty count as a look at it."""
@@ -388,7 +398,9 @@ class ProgramModules:
 
         module.Empty = Empty
         for kind in (module.Queue, module._PySimpleQueue):
-            kind.empty = _looking(kind.empty, nothing=True)
+            for name in ("empty", "full", "qsize"):
+                if hasattr(kind, name):
+                    setattr(kind, name, _looking(getattr(kind, name)))
 
     def _prepare_futures(self, module: Any) -> None:
         """Have jobs of processes run in threads: a child process has a time of its own.
@@ -407,7 +419,7 @@ class ProgramModules:
                 return super().map(function, *iterables, timeout=timeout)
 
         module.ProcessPoolExecutor = ProcessPoolExecutor
-        module.Future.done = _looking(module.Future.done, nothing=False)
+        module.Future.done = _looking(module.Future.done)
         module._base.LOGGER.addFilter(lambda _: not isinstance(sys.exception(), GreenletExit))
 
 
@@ -448,13 +460,12 @@ def _no_input(prompt: object = "") -> NoReturn:
     raise EOFError("input(): a vehicle has no keyboard")
 
 
-def _looking(ask: Callable[[Any], bool], nothing: bool) -> Callable[[Any], bool]:
-    """Return a method that counts as a look where it answers that there is nothing new."""
+def _looking(ask: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that counts as a look at what others change."""
 
-    def looking(asked: Any) -> bool:
-        if ask(asked) is nothing:
-            look()
-        return ask(asked)
+    def looking(*args: Any, **options: Any) -> Any:
+        look()
+        return ask(*args, **options)
 
     return looking
 

@@ -23,6 +23,7 @@ from vnet.gateway.emulated.values import (
     Sink,
     SourceInfo,
     bytes_or_none,
+    check,
     encoding_of,
     key_of,
     zbytes_of,
@@ -49,6 +50,10 @@ class Entity:
     told: set[str] = field(default_factory=set)
     """Keys of living tokens of which a subscriber of tokens has been told."""
 
+    def arrive(self, item: Any) -> None:
+        """Take an item that comes from outside of its session."""
+        self.session.outlet.intake.take(self.sink, self.sink.push, item)
+
     def __post_init__(self) -> None:
         self.is_local = self.origin != zenoh.Locality.REMOTE
         self.is_remote = self.origin != zenoh.Locality.SESSION_LOCAL
@@ -59,8 +64,8 @@ class Asking:
     """A query on its way: who has been asked and has not concluded yet, and which replies are passed on."""
 
     selector: zenoh.Selector
-    on_reply: Callable[[Reply], object]
-    on_end: Callable[[], object]
+    sink: Sink
+    """Destination of replies, closed at the end."""
     _: KW_ONLY
     target: zenoh.QueryTarget | None = None
     consolidation: Any = None
@@ -89,7 +94,7 @@ class Asking:
         self._pending = 1
         self._timer: asyncio.TimerHandle | None = None
         self.is_over = False
-        self.session: object | None = None
+        self.session: Any = None
         """The session that asks, None for another vehicle."""
 
     @property
@@ -114,29 +119,41 @@ class Asking:
         """Have a queryable take the query."""
         query = Query(self, entity)
         if not self.is_over:
-            entity.sink.push(query)
+            (entity.sink.push if entity.session is self.session else entity.arrive)(query)
 
     def reply(self, reply: Reply, session: object | None = None) -> None:
         """Take a reply of a session, None for one that comes by radio: of others it has the query's priority."""
         sample = reply.result
+        if isinstance(sample, Sample) and (session is None or session is not self.session):
+            reply = Reply(msgspec.structs.replace(sample, **self.qos), reply.replier_id)
+        self._arrive(self._take, reply, session)
+
+    def _arrive(self, act: Callable[[Any], object], item: Any, session: Any) -> None:
+        if self.session is None or session is self.session:
+            act(item)
+        else:
+            self.session.outlet.intake.take(self.sink, act, item)
+
+    def _take(self, reply: Reply) -> None:
+        sample = reply.result
         if self.is_over:
             return
-        if isinstance(sample, Sample) and (session is None or session is not self.session):
-            sample = msgspec.structs.replace(sample, **self.qos)
-            reply = Reply(sample, reply.replier_id)
         if not isinstance(sample, Sample) or not self._consolidates:
-            self.on_reply(reply)
+            self.sink.push(reply)
             return
         key = str(sample.key_expr)
         before = self._replies.get(key)
         if before is None or _is_not_older(sample, before.result):
             self._replies[key] = reply
             if not self._holds_back:
-                self.on_reply(reply)
+                self.sink.push(reply)
 
-    def done(self) -> None:
-        """Take note that one of those asked has concluded."""
-        self._pending -= 1
+    def done(self, session: object | None = None) -> None:
+        """Take note that one of those asked has concluded: a session, None for other vehicles."""
+        self._arrive(self._conclude, 1, session)
+
+    def _conclude(self, number: int) -> None:
+        self._pending -= number
         if self._pending == 0:
             self._end()
 
@@ -153,10 +170,10 @@ class Asking:
             self._timer.cancel()
         if self._holds_back:
             for reply in self._replies.values():
-                self.on_reply(reply)
+                self.sink.push(reply)
         if error is not None:
-            self.on_reply(error)
-        self.on_end()
+            self.sink.push(error)
+        self.sink.close()
 
     def _expire(self) -> None:
         self._end(Reply(ReplyError(zenoh.ZBytes("Timeout"), NO_ENCODING)))
@@ -232,6 +249,8 @@ class Query:
         attachment: Any = None,
         timestamp: zenoh.Timestamp | None = None,
     ) -> None:
+        check({"congestion_control": congestion_control, "priority": priority, "express": express})
+        check({"timestamp": timestamp})
         asking, key_expr = self._asking, key_of(key)
         if not asking.takes_any_key and not asking.key.intersects(key_expr):
             raise zenoh.ZError(f"Attempted to reply on `{key_expr}`, which does not intersect query `{asking.key}`")
@@ -249,4 +268,4 @@ class Query:
         """Conclude it: no more replies come from here."""
         if self._is_open:
             self._is_open = False
-            self._asking.done()
+            self._asking.done(self._entity.session)

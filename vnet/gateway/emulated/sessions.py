@@ -18,6 +18,7 @@ from vnet.gateway.emulated.values import (
     NOTHING,
     PUT,
     CallbackSink,
+    Direct,
     EntityGlobalId,
     Hello,
     MatchingStatus,
@@ -243,7 +244,7 @@ class Liveliness:
         cancellation_token: CancellationToken | None = None,
     ) -> Any:
         """Get the tokens that are there: those of other vehicles as far as they have been heard."""
-        check({"timeout": timeout})
+        check({"timeout": timeout, "cancellation_token": cancellation_token}, cancellation_token=CancellationToken)
         self._session.check_open()
         sink, seen = sink_of(handler, self._session.outlet)
         if cancellation_token is not None:
@@ -294,7 +295,12 @@ class Sending(Declared):
         self.check_declared()
         assert self._ends is not None
         self._ends.append(ends := self.session.until_closed(end))
-        return ends
+        return partial(self._end, ends)
+
+    def _end(self, ends: Callable[[], object]) -> None:
+        if self._ends and ends in self._ends:
+            self._ends.remove(ends)
+        ends()
 
     @property
     def matching_status(self) -> MatchingStatus:
@@ -321,6 +327,8 @@ class Publisher(Sending):
         reliability: zenoh.Reliability | None = None,
         allowed_destination: zenoh.Locality | None = None,
     ) -> None:
+        given = {"express": express, "priority": priority, "congestion_control": congestion_control}
+        check({**given, "reliability": reliability, "allowed_destination": allowed_destination})
         super().__init__(session, key_expr)
         self._matches = partial(session.vehicle.matches_subscriber, self.key_expr)
         self.encoding = encoding_of(encoding)
@@ -333,7 +341,6 @@ class Publisher(Sending):
             "express": express,
             "allowed_destination": allowed_destination,
         }
-        check({**self._qos, "reliability": reliability})
 
     encoding: zenoh.Encoding
     congestion_control: zenoh.CongestionControl
@@ -380,7 +387,8 @@ class Querier(Sending):
     def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
         """Ask for replies."""
         self.check_declared()
-        return self.session.get(zenoh.Selector(self.key_expr, parameters), handler, **self._options, **options)
+        selector = zenoh.Selector(self.key_expr, parameters)
+        return self.session.query(self.until_undeclared, selector, handler, **self._options, **options)
 
 
 class SessionInfo:
@@ -533,8 +541,13 @@ class Session:
         self.vehicle.put(self, sample, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return sample
 
-    def get(
+    def get(self, selector: Any, handler: Any = None, **options: Any) -> Any:
+        """Ask for replies."""
+        return self.query(self.until_closed, selector, handler, **options)
+
+    def query(
         self,
+        until: Callable[[Callable[[], object]], Callable[[], None]],
         selector: Any,
         handler: Any = None,
         *,
@@ -545,9 +558,10 @@ class Session:
         cancellation_token: CancellationToken | None = None,
         **options: Any,
     ) -> Any:
-        """Ask for replies."""
+        """Ask for replies, until they are there or what `until` is given is called."""
         check({**options, "timeout": timeout, "timestamp_instrumentation": timestamp_instrumentation})
         check({"accept_replies": accept_replies, "allowed_destination": allowed_destination})
+        check({"cancellation_token": cancellation_token}, cancellation_token=CancellationToken)
         self.check_open()
         sink, seen = sink_of(handler, self.outlet)
         selector = selector if isinstance(selector, zenoh.Selector) else zenoh.Selector(selector)
@@ -556,11 +570,11 @@ class Session:
             selector = zenoh.Selector(selector.key_expr, f"{rest};{ANY_KEY}" if rest else ANY_KEY)
 
         def ended() -> None:
-            self._ends.pop(asking.cancel, None)
+            forget()
             sink.close()
 
-        asking = Asking(selector, sink.push, ended, **options)
-        self._ends[asking.cancel] = None
+        asking = Asking(selector, Direct(sink.push, ended, sink.has_room), **options)
+        forget = until(asking.cancel)
         if cancellation_token is not None:
             cancellation_token.add(sink, asking)
         asking.expire_after(self._timeout_s if timeout is None else timeout)

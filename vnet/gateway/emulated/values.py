@@ -10,9 +10,9 @@ from contextvars import copy_context
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import lru_cache
-from math import isfinite
+from math import inf, isfinite
 from operator import index
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import msgspec
@@ -35,6 +35,8 @@ from vnet.gateway.frames import MOST_WHOLE, CrossingReply, CrossingSample, sampl
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
+MOST_COUNT = 2**64
+"""Bound of counts, and of seconds."""
 ZID_BYTES, EID_BYTES = 16, 4
 """Bytes of the ids of a session and of its entity, as they cross the radio."""
 
@@ -181,48 +183,52 @@ def refused(name: str, reason: str) -> type:
 
 
 def _seconds(value: float) -> None:
-    if not (isfinite(value) and value >= 0):
-        raise ValueError("negative timeout")
+    if not 0 <= value < MOST_COUNT:
+        raise ValueError("negative timeout, or one that is too long")
 
 
 def _count(value: int) -> None:
-    if index(value) < 0:
-        raise OverflowError("can't convert negative int to unsigned")
+    if not 0 <= index(value) < MOST_COUNT:
+        raise OverflowError("can't convert int to unsigned")
 
 
-_TYPES: dict[str, type | UnionType] = {
+BOOL = bool | np.bool_
+KINDS: dict[str, type | UnionType | Callable[[Any], object]] = {
     **dict.fromkeys(["allowed_origin", "allowed_destination"], zenoh.Locality),
-    **dict.fromkeys(["complete", "detect_late_publishers", "express", "history"], bool | np.bool_),
+    **dict.fromkeys(["complete", "detect_late_publishers", "express", "history"], BOOL),
+    **dict.fromkeys(["publisher_detection", "subscriber_detection"], BOOL),
+    **dict.fromkeys(["encoding", "attachment", "payload"], object),  # which Zenoh's own types check
+    **dict.fromkeys(["heartbeat", "sporadic_heartbeat", "timeout"], _seconds),
+    **dict.fromkeys(["capacity", "max_samples"], _count),
     "accept_replies": zenoh.ReplyKeyExpr,
     "config": zenoh.Config,
     "congestion_control": zenoh.CongestionControl,
+    "consolidation": zenoh.QueryConsolidation | zenoh.ConsolidationMode,
+    "max_age": isfinite,  # of any sign
     "periodic_queries": timedelta,
     "priority": zenoh.Priority,
     "reliability": zenoh.Reliability,
+    "source_info": SourceInfo,
     "target": zenoh.QueryTarget,
     "timestamp": zenoh.Timestamp,
+    "timestamp_instrumentation": NoneType,  # its type is refused
 }
-"""Types of arguments that are of no other."""
-_NUMBERS: dict[str, Callable[[Any], object]] = {
-    **dict.fromkeys(["heartbeat", "sporadic_heartbeat", "timeout"], _seconds),
-    **dict.fromkeys(["capacity", "max_samples"], _count),
-    "max_age": isfinite,  # of any sign
-}
-"""Check of each argument that is a number."""
+"""Type of each option, or check of one that is a number."""
 
 
-def check(options: Mapping[str, Any]) -> None:
-    """Raise as Zenoh for an option of another type or sign, and ZError for what virtual time does not have."""
+def check(options: Mapping[str, Any], **kinds: Any) -> None:
+    """Raise as Zenoh for an option that there is not, or of another type or sign; `kinds` go before `KINDS`."""
     for name, value in options.items():
-        if value is None and name != "config":
+        kind = kinds.get(name) or KINDS.get(name)
+        if kind is None:
+            raise TypeError(f"got an unexpected keyword argument '{name}'")
+        if value is None and name not in ("capacity", "config", "session"):
             continue
-        if name == "timestamp_instrumentation":
-            raise zenoh.ZError(f"{name} is not available on virtual time: sessions have no transport")
-        if name in _NUMBERS:
-            _NUMBERS[name](value)
-        elif not isinstance(value, kind := _TYPES.get(name, object)):
+        if not isinstance(kind, type | UnionType):
+            kind(value)
+        elif not isinstance(value, kind):
             given = type(value).__name__
-            wanted = kind.__name__ if isinstance(kind, type) else "bool"
+            wanted = kind.__name__ if isinstance(kind, type) else kind.__args__[0].__name__
             raise TypeError(f"argument '{name}': '{given}' object cannot be converted to '{wanted}'")
 
 
@@ -305,11 +311,13 @@ def result_of(reply: CrossingReply) -> Sample | ReplyError:
 
 
 class DefaultHandler:
-    """The default channel, of any length."""
+    """The default channel."""
+
+    capacity = 256
 
 
 class FifoChannel(DefaultHandler):
-    """A channel of any length: a full one would stop Zenoh, and here stops nothing."""
+    """A channel whose writers wait while it is full."""
 
     def __init__(self, capacity: int) -> None:
         check({"capacity": capacity})
@@ -320,13 +328,78 @@ class RingChannel(FifoChannel):
     """A channel that keeps the newest items."""
 
 
-class Handler:
+class Intake:
+    """Items that wait for room at a session, in order; one stops all that follow, as it stops Zenoh's thread."""
+
+    def __init__(self) -> None:
+        self._held: deque[tuple[Sink, Callable[[Any], object], Any]] = deque()
+        self._called: CallbackSink | None = None
+        """The latest callback that is called in Zenoh's own thread."""
+        self.is_giving = False
+
+    def take(self, sink: Sink, act: Callable[[Any], object], item: Any) -> None:
+        """Have `act` give an item to `sink` once that has room, and all before it has been given."""
+        self._held.append((sink, act, item))
+        if len(self._held) == 1:
+            self._go_on()
+
+    def go_on_soon(self) -> None:
+        """Go on, as there is room, once the present code has blocked or returned."""
+        if self._held:
+            asyncio.get_running_loop().call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        self.is_giving = True
+        try:
+            while self._held and self._held[0][0].has_room() and not (self._called and self._called.is_running):
+                sink, act, item = self._held[0]
+                self._called = sink if isinstance(sink, CallbackSink) and sink.is_direct else None
+                act(item)
+                self._held.popleft()
+        finally:
+            self.is_giving = False
+
+
+class _Queue:
+    """Items on their way to a program, as many as its capacity; a thread that adds more waits."""
+
+    def __init__(self, capacity: float, intake: Intake) -> None:
+        self._items: deque[Any] = deque()
+        self._capacity, self._intake = capacity, intake
+        self._room = Waiting()
+        self._closed = False
+
+    def has_room(self) -> bool:
+        """Return whether an item stops nobody."""
+        return len(self._items) < self._capacity or self._closed
+
+    def _is_given_by_program(self) -> bool:
+        return current_strand() is not None and not self._intake.is_giving
+
+    def _takes(self) -> bool:
+        """Return whether it is open; a thread of the program waits for room before."""
+        while not self.has_room() and self._is_given_by_program():
+            self._room.wait()
+        return not self._closed
+
+    def _next(self) -> Any:
+        item = self._items.popleft()
+        self._freed()
+        return item
+
+    def _freed(self) -> None:
+        self._room.wake()
+        self._intake.go_on_soon()
+
+
+class Handler(_Queue):
     """A channel, with the reading end that a program sees."""
 
-    def __init__(self, most: int | None = None) -> None:
-        self._items: deque[Any] = deque(maxlen=most)
+    def __init__(self, channel: DefaultHandler, intake: Intake) -> None:
+        is_ring = isinstance(channel, RingChannel)
+        super().__init__(inf if is_ring else max(channel.capacity, 1), intake)
+        self._items = deque(maxlen=channel.capacity if is_ring else None)
         self._waiting = Waiting()
-        self._closed = False
 
     def __class_getitem__(cls, item: object) -> type[Handler]:
         return cls
@@ -334,7 +407,7 @@ class Handler:
     def try_recv(self) -> Any:
         """Return the next item, None if there is none now. Raises ZError if there will be none."""
         if self._items:
-            return self._items.popleft()
+            return self._next()
         if self._closed:
             raise zenoh.ZError("channel is empty and closed")
         look()
@@ -346,7 +419,7 @@ class Handler:
             if self._closed:
                 raise zenoh.ZError("channel is empty and closed")
             self._waiting.wait()
-        return self._items.popleft()
+        return self._next()
 
     def __iter__(self) -> Iterator[Any]:
         return self
@@ -361,47 +434,58 @@ class Handler:
 
     def push(self, item: Any) -> None:
         """Add an item, and wake who waits longest."""
-        self._items.append(item)
-        self._waiting.wake()
+        if self._takes():
+            self._items.append(item)
+            self._waiting.wake()
 
     def close(self) -> None:
         """Add no more."""
         self._closed = True
         self._waiting.wake_all()
+        self._freed()
 
 
-class CallbackSink:
-    """A callback in a thread of its own, as Zenoh's Python runs it."""
+class CallbackSink(_Queue):
+    """A callback in a thread of its own, as Zenoh's Python runs it, or without a queue in the thread that calls."""
 
-    def __init__(self, callback: Callable[[Any], Any], drop: Callable[[], Any] | None, outlet: Outlet) -> None:
-        self._callback = callback
-        self._drop = drop
+    def __init__(self, callback: Callback[Any], outlet: Outlet) -> None:
+        super().__init__(DefaultHandler.capacity, outlet.intake)
+        self._callback, self._drop, self.is_direct = callback.callback, callback.drop, not callback.indirect
         self._outlet = outlet
         self._number = outlet.threads.new_number()
         self._context = copy_context()
         self._strand: Strand | None = None
-        self._items: deque[Any] = deque()
-        self._runs = self._closed = False
+        self.is_running = False
         self._waiting = Waiting()
+
+    def has_room(self) -> bool:
+        """Return whether an item stops nobody."""
+        return not self.is_running if self.is_direct else super().has_room()
 
     def wait(self) -> None:
         """Block until the callback has had all, unless it is the callback itself that asks."""
-        if self._runs and current_strand() is not self._strand:
+        if self.is_running and current_strand() is not self._strand:
             self._waiting.wait()
 
     def push(self, item: Any) -> None:
         """Have the callback called with an item."""
+        if self.is_direct and self._is_given_by_program():
+            self._call(self._callback, item)
+            return
+        if not self._takes():
+            return
         self._items.append(item)
-        if not self._runs:
-            self._runs = True
+        if not self.is_running:
+            self.is_running = True
             self._outlet.due.soon(self)
 
     def close(self) -> None:
         """Call the callback no more, once it has had all."""
         if not self._closed:
             self._closed = True
-            if self._drop is not None and not self._runs:
-                self._runs = True
+            self._freed()
+            if self._drop is not None and not self.is_running:
+                self.is_running = True
                 self._outlet.due.soon(self)
 
     def run(self) -> None:
@@ -418,11 +502,12 @@ class CallbackSink:
     def _work(self) -> None:
         while True:  # a strand costs ten times what a switch does
             while self._items:
-                self._call(self._callback, self._items.popleft())
+                self._call(self._callback, self._next())
             if self._closed and self._drop is not None:
                 drop, self._drop = self._drop, None
                 self._call(drop)
-            self._runs = False
+            self.is_running = False
+            self._freed()
             self._waiting.wake_all()
             idle()
 
@@ -442,6 +527,7 @@ class Direct:
 
     push: Callable[[Any], object]
     close: Callable[[], object] = lambda: None
+    has_room: Callable[[], bool] = lambda: True
 
 
 Sink = Handler | CallbackSink | Direct
@@ -474,18 +560,17 @@ class Outlet(NamedTuple):
 
     due: DueCallbacks
     threads: Threads
+    intake: Intake
 
 
 def sink_of(handler: Any, outlet: Outlet) -> tuple[Handler | CallbackSink, Any]:
     """Return where items go, and the handler that the program sees. Raises ValueError for what is no handler."""
     if handler is None or isinstance(handler, DefaultHandler):
-        channel = Handler(handler.capacity if isinstance(handler, RingChannel) else None)
+        channel = Handler(handler or DefaultHandler(), outlet.intake)
         return channel, channel
     seen = None
     if isinstance(handler, tuple) and len(handler) == 2:
         handler, seen = handler
     if not callable(handler):
         raise ValueError(f"Invalid handler type {type(handler).__name__}")
-    if isinstance(handler, Callback):
-        return CallbackSink(handler.callback, handler.drop, outlet), seen
-    return CallbackSink(handler, None, outlet), seen
+    return CallbackSink(handler if isinstance(handler, Callback) else Callback(handler), outlet), seen

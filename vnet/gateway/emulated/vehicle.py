@@ -23,6 +23,7 @@ from vnet.gateway.emulated.queries import ALL_REPLIES, Asking, Entity
 from vnet.gateway.emulated.values import (
     NO_ENCODING,
     PUT,
+    Direct,
     DueCallbacks,
     EntityGlobalId,
     Reply,
@@ -151,11 +152,13 @@ class Vehicle(RadioSide[Asking]):
             if others:
                 self._loop.call_soon(self._deliver, others, stamped)
         if to_own:
-            self._deliver([each for each in matching if each.session is session and each.is_local], sample)
+            for entity in matching:
+                if entity.session is session and entity.is_local:
+                    entity.sink.push(sample)
 
     def _deliver(self, entities: list[Entity], sample: Sample) -> None:
         for entity in entities:
-            entity.sink.push(sample)
+            entity.arrive(sample)
 
     def _report(self, sample: Sample) -> None:
         try:
@@ -188,7 +191,7 @@ class Vehicle(RadioSide[Asking]):
             for entity in intersecting:
                 if entity.session is session and entity.is_local and (entity.is_complete or not all_complete):
                     asking.begun().put_to(entity)
-        asking.done()  # of the asking itself
+        asking.done(session)  # of the asking itself
 
     def _is_asked_by_radio(self, key: zenoh.KeyExpr, all_complete: bool) -> bool:
         """Return whether queries there cross. Clients of ROS 2's services ask none but complete queryables."""
@@ -209,8 +212,7 @@ class Vehicle(RadioSide[Asking]):
 
         asking = Asking(
             zenoh.Selector(query.selector),
-            reply,
-            lambda: None,
+            Direct(reply),
             **ALL_REPLIES,
             payload=query.payload,
             encoding=query.encoding,
@@ -231,7 +233,7 @@ class Vehicle(RadioSide[Asking]):
         """Tell a new subscriber of tokens which are there."""
         for token in self.tokens(watcher.key):
             watcher.told.add(str(token))
-            watcher.sink.push(token_sample(token, alive=True))
+            watcher.arrive(token_sample(token, alive=True))
 
     def _token_changed(self, key: zenoh.KeyExpr, alive: bool) -> None:
         if self.crosses(str(key)):
@@ -247,7 +249,7 @@ class Vehicle(RadioSide[Asking]):
             is_news = text not in watcher.told if alive else not watcher.session.is_closed()
             if is_news and watcher.key.intersects(key):
                 (watcher.told.add if alive else watcher.told.discard)(text)
-                watcher.sink.push(token_sample(key, alive))
+                watcher.arrive(token_sample(key, alive))
 
     async def tell_tokens(self) -> None:
         """Tell the tokens again while there are any, and forget those of vehicles that are not heard."""
@@ -320,7 +322,7 @@ class Vehicle(RadioSide[Asking]):
         shown = sample_of(sample)
         for entity in self._subscribers_of(sample.key):
             if entity.is_remote:
-                entity.sink.push(shown)
+                entity.arrive(shown)
 
     def _reply(self, query: Asking, answer: CrossingReply) -> None:
         query.reply(Reply(result_of(answer), EntityGlobalId(self.zid, 0)))  # as a gateway, which passes it on
