@@ -35,7 +35,7 @@ def vnet(command: str, scenario: str, *options: str, watch: Callable[[int], None
             sys.executable,
             "-P",
             "-m",
-            "emulator.cli",
+            "emulator",
             command,
             scenario,
             "--out",
