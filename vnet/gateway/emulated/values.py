@@ -340,7 +340,7 @@ class Intake:
     def take(self, sink: Sink, act: Callable[[Any], object], item: Any) -> None:
         """Have `act` give an item to `sink` once that has room, and all before it has been given."""
         self._held.append((sink, act, item))
-        if len(self._held) == 1:
+        if not self.is_giving:
             self._go_on()
 
     def go_on_soon(self) -> None:
@@ -352,10 +352,9 @@ class Intake:
         self.is_giving = True
         try:
             while self._held and self._held[0][0].has_room() and not (self._called and self._called.is_running):
-                sink, act, item = self._held[0]
+                sink, act, item = self._held.popleft()
                 self._called = sink if isinstance(sink, CallbackSink) and sink.is_direct else None
                 act(item)
-                self._held.popleft()
         finally:
             self.is_giving = False
 
