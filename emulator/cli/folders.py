@@ -159,14 +159,14 @@ def report(
 ) -> None:
     """Rebuild a run's report.html from its files alone."""
     with one_line_errors():
-        path = _write_index(index) if index is not None else _write_report(run)
+        path, damages = (_write_index(index), []) if index is not None else _write_report(run)
         print(path, flush=True)
         if index is None and not (run / VERDICT_FILE).exists():
             tell(f"{run}: has no verdict: the run is still going on, or was ended from outside")
         if show and not webbrowser.open(path.resolve().as_uri()):
             raise VnetError(f"--open: no browser was found here; open {path}")
-        if index is None and (lost := _damages(run)):
-            raise VnetError(f"{run}: its verdict stands on files that cannot be read: {'; '.join(lost)}")
+        if damages:
+            raise VnetError(f"{run}: its verdict stands on files that cannot be read: {'; '.join(damages)}")
 
 
 def report_at_end(folder: Path) -> None:
@@ -201,17 +201,13 @@ def compare(
         raise typer.Exit(0 if comparison.same_trace and not comparison.partings else 1)
 
 
-def _write_report(folder: Path) -> Path:
+def _write_report(folder: Path) -> tuple[Path, list[str]]:
+    """Write a run's report; returns its path, and why files on which the verdict stands cannot be read."""
+    from emulator.report.source import Source
     from emulator.report.write import write_report  # slow to import
 
-    return write_report(folder)
-
-
-def _damages(folder: Path) -> list[str]:
-    from emulator.report.source import Source
-    from emulator.report.write import damages
-
-    return damages(Source(folder))
+    source = Source(folder)
+    return write_report(source), source.damages
 
 
 def _write_index(folder: Path) -> Path:

@@ -53,6 +53,7 @@ def render(
     rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Rebuild a run's recording (and its report, where the recording is the run's own) from its files alone."""
+    from emulator.report.source import Source
     from emulator.report.write import write_report  # slow to import
 
     with one_line_errors():
@@ -66,7 +67,7 @@ def render(
         )
         print(recording)
         if out is None:
-            print(write_report(run))
+            print(write_report(Source(run)))
 
 
 def _write_recording(played: Iterator[Message], sinks: Sinks) -> None:

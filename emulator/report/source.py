@@ -122,6 +122,20 @@ class Source(OpenedRun):
         return spans + [FaultSpan(label, start_s, max(start_s, self.end_s)) for label, start_s in started.items()]
 
     @cached_property
+    def damages(self) -> list[str]:
+        """Reasons why files on which the verdict stands cannot be read; none where there is no verdict."""
+        if maybe(lambda: self.record) is None:
+            return []
+        reads = (
+            lambda: self.scenario,
+            lambda: self.trace,
+            lambda: self.states,
+            lambda: self.metrics,
+            lambda: self.events,
+        )
+        return list(dict.fromkeys(reason for read in reads if (reason := why_not(read))))
+
+    @cached_property
     def cut(self) -> Event | None:
         """The event that ended the run before its time."""
         return next((event for event in maybe(lambda: self.events) or () if event.has(CUTS_RUN)), None)

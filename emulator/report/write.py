@@ -43,12 +43,12 @@ SLOWEST = 10
 WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 
 
-def write_report(folder: Path) -> Path:
+def write_report(source: Source) -> Path:
     """Write RUN/report.html, and the index of `runs/` if the run lies there; returns the report's path.
 
-    Raises VnetError if `folder` is not a run's, is of a later format, or cannot be written.
+    Raises VnetError if the source's folder is not a run's, is of a later format, or cannot be written.
     """
-    source = Source(folder)
+    folder = source.folder
     source.refuse_later_format()
     known = [maybe(read) is not None for read in (lambda: source.scenario_text, lambda: source.record)]
     if not any(known):
@@ -65,7 +65,7 @@ def report_page(source: Source) -> str:
     return render(
         "report.html.j2",
         name=source.folder.resolve().name,
-        verdict=record.verdict if record and not damages(source) else None,
+        verdict=record.verdict if record and not source.damages else None,
         facts=list(_facts(source, record)),
         note=_note(source, record),
         summary=_summary(source, record),
@@ -88,20 +88,6 @@ def report_page(source: Source) -> str:
     )
 
 
-def damages(source: Source) -> list[str]:
-    """Return what is wrong with the files on which a run's verdict stands; nothing where there is no verdict."""
-    if maybe(lambda: source.record) is None:
-        return []
-    reads = (
-        lambda: source.scenario,
-        lambda: source.trace,
-        lambda: source.states,
-        lambda: source.metrics,
-        lambda: source.events,
-    )
-    return list(dict.fromkeys(reason for read in reads if (reason := why_not(read))))
-
-
 def _facts(source: Source, record: Record | None) -> Iterator[str]:
     if record is not None:
         yield counted(record.vehicles, "vehicle")
@@ -119,8 +105,9 @@ def _facts(source: Source, record: Record | None) -> Iterator[str]:
 def _note(source: Source, record: Record | None) -> str:
     """The reason for a missing verdict or an early end; "" for a run that has both."""
     if record is not None:
-        if lost := damages(source):
-            return f"The verdict, {record.verdict.value}, stood on files that cannot be read: {'; '.join(lost)}."
+        if source.damages:
+            lost = "; ".join(source.damages)
+            return f"The verdict, {record.verdict.value}, stood on files that cannot be read: {lost}."
         cut = source.cut
         return f"The run was {cut.kind} at {cut.time_ns / 1e9:.1f} s." if cut else ""
     if source.has_record:  # the checks' section says why

@@ -23,6 +23,7 @@ def main(folder: Path) -> None:
     from emulator.drivers.session import Session
     from emulator.records.events import EventKind, merged
     from emulator.records.recorded_run import RecordedRun
+    from emulator.report.source import Source
     from emulator.report.timeline import marks_of
     from emulator.report.write import write_report
     from emulator.scenario.loading import load_scenario
@@ -34,7 +35,7 @@ def main(folder: Path) -> None:
     for node in ("v01", "v02"):
         session.folder.event(session.emulation.emulated_ns, EventKind["jammed"], node, channel=5)
     session.close()
-    write_report(folder)
+    write_report(Source(folder))
     run = RecordedRun.open(folder)
     events = run.event("jammed")
     canvas = Mock()

@@ -17,6 +17,7 @@ from emulator.checks.own import own_findings
 from emulator.records.events import Event
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, NotExercised, Verdict
+from emulator.report.source import Source
 from emulator.report.write import write_report
 from emulator.scenario.program import Program
 from tests.emulator.checks.test_judge import run as simulate_in
@@ -142,7 +143,7 @@ def test_a_failed_check_makes_the_run_invalid_and_shows_its_rows(here: Path) -> 
     record = emulator.Run.open(here / "run")
     (found,) = [check for check in record.checks if check.name == "own:near"]
     assert len(found.figures["rows"]) == 10
-    assert "27 too near" in write_report(here / "run").read_text()
+    assert "27 too near" in write_report(Source(here / "run")).read_text()
 
 
 def test_one_that_raises_is_unknown_and_named_and_its_results_so_far_count(here: Path) -> None:
@@ -258,7 +259,7 @@ def test_a_folder_is_judged_by_its_own_checks_as_recorded_and_nothing_is_importe
     assert status == 1
     assert "27 too near" in text and "nobody was silent" in text and "own:crowded" in text
     assert "own_checks" not in sys.modules
-    assert write_report(here / "run").exists()
+    assert write_report(Source(here / "run")).exists()
     assert "own_checks" not in sys.modules
 
 

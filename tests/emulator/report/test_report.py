@@ -18,6 +18,7 @@ from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.index import write_index
+from emulator.report.source import Source
 from emulator.report.write import key_figures, write_report
 from tests.support.command_line import app
 from tests.support.forked_commands import NO_CHARTS
@@ -98,7 +99,7 @@ def no_charts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def page_of(folder: Path) -> Page:
-    return Page(write_report(folder).read_text())
+    return Page(write_report(Source(folder)).read_text())
 
 
 def test_figures_have_axes_with_units_and_are_those_of_the_verdict(cooperative: Path, page: Page) -> None:
@@ -169,7 +170,7 @@ def test_what_others_wrote_is_text(beacon: Path) -> None:
         events.write(json.dumps({"time_ns": 1, "kind": "crashed", "node": EVIL, "error": EVIL}) + "\n")
     (beacon / "scenario.toml").write_text((beacon / "scenario.toml").read_text() + f"# {EVIL}\n")
     evil = beacon.rename(beacon.with_name("<img src=x>"))
-    text = write_report(evil).read_text()
+    text = write_report(Source(evil)).read_text()
     index = write_index(evil.parent).read_text()
     assert EVIL not in text and "<img" not in text + index
     page = Page(text)
@@ -214,7 +215,7 @@ def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Pa
     (runs / "half-1").mkdir()
     shutil.copy(beacon / "scenario.toml", runs / "half-1")
     (runs / "notes").mkdir()
-    write_report(beacon)
+    write_report(Source(beacon))
     page = Page((runs / "index.html").read_text())
     assert "3 runs" in page.text and "notes" not in page.text
     assert page.text.count("beacon-1") == 1 and "beacon-1 · latest" in page.text.replace("  ", " ")
