@@ -108,13 +108,11 @@ ARGUMENTS = """
     session.liveliness().declare_subscriber("a", history=1)
 """
 NAMES = """
-import time
 from datetime import timedelta
 import numpy as np
 import zenoh
 from zenoh import ext, handlers
 SECOND = timedelta(seconds=1)
-asked = []
 """
 AT = {
     "CacheConfig": "ext.CacheConfig",
@@ -176,9 +174,8 @@ def generated() -> list[str]:
 def attempts() -> str:
     """Return a program that collects in `answers` what becomes of each of these calls at a `session`."""
     return f"""
-queryable, pending = session.declare_queryable("asked", asked.append), session.get("asked", timeout=60)
-time.sleep(0.2)
-answers = []
+queryable, pending = session.declare_queryable("asked"), session.get("asked", timeout=60)
+asked, answers = [queryable.recv()], []
 for call in {[*map(str.strip, ARGUMENTS.split(chr(10))[1:-1]), *generated()]!r}:
     try:
         eval(call)
