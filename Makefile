@@ -1,7 +1,13 @@
 # Two commands matter: `make demo` runs the main job, `make test` proves the build. CONTRIBUTING.md has the others.
 # Each sets up the virtual environment it needs, with the exact versions of constraints.txt.
 
-PYTHON ?= python3
+# Python, or Debian's own where that is the same version, if one of them was built with optimization, which saves 13 % of
+# a simulation's CPU time.
+OPTIMIZED := import ensurepip, sys, sysconfig, venv; \
+	sys.exit(sys.base_prefix != "/usr" and "--enable-optimizations" not in str(sysconfig.get_config_var("CONFIG_ARGS")))
+PYTHON ?= $(shell for python in python3 /usr/bin/python3; do \
+	[ "$$($$python -V | cut -d. -f-2)" = "$$(python3 -V | cut -d. -f-2)" ] && $$python -c '$(OPTIMIZED)' && echo $$python && exit; \
+	done 2>/dev/null; echo python3)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -29,8 +35,7 @@ $(READY): pyproject.toml studies/pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "Python's venv module is missing: apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' -e ./studies
-	@$(PYTHON) -c 'import sys, sysconfig as s; sys.exit(sys.prefix == "/usr" or "--enable-optimizations" in s.get_config_var("CONFIG_ARGS"))' \
-		&& echo "note: $(PYTHON) was built without optimization: a simulation takes 1.1 times the CPU time of Debian's (make clean, then make PYTHON=/usr/bin/python3)" || true
+	@$(PYTHON) -c '$(OPTIMIZED)' || echo "note: $(PYTHON) was built without optimization: a simulation takes 1.15 times the CPU time of Debian's"
 	@touch $(READY)
 
 demo: $(READY)
