@@ -25,6 +25,7 @@ from vnet.gateway.emulated.values import (
     Outlet,
     Reply,
     Sample,
+    Selector,
     Sink,
     ZenohId,
     bytes_or_none,
@@ -387,7 +388,7 @@ class Querier(Sending):
     def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
         """Ask for replies."""
         self.check_declared()
-        selector = zenoh.Selector(self.key_expr, parameters)
+        selector = Selector(self.key_expr, parameters)
         return self.session.query(self.until_undeclared, selector, handler, **self._options, **options)
 
 

@@ -142,24 +142,54 @@ class MatchingStatus(_Value, frozen=True, eq=False, gc=False):
         return f"MatchingStatus {{ matching: {str(self.matching).lower()} }}"
 
 
-class _ConfigType(type):
+class _StandIn(type):
+    """A class that stands for one of Zenoh's, whose values it makes in a way of its own."""
+
+    real: type
+
     def __instancecheck__(cls, instance: object) -> bool:
-        return isinstance(instance, zenoh.Config)
+        return isinstance(instance, cls.real)
+
+    def __getattr__(cls, name: str) -> Any:
+        return getattr(cls.real, name)
 
 
-class Config(metaclass=_ConfigType):
+def ordered(parameters: Any) -> Any:
+    """Return parameters in the order of their dict: Zenoh takes them from one in another order each time."""
+    if not isinstance(parameters, dict):
+        return parameters
+    if not all(isinstance(word, str) for item in parameters.items() for word in item):
+        return parameters
+    return ";".join(f"{key}={value}" if value else key for key, value in parameters.items() if key)
+
+
+class Parameters(metaclass=_StandIn):
+    """Zenoh's own parameters of a query."""
+
+    real = zenoh.Parameters
+
+    def __new__(cls, *parameters: Any) -> zenoh.Parameters:  # type: ignore[misc]
+        return zenoh.Parameters(*map(ordered, parameters))
+
+
+class Selector(metaclass=_StandIn):
+    """Zenoh's own selector."""
+
+    real = zenoh.Selector
+
+    def __new__(cls, arg: Any, /, parameters: Any = None) -> zenoh.Selector:  # type: ignore[misc]
+        return zenoh.Selector(arg, ordered(parameters))
+
+
+class Config(metaclass=_StandIn):
     """Zenoh's own configuration; that of the environment is found by the variables of the program."""
 
+    real = zenoh.Config
     environ: ClassVar[Mapping[str, str]] = {}
     DEFAULT_CONFIG_PATH_ENV = "ZENOH_CONFIG"
 
     def __new__(cls) -> zenoh.Config:  # type: ignore[misc]
         return zenoh.Config()
-
-    from_file = zenoh.Config.from_file
-    from_json5 = zenoh.Config.from_json5
-    get_json = zenoh.Config.get_json
-    insert_json5 = zenoh.Config.insert_json5
 
     @classmethod
     def from_env(cls) -> zenoh.Config:
