@@ -393,28 +393,50 @@ def broken_rules(recorded: RecordedRun, mac: Sidelink) -> dict[str, NDArray[np.i
     """
     on_air = ~received_twice(recorded) & (recorded.on_air_ns >= 0)
     rows = np.flatnonzero(on_air)
-    begin_ns, left_ns = recorded.on_air_ns[rows], recorded.column("left_ns")[rows]
-    lasts, rest = np.divmod(left_ns - begin_ns, mac.slot_ns)
-    most = 1 + REPEAT_SLOTS if mac.retransmit else 1
-    unaligned = (begin_ns % mac.slot_ns != 0) | (rest != 0) | (lasts < 1) | (lasts > most)
-    earliest_ns = (recorded.sent_ns[rows] // mac.slot_ns + mac.t1_slots) * mac.slot_ns
-    frames = recorded.first_rows(on_air)
-    node, slot = _occupied(recorded, mac, frames)
-    count, slots = len(recorded.node_ids), _slots(recorded, mac, rows)
+    count = len(recorded.node_ids)
+    node, slot = _occupied(recorded, mac, recorded.first_rows(on_air))
     key, times = np.unique(slot * count + node, return_counts=True)
-    deaf = np.logical_and.reduce([np.isin(each * count + recorded.receiver[rows], key) for each in slots])
-    twice = [np.isin(each * count + recorded.sender[rows], key[times > 1]) for each in slots]
+    deaf = _transmit(recorded.receiver, recorded, mac, rows, key).all(axis=0)
     outcome_deaf = recorded.outcome_is("half_duplex")[rows]
     seen = recorded.places.always_in_range[recorded.receiver[rows]]
     judged = recorded.outcome_is(*ON_AIR)[rows]
     return {
-        "unaligned": rows[unaligned],
-        "too_soon": rows[begin_ns < earliest_ns],
-        "twice": rows[np.logical_or.reduce(twice)],
+        "unaligned": rows[_unaligned(recorded, mac, rows)],
+        "too_soon": rows[_too_soon(recorded, mac, rows)],
+        "twice": rows[_transmit(recorded.sender, recorded, mac, rows, key[times > 1]).any(axis=0)],
         "heard_while_sending": rows[judged & deaf & ~outcome_deaf],
         "deaf_without_sending": rows[outcome_deaf & ~deaf & seen],
         "wrongly_detected": _wrongly_detected(recorded, mac, rows[judged & ~outcome_deaf]),
     }
+
+
+def _unaligned(recorded: RecordedRun, mac: Sidelink, rows: NDArray[np.intp]) -> Mask:
+    """Return whether each row's transmission is no whole number of slots, or of too many."""
+    begin_ns = recorded.on_air_ns[rows]
+    lasts, rest = np.divmod(recorded.column("left_ns")[rows] - begin_ns, mac.slot_ns)
+    most = 1 + REPEAT_SLOTS if mac.retransmit else 1
+    return np.asarray((begin_ns % mac.slot_ns != 0) | (rest != 0) | (lasts < 1) | (lasts > most))
+
+
+def _too_soon(recorded: RecordedRun, mac: Sidelink, rows: NDArray[np.intp]) -> Mask:
+    """Return whether each row's transmission began before the first slot that its frame may have."""
+    earliest = recorded.sent_ns[rows] // mac.slot_ns + mac.t1_slots
+    return np.asarray(recorded.on_air_ns[rows] < earliest * mac.slot_ns)
+
+
+def _transmit(
+    node: NDArray[np.intp], recorded: RecordedRun, mac: Sidelink, rows: NDArray[np.intp], keys: NDArray[np.int64]
+) -> Mask:
+    """Return whether the node of each row transmits in the first and in the last slot of its frame.
+
+    `keys` are the transmissions, slot by slot, in order.
+    """
+    keys = np.append(keys, -1)  # so that what is after the last has one to compare with
+    found = []
+    for slot in _slots(recorded, mac, rows):
+        wanted = slot * len(recorded.node_ids) + node[rows]
+        found.append(keys[np.searchsorted(keys[:-1], wanted)] == wanted)
+    return np.asarray(found)
 
 
 def _slots(recorded: RecordedRun, mac: Sidelink, rows: NDArray[np.intp]) -> list[NDArray[np.int64]]:
