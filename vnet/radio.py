@@ -125,6 +125,9 @@ class Packet(Struct, frozen=True, gc=False):  # made six times as fast as a data
     rssi_dbm: float | None = None
     snr_db: float | None = None
 
+    def __hash__(self) -> int:  # that of msgspec, and of None before Python 3.12, differ from process to process
+        return hash((self.sender, self.sent_ns, self.received_ns, self.payload))
+
 
 class RadioAbilities(NamedTuple):
     """Limits of a choice for a frame: the largest power in dBm, or None, and the bit rates in Mbit/s.

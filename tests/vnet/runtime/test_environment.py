@@ -147,3 +147,18 @@ def test_openblas_and_numpy_take_what_they_are_told_and_a_run_says_so() -> None:
     assert done.stdout.splitlines()[-1] == "False AVX2"
     other = python("-c", program, **SAME_ARITHMETIC | {"OPENBLAS_CORETYPE": "Nehalem"})
     assert other.stdout.splitlines()[-1] == "False this processor"
+
+
+@pytest.mark.slow
+def test_packets_and_ids_of_zenoh_hash_alike_in_each_process() -> None:
+    program = "\n".join(
+        [
+            "from vnet.gateway.emulated.values import EntityGlobalId, SourceInfo, ZenohId",
+            "from vnet.radio import Packet",
+            "zid = ZenohId(7)",
+            "entity = EntityGlobalId(zid, 3)",
+            "print(*map(hash, (Packet('v01', 1, 2, b'x'), zid, entity, SourceInfo(entity, 9))))",
+        ]
+    )
+    said = {python("-c", program, PYTHONHASHSEED="0").stdout for _ in range(3)}
+    assert len(said) == 1 and len(said.pop().split()) == 4

@@ -45,7 +45,14 @@ class _Value(msgspec.Struct, frozen=True, eq=False, gc=False):
     """A value that vehicles share."""
 
 
-class ZenohId(msgspec.Struct, frozen=True, gc=False):
+class _Id(msgspec.Struct, frozen=True, gc=False):
+    """A value with equals. The hash that msgspec gives has the address of the class, which differs by process."""
+
+    def __hash__(self) -> int:
+        return hash(msgspec.structs.astuple(self))
+
+
+class ZenohId(_Id, frozen=True, gc=False):
     """The id of a session."""
 
     number: int
@@ -65,7 +72,7 @@ class ZenohId(msgspec.Struct, frozen=True, gc=False):
         return cls(int.from_bytes(digest[:ZID_BYTES]) | 1 << 8 * ZID_BYTES - 1)
 
 
-class EntityGlobalId(msgspec.Struct, frozen=True, gc=False):
+class EntityGlobalId(_Id, frozen=True, gc=False):
     """The id of an entity: that of its session, and its number there."""
 
     zid: ZenohId
@@ -75,7 +82,7 @@ class EntityGlobalId(msgspec.Struct, frozen=True, gc=False):
         return f"EntityGlobalId {{ zid: {self.zid}, eid: {self.eid} }}"
 
 
-class SourceInfo(msgspec.Struct, frozen=True, gc=False):
+class SourceInfo(_Id, frozen=True, gc=False):
     """The entity that has published a sample, and the sample's number there."""
 
     source_id: EntityGlobalId
