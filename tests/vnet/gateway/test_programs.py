@@ -842,6 +842,23 @@ def test_a_querier_that_is_undeclared_ends_its_queries(drive: Drive) -> None:
     assert log(run)[:-1] == ["[]", "dropped 0.5", "0", "Invalid handler type int"]
 
 
+def test_a_get_as_long_as_replies_are_awaited_does_not_time_out(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config.from_env())
+        if sys.argv[1] == "v01":
+            session.declare_queryable("q", lambda query: query.reply("q", "yes"))
+            time.sleep(1.9)
+        else:
+            time.sleep(0.1)
+            print([reply.ok and reply.ok.payload.to_string() for reply in session.get("q", timeout=1.0)])
+        """,
+        vehicles=2,
+    )
+    assert log(run, "v02")[0] == "['yes']"
+
+
 def test_timers_ring_at_fractions_of_a_second_again_and_again(drive: Drive) -> None:
     run = drive(
         """

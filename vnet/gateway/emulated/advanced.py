@@ -412,8 +412,7 @@ class AdvancedSubscriber(Subscriber):
         parameters = f"{parameters};{ANY_KEY}" if parameters else ANY_KEY
         sink = Direct(self._replied, on_end, self._sink.has_room)
         asking = Asking(zenoh.Selector(key, parameters), sink, **ALL_REPLIES)
-        asking.expire_after(RECOVERY_TIMEOUT_S)
-        self.session.vehicle.ask(asking, self.session, to_own=True, to_others=True)
+        self.session.vehicle.ask(asking, self.session, RECOVERY_TIMEOUT_S, to_own=True, to_others=True)
 
     def _ask_about(self, source: _Source, key: str, parameters: str) -> None:
         source.queries += 1

@@ -107,8 +107,9 @@ class Asking:
         }
 
     def expire_after(self, seconds: float) -> None:
-        """End it then if it goes on."""
-        self._timer = asyncio.get_running_loop().call_later(seconds, self._expire)
+        """End it then if it goes on; who has been asked before concludes first at the same instant."""
+        if not self.is_over:
+            self._timer = asyncio.get_running_loop().call_later(seconds, self._expire)
 
     def begun(self) -> Asking:
         """Take note of one more that is asked."""

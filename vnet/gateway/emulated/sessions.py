@@ -578,8 +578,8 @@ class Session:
         forget = until(asking.cancel)
         if cancellation_token is not None:
             cancellation_token.add(sink, asking)
-        asking.expire_after(self._timeout_s if timeout is None else timeout)
-        self.vehicle.ask(asking, self, allowed_destination != REMOTE, allowed_destination != LOCAL)
+        timeout_s = self._timeout_s if timeout is None else timeout
+        self.vehicle.ask(asking, self, timeout_s, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return seen
 
     declare_subscriber = partialmethod(Subscriber)

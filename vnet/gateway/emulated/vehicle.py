@@ -169,7 +169,7 @@ class Vehicle(RadioSide[Asking]):
 
     # Queries.
 
-    def ask(self, asking: Asking, session: object | None, to_own: bool, to_others: bool) -> None:
+    def ask(self, asking: Asking, session: object | None, timeout_s: float, to_own: bool, to_others: bool) -> None:
         """Ask the queryables of a session, those of others, and other vehicles; None asks for another vehicle."""
         asking.session = session
         intersecting = [each for each in self._entities["queryable"] if each.key.intersects(asking.key)]
@@ -192,6 +192,7 @@ class Vehicle(RadioSide[Asking]):
                 if entity.session is session and entity.is_local and (entity.is_complete or not all_complete):
                     asking.begun().put_to(entity)
         asking.done(session)  # of the asking itself
+        asking.expire_after(timeout_s)
 
     def _is_asked_by_radio(self, key: zenoh.KeyExpr, all_complete: bool) -> bool:
         """Return whether queries there cross. Clients of ROS 2's services ask none but complete queryables."""
@@ -218,8 +219,7 @@ class Vehicle(RadioSide[Asking]):
             encoding=query.encoding,
             attachment=query.attachment,
         )
-        asking.expire_after(self._query_s)
-        self.ask(asking, None, to_own=False, to_others=True)
+        self.ask(asking, None, self._query_s, to_own=False, to_others=True)
 
     # Tokens.
 
