@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -61,7 +62,7 @@ SAMPLES = 20
 LEAST_NS = 1_500_000_000
 """Least time between two samples, in emulated ns: that of a run of 30 s, the shortest that is judged."""
 UNCHANGED_KB = 16
-"""Change of resident memory in KiB from which on private memory is read again: that takes 30 times as long."""
+"""Change in KiB from which on private memory is read again: that takes 30 times as long."""
 KB_PER_MB = 1e6 / 1024
 """KiB of a megabyte."""
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") // 1024
@@ -85,6 +86,18 @@ def private_kb(pid: int | str = "self") -> int | None:
         return None
 
 
+def _changes_kb(pid: int) -> tuple[int, int] | None:
+    """Return a process's resident memory and the pages it has faulted in, in KiB; None where it has just ended.
+
+    What a forked process writes to becomes its own by a fault, and was resident before.
+    """
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return int(fields[21]) * _PAGE_KB, int(fields[7]) * _PAGE_KB
+    except (OSError, IndexError, ValueError):
+        return None
+
+
 def first_over(limit_mb: float | None, pids: Mapping[str, int]) -> tuple[str, float] | None:
     """Return the first process (name to pid) that holds more private memory than the limit, and its megabytes."""
     if limit_mb is None:
@@ -103,7 +116,7 @@ class MemoryWatch:
         self._every_ns = max(LEAST_NS, duration_ns // SAMPLES)
         self._next_ns = 0
         self._series: dict[tuple[str, int], list[tuple[float, int]]] = {}
-        self._resident_kb: dict[int, int] = {}
+        self._changes_kb: dict[int, tuple[int, int]] = {}
 
     def look(self, time_ns: int, pids: Mapping[str, int]) -> None:
         """Take a sample of each process (name to pid), if it is time to."""
@@ -115,13 +128,13 @@ class MemoryWatch:
                 self._series.setdefault((name, pid), []).append((time_ns / 1e9, size_kb))
 
     def _private_kb(self, name: str, pid: int) -> int | None:
-        """Return the private memory of a process; what was read before if its resident memory is as it was."""
-        now_kb, before = resident_kb(pid), self._series.get((name, pid))
+        """Return the private memory of a process; what was read before if nothing has changed since."""
+        now_kb, before = _changes_kb(pid), self._series.get((name, pid))
         if now_kb is None:
             return None
-        if before and abs(now_kb - self._resident_kb[pid]) < UNCHANGED_KB:
+        if before and math.dist(now_kb, self._changes_kb[pid]) < UNCHANGED_KB:
             return before[-1][1]
-        self._resident_kb[pid] = now_kb
+        self._changes_kb[pid] = now_kb
         return private_kb(pid)
 
     def series(self) -> Iterator[tuple[str, list[float], list[int]]]:
