@@ -105,7 +105,7 @@ def first_over(limit_mb: float | None, pids: Mapping[str, int]) -> tuple[str, fl
     limit_kb = limit_mb * KB_PER_MB
     for name, pid in pids.items():
         if (resident_kb(pid) or 0) > limit_kb and (size_kb := private_kb(pid) or 0) > limit_kb:
-            return name, round(size_kb / KB_PER_MB, 1)
+            return name, math.ceil(size_kb / KB_PER_MB * 10) / 10  # rounded up: always more than the limit
     return None
 
 

@@ -5,11 +5,14 @@ import subprocess
 import sys
 import time
 from itertools import pairwise
+from math import floor
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from emulator.drivers import usage
-from emulator.drivers.usage import LEAST_NS, CpuWatch, MemoryWatch, cpu_time_ns
+from emulator.drivers.usage import KB_PER_MB, LEAST_NS, CpuWatch, MemoryWatch, cpu_time_ns, first_over
 
 
 def test_a_process_that_is_started_again_adds_to_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,6 +37,16 @@ def test_the_clock_of_a_process_is_read() -> None:
     assert seen is not None
     assert before <= seen <= after
     assert cpu_time_ns(2**22 + 1) is None, "there is no such process"
+
+
+@given(st.integers(1, 10**6), st.integers(1, 10**6))
+def test_what_is_over_the_limit_is_told_as_more(limit_tenths: int, over_kb: int) -> None:
+    limit_mb = limit_tenths / 10
+    with pytest.MonkeyPatch.context() as patch:
+        for size_kb in ("resident_kb", "private_kb"):
+            patch.setattr(usage, size_kb, lambda pid: floor(limit_mb * KB_PER_MB) + over_kb)
+        over = first_over(limit_mb, {"v01": 7})
+    assert over is not None and over[1] > limit_mb
 
 
 FORKED = """
