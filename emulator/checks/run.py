@@ -391,8 +391,9 @@ def steady_growth_kib_per_s(time_s: Sequence[float], size_kb: Sequence[float]) -
         return 0.0
     from_s, to_s = (time_s[0] + time_s[-1]) / 2, time_s[-1]
     levels_kb = np.interp(np.linspace(from_s, to_s, TENTHS + 1), time_s, size_kb)
-    grown_kb = float(levels_kb[-1] - levels_kb[0])
-    is_steady = int((np.diff(levels_kb) > 0).sum()) >= RISING_TENTHS and grown_kb >= FLOOR_KIB
+    rises_kb = np.diff(levels_kb)
+    grown_kb = float(min(levels_kb[-1] - levels_kb[0], TENTHS * np.median(rises_kb)))  # without a step or two
+    is_steady = int((rises_kb > 0).sum()) >= RISING_TENTHS and grown_kb >= FLOOR_KIB
     return grown_kb / (to_s - from_s) if is_steady else 0.0
 
 

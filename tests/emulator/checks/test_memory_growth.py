@@ -35,10 +35,17 @@ def test_every_leak_is_found_with_its_rate(duration_s: float, kb_per_s: float, b
 
 
 @pytest.mark.slow
-@given(durations, st.lists(st.tuples(st.floats(0, 1), st.floats(0, 1e6)), max_size=2))
-def test_two_steps_are_no_growth_whatever_their_size(duration_s: float, steps: list[tuple[float, float]]) -> None:
+@given(
+    durations, st.lists(st.tuples(st.floats(0, 1), st.floats(0, 1e6)), max_size=2), st.floats(0, FLOOR_KIB / 1.1)
+)
+def test_two_steps_and_slow_growth_are_no_growth_whatever_their_size(
+    duration_s: float, steps: list[tuple[float, float]], slow_kb: float
+) -> None:
     time_s = times(duration_s)
-    size_kb = [BASE_KB + sum(kb for share, kb in steps if t >= share * duration_s) for t in time_s]
+    slow_kb_per_s = slow_kb / (duration_s / 2)
+    size_kb = [
+        BASE_KB + slow_kb_per_s * t + sum(kb for share, kb in steps if t >= share * duration_s) for t in time_s
+    ]
     assert steady_growth_kib_per_s(time_s, size_kb) == 0
 
 
