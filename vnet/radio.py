@@ -314,7 +314,7 @@ class Radio:
         if rate_mbps is None:
             return None
         if not self.rates_mbps:
-            text = "only with [radio.path_loss] or [radio.mac], and 802.11p, a frame has a rate of its own"
+            text = "only with 802.11p, and [radio.path_loss] or [radio.mac], a frame has a rate"
             raise ValueError(f"{call}(rate_mbps={shown(rate_mbps)}): {text}")
         number = number_or_nan(rate_mbps)
         if number not in self.rates_mbps:

@@ -145,9 +145,12 @@ def apply_override(data: dict[str, Any], override: str) -> None:
 
 
 def wrong_value(path: PurePath, problem: str, overrides: Sequence[str]) -> ScenarioError:
-    """Return the error for a problem that begins with its key: of the override of that key, else of the file."""
-    found = re.match(r"[^\s:=]+", problem)
-    named = f"{found[0] if found else ''}."
+    """Return the error for a problem that begins with its key: of the override of that key, else of the file.
+
+    A problem of several keys begins with their section, and with the one that is to blame if there is one.
+    """
+    found = re.match(r"([^\s:=]+)(?:: (\w+) = )?", problem)
+    named = "".join(f"{part}." for part in found.groups() if part) if found else "."
     keys = [override.partition("=")[0].strip() for override in overrides]
     of_key = [key for key in keys if named.startswith(f"{key}.")]
     of_section = [key for key in keys if f"{key}.".startswith(named)]

@@ -12,3 +12,7 @@ def test_of_several_overrides_of_a_section_none_is_blamed_for_what_all_make() ->
     assert str(wrong_value(path, problem, both)) == f"s.toml: {problem}"
     assert isinstance(wrong_value(path, problem, both[1:]), OverrideError)
     assert isinstance(wrong_value(path, "run.tape = 3: a path", both), OverrideError)
+    of_one = wrong_value(
+        path, "radio.mac: reservation_ms = 150: 100 or 200", ["radio.mac.kind=a", "radio.mac.reservation_ms=150"]
+    )
+    assert isinstance(of_one, OverrideError) and of_one.key == "radio.mac.reservation_ms"
