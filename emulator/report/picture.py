@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator
-from itertools import accumulate, islice
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from emulator.pages.canvas import INK, PAPER, QUIET, WIDTH_PX, styled
 from emulator.pages.text import as_text
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _Drawn: TypeAlias = "tuple[str, NDArray[Any]]"
-_Rows: TypeAlias = list[tuple[int, list[_Drawn]]]
 DPI = 72
 """Pixels an inch: a point is a pixel."""
 MAP_PX, CURVE_PX = 760, 480
@@ -40,6 +39,15 @@ COLUMNS, ROWS = 2, 4
 MOST_EVENTS, MOST_SAID = 12, 6
 LONGEST_LINE, LONGEST_HEADING = 104, 230
 """Letters of a line of an event, and of the figures below the name."""
+
+
+class _Packed(NamedTuple):
+    """A figure in a column, and where it begins and ends there."""
+
+    column: int
+    begin_px: int
+    end_px: int
+    drawn: _Drawn
 
 
 def write_picture(folder: Path, path: Path) -> None:
@@ -62,13 +70,12 @@ def _picture(source: Source) -> Figure:
     problems: list[str] = []
     chart = next(_drawn({"map": map_charts(source)["map"]}, MAP_PX, problems), None)
     curves = list(islice(_drawn(figures_of(source), CURVE_PX, problems), COLUMNS * ROWS))
-    right = _in_rows(curves)
-    right_px = sum(height for height, _ in right)
+    right = list(_packed(curves))
+    right_px = max((one.end_px for one in right), default=0)
     events = [line[:LONGEST_LINE] for line in (*_events(source), *problems)]
     left_px = (TITLE_PX + chart[1].shape[0] if chart else 0) + (TITLE_PX + LINE_PX * len(events))
-    own = _in_rows(_drawn(program_charts(source), MAP_PX // COLUMNS, []))
-    ends_px = accumulate((height for height, _ in own), initial=left_px + LINE_PX)
-    own = [row for row, end_px in zip(own, islice(ends_px, 1, None), strict=True) if end_px <= right_px]
+    room_px = right_px - left_px - LINE_PX
+    own = [one for one in _packed(_drawn(program_charts(source), MAP_PX // COLUMNS, [])) if one.end_px <= room_px]
     height_px = HEADING_PX + max(left_px, right_px) + MARGIN_PX
     width_px = 3 * MARGIN_PX + MAP_PX + COLUMNS * CURVE_PX
     figure = Figure(figsize=(width_px / DPI, height_px / DPI), dpi=DPI)
@@ -80,11 +87,9 @@ def _picture(source: Source) -> Figure:
         write(title, x + 8, y + 4, fontsize=13, color=INK)
         figure.figimage(pixels, x, height_px - y - TITLE_PX - pixels.shape[0])
 
-    def place_all(rows: _Rows, x: int, y: int, width_px: int) -> None:
-        for height, row in rows:
-            for column, (title, pixels) in enumerate(row):
-                place(title, pixels, x + column * width_px, y)
-            y += height
+    def place_all(packed: list[_Packed], x: int, y: int, width_px: int) -> None:
+        for column, begin_px, _, drawn in packed:
+            place(*drawn, x + column * width_px, y + begin_px)
 
     name, facts = _heading(source)
     write(name, MARGIN_PX, 16, fontsize=20, color=INK)
@@ -101,11 +106,14 @@ def _picture(source: Source) -> Figure:
     return figure
 
 
-def _in_rows(drawn: Iterable[_Drawn]) -> _Rows:
-    """Return titles and pixels in rows, each with its height."""
-    curves = list(drawn)
-    rows = [curves[first : first + COLUMNS] for first in range(0, len(curves), COLUMNS)]
-    return [(TITLE_PX + max(pixels.shape[0] for _, pixels in row), row) for row in rows]
+def _packed(drawn: Iterable[_Drawn]) -> Iterator[_Packed]:
+    """Yield where each title and its pixels are placed: in the column that is the shortest until then."""
+    ends_px = [0] * COLUMNS
+    for each in drawn:
+        column = ends_px.index(min(ends_px))
+        begin_px = ends_px[column]
+        ends_px[column] += TITLE_PX + each[1].shape[0]
+        yield _Packed(column, begin_px, ends_px[column], each)
 
 
 def _drawn(drawers: Drawers, width_px: int, problems: list[str]) -> Iterator[_Drawn]:
