@@ -123,7 +123,7 @@ def test_programs_learn_what_the_radio_can_do() -> None:
         (PHYSICAL, {"rate_mbps": "12"}, r"rate_mbps='12'\): 802.11p has"),
         (PHYSICAL, {"rate_mbps": 7}, r"broadcast\(rate_mbps=7\): 802.11p has 3, 4.5, 6, 9, 12, 18, 24, 27$"),
         ({"mac": {}}, {"power_dbm": 10}, r"only with \[radio.path_loss\] a frame has a power$"),
-        ({}, {"rate_mbps": 12}, r"only with \[radio.path_loss\] or \[radio.mac\]"),
+        ({}, {"rate_mbps": 12}, r"rate_mbps=12\): only with 802.11p"),
     ],
 )
 def test_what_the_radio_cannot_do_is_said_in_one_line(section: Any, choice: Any, line_of_error: str) -> None:
