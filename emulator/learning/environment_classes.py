@@ -243,6 +243,8 @@ class RadioEnvironment(BaseParallelWrapper):
         for number, agent in enumerate(self._node_ids):
             if agent not in actions or agent not in self.env.agents:
                 continue
+            if agent not in self._observed:
+                raise VnetError(f"step: {shown(agent)} acts, and env has given no observation of it")
             payload = self._send(agent, self._observed[agent], actions[agent])
             if payload is not None and not isinstance(payload, bytes):
                 raise VnetError(f"send({agent!r}) = {shown(payload)}: bytes are needed, or None")

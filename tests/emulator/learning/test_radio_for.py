@@ -245,3 +245,18 @@ def test_agents_must_be_among_the_possible_ones() -> None:
     del env.possible_agents
     with pytest.raises(VnetError, match="its possible_agents are needed"):
         emulator.radio_for(env, PERFECT, **given)
+
+
+def test_who_acts_has_an_observation() -> None:
+    class Late(Crossing):
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+            seen, infos = super().reset(seed, options)
+            return {agent: seen[agent] for agent in self.agents[:-1]}, infos
+
+    env = Late(2)
+    radio = emulator.radio_for(
+        env, PERFECT, position_m=env.position_m, send=lambda *_: b"x", receive=lambda *all: all[1]
+    )
+    radio.reset(seed=1)
+    with pytest.raises(VnetError, match="'car_1' acts, and env has given no observation of it"):
+        radio.step(dict.fromkeys(env.agents, 1))
