@@ -818,6 +818,26 @@ def test_who_puts_into_a_full_channel_of_the_same_session_waits(drive: Drive) ->
     assert log(run)[:-1] == ["256 0", "257", "['0.2'] 0.4"]
 
 
+def test_a_full_channel_that_is_undeclared_lets_all_go_on_that_wait(drive: Drive) -> None:
+    run = drive("""
+        import threading, time, zenoh
+        session, done = zenoh.open(zenoh.Config.from_env()), []
+        channel = session.declare_subscriber("k", zenoh.handlers.FifoChannel(1))
+        def put(number):
+            for _ in range(2):
+                session.put("k", "")
+            done.append(number)
+        for number in range(3):
+            threading.Thread(target=put, args=[number]).start()
+        time.sleep(0.1)
+        print(done)
+        channel.undeclare()
+        time.sleep(0.1)
+        print(sorted(done))
+        """)
+    assert log(run)[:-1] == ["[]", "[0, 1, 2]"]
+
+
 def test_a_querier_that_is_undeclared_ends_its_queries(drive: Drive) -> None:
     run = drive("""
         import time, zenoh

@@ -263,7 +263,8 @@ class ProgramModules:
                 get_code: Any = _shared_code if _is_own_copy(name) else SourceFileLoader.get_code
                 exec(get_code(spec.loader, name), vars(module))
         except BaseException:
-            self.modules.take_back(name)
+            if again is None:
+                self.modules.take_back(name)
             raise
         if (prepare := self._preparations.get(name)) is not None:
             prepare(module)

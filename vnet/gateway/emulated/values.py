@@ -424,7 +424,7 @@ class _Queue:
         return item
 
     def _freed(self) -> None:
-        self._room.wake()
+        (self._room.wake_all if self._closed else self._room.wake)()
         self._intake.go_on_soon()
 
 
