@@ -225,11 +225,6 @@ class InFlight:
         """Return the time of the next arrival at any node, or None."""
         return self._soonest_ns if self._length else None
 
-    def next_ns(self, receiver: int) -> int | None:
-        """Return the time of the next arrival at `receiver`, or None."""
-        next_ns = int(self.by_receiver()[receiver])
-        return None if next_ns == NO_ARRIVAL_NS else next_ns
-
     def by_receiver(self) -> IntArray:
         """Return the time of the next arrival at each receiver (N,), or `NO_ARRIVAL_NS`; not to be changed."""
         if self._compared < self._length:
@@ -611,13 +606,8 @@ class Engine:
 
     # Arrivals.
 
-    def next_arrival_ns(self, node: int) -> int | None:
-        """Return the time of the next arrival at `node` among the frames that have been sent, or None."""
-        self._settle()
-        return self._in_flight.next_ns(node)
-
     def next_arrivals_ns(self) -> IntArray:
-        """Return the time of the next arrival at each node (N,), as `next_arrival_ns`, or `NO_ARRIVAL_NS`."""
+        """Return the time of the next arrival of a sent frame at each node (N,), or `NO_ARRIVAL_NS`."""
         self._settle()
         return self._in_flight.by_receiver()
 

@@ -157,9 +157,7 @@ def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
             asked.transmit(time_ns, node, [bytes([node]) * size])
         while True:
             asked.look_ahead(until_ns, [2, 3])
-            first_ns = min(
-                (t for node in (2, 3) if (t := asked.next_arrival_ns(node)) is not None), default=until_ns
-            )
+            first_ns = min(until_ns, *asked.next_arrivals_ns()[[2, 3]].tolist())
             if first_ns >= until_ns:
                 break
             told.append(first_ns)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.radio.engine import INITIAL_CAPACITY, Delivery, Engine
+from emulator.radio.engine import INITIAL_CAPACITY, NO_ARRIVAL_NS, Delivery, Engine
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.scenario.scenario import Radio
@@ -125,8 +125,8 @@ def test_next_times_are_those_of_the_earliest_arrival() -> None:
     subject.transmit(0, 0, [b"x"])
     arrivals = {row["receiver"]: row["arrival_ns"] for row in rows(subject)}
     assert subject.next_time() == min(arrivals.values())
-    assert all(subject.next_arrival_ns(int(r[1:])) == t for r, t in arrivals.items())
-    assert subject.next_arrival_ns(0) is None
+    assert all(subject.next_arrivals_ns()[int(r[1:])] == t for r, t in arrivals.items())
+    assert subject.next_arrivals_ns()[0] == NO_ARRIVAL_NS
 
 
 def test_moving_changes_who_hears_from_then_on() -> None:
