@@ -179,8 +179,8 @@ def place_to_serve(address: str | None = None, port: int | None = None) -> Serve
     )
 
 
-_reserved: dict[tuple[str, int], socket.socket] = {}
-"""Ports that this process has chosen by itself, until it ends."""
+_reserved: set[tuple[str, int]] = set()
+"""Addresses and ports that this process has chosen by itself, until it ends."""
 
 
 def _reserve(address: str, port: int) -> bool:
@@ -195,7 +195,8 @@ def _reserve(address: str, port: int) -> bool:
         except OSError:
             mark.close()
             return False
-        _reserved[address, port] = mark
+        mark.detach()  # open until this process ends
+        _reserved.add((address, port))
     return True
 
 
