@@ -35,6 +35,7 @@ from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.records.atomic import atomically, disk_errors, write_atomically
 from emulator.records.code_digest import digests_of
 from emulator.records.events import Level
+from emulator.records.run_folder import is_run_folder
 from emulator.scenario.loading import dump_scenario
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
@@ -242,8 +243,10 @@ def run_cells(
 
     Simulated cells run on `executor`, or in `jobs` processes of this machine (default: as many as it has cores);
     live ones one after the other, because each starts a process a vehicle. Raises VnetError if a cell cannot be
-    run, and KeyboardInterrupt: those that are finished stay.
+    run or the folder is that of a run, and KeyboardInterrupt: those that are finished stay.
     """
+    if is_run_folder(folder):
+        raise VnetError(f"{folder}: this is a run's folder, which is for that run alone")
     store = folder / ("live" if live else "cells")
     with disk_errors(store):
         store.mkdir(parents=True, exist_ok=True)

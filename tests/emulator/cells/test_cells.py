@@ -50,6 +50,13 @@ def test_a_cell_comes_out_the_same_whichever_process_runs_it(tmp_path: Path) -> 
     assert in_pool == {"seed": 3} | compute(tiny_cell(3)).figures
 
 
+def test_the_folder_of_a_run_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "verdict.json").touch()
+    with pytest.raises(VnetError, match="this is a run's folder"):
+        run_cells([tiny_cell(1)], tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["verdict.json"]
+
+
 def test_a_live_cell_whose_program_cannot_be_imported_is_refused_before_it_starts() -> None:
     scenario = tiny_cell(1).scenario.model_copy(deep=True)
     program = scenario.program.model_copy(update={"entry": "nothing:main"})
