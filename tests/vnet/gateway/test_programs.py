@@ -600,6 +600,7 @@ def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
         session = zenoh.open(zenoh.Config())
         zid, publisher = session.zid(), session.declare_publisher("a")
         print(len(str(zid)), len(bytes(zid)), repr(zid) == str(zid))
+        print(str(session) == f"Session(Session {{ id: {zid} }})")
         print(repr(publisher.id) == f"EntityGlobalId {{ zid: {zid}, eid: {publisher.id.eid} }}")
         print(publisher.matching_status)
         for act in (
@@ -625,6 +626,7 @@ def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
     )
     assert log(run)[:-1] == [
         "32 16 True",
+        "True",
         "True",
         "MatchingStatus { matching: true }",
         "TypeError argument 'priority': 'int' object cannot be converted to 'Priority'",

@@ -452,6 +452,9 @@ class Session:
     info = property(SessionInfo)
     id = property(lambda self: EntityGlobalId(self._zid, 0))
 
+    def __repr__(self) -> str:
+        return f"Session(Session {{ id: {self._zid} }})"
+
     def zid(self) -> ZenohId:
         """Return the session's id."""
         return self._zid
