@@ -280,7 +280,7 @@ class Node:
             raise ValueError(f"log(level={level!r}): allowed are {', '.join(LEVELS)}")
         self._transport.send_note(self.id, "log", level, str(text), {})
 
-    def event(self, name: str, **details: NoteDetail) -> None:
+    def event(self, name: str, /, **details: NoteDetail) -> None:
         """Record that something happened, at the present time: event `event` of `events.jsonl`.
 
         `details` are numbers, booleans or texts. Raise ValueError for any other value, an empty name, and a name by

@@ -213,7 +213,7 @@ def _seeded(generator: random.Random, a: Any = None, version: int = 2) -> None:
 
 def _drawing(own: Callable[..., Any], module: ModuleType, name: str, kind: str) -> Callable[..., Any]:
     """Return a function of a module that draws by its node's generator of this kind, or as ever."""
-    method_name = _OTHER_NAMES.get(name, name)
+    method_name = _OTHER_NAMES.get(name, name) if kind == "numpy" else name
 
     @wraps(own)
     def draw(*arguments: Any, **options: Any) -> Any:

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from random import gauss
 from random import random as drawn_by_name
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,31 @@ def test_a_seed_of_a_program_is_its_nodes_alone() -> None:
         own = as_node(first, draw)
         seed(7)
         assert draw() == own != unseeded
+
+
+@pytest.mark.parametrize("module", [random, np.random])
+def test_each_function_draws_as_that_of_a_generator_with_its_seed(module: ModuleType) -> None:
+    arguments = {"betavariate": (1, 2), "binomialvariate": (3,), "choice": ([1, 2],), "choices": ([1, 2],)}
+    arguments |= {"gammavariate": (1, 2), "getrandbits": (8,), "lognormvariate": (0, 1), "normalvariate": (0, 1)}
+    arguments |= {"expovariate": (1,), "gauss": (0, 1), "paretovariate": (1,), "randbytes": (3,), "randint": (1, 9)}
+    arguments |= {"randrange": (9,), "uniform": (1, 2), "vonmisesvariate": (0, 1), "weibullvariate": (1, 1)}
+    ours = {
+        name: own
+        for where, name, own, _ in own_asyncio._STAND_INS
+        if where is module and not name.startswith(("_", "seed", "set_state", "setstate"))
+    }
+    assert "sample" in ours
+    node = Fake(1)
+    for name in sorted(ours):
+        given = {"sample": ([1, 2, 3], 2)}.get(name, arguments.get(name, ())) if module is random else ()
+        as_node(node, partial(module.seed, 7))
+        try:
+            drawn = as_node(node, partial(getattr(module, name), *given))
+        except TypeError as error:
+            assert "required" in str(error) or "argument" in str(error), (name, error)
+            continue
+        module.seed(7)
+        assert repr(drawn) == repr(ours[name](*given)), name
 
 
 def test_functions_can_be_pickled() -> None:
