@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
@@ -194,7 +195,7 @@ class Node:
         unit: UnitAbilities | None = None,
     ) -> None:
         self._reporter = Reporter(node_id)
-        self.id = node_id
+        self.id = sys.intern(node_id)
         self._hashes = count(crc32(node_id.encode()))  # of its tasks and futures
         self._task_names = count(1)
         self.radio = Radio(node_id, transport, max_payload, abilities)

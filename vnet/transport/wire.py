@@ -13,6 +13,7 @@ references, whatever comes first: nothing depends on an order between keys.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
@@ -165,8 +166,9 @@ class WirePacket(msgspec.Struct, frozen=True, array_like=True):
         return cls(node, sender, sent_ns, received_ns, payload, packet.rssi_dbm, packet.snr_db)
 
     def packet(self) -> Packet:
-        """Return the packet as the program sees it."""
-        return Packet(self.sender, self.sent_ns, self.received_ns, self.payload, self.rssi_dbm, self.snr_db)
+        """Return the packet as the program sees it: a sender is one object, which `pickle` tells apart."""
+        sender = sys.intern(self.sender)
+        return Packet(sender, self.sent_ns, self.received_ns, self.payload, self.rssi_dbm, self.snr_db)
 
 
 class WireFix(msgspec.Struct, frozen=True, array_like=True):

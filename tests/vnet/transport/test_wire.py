@@ -1,5 +1,7 @@
 """The wire: what is encoded comes back, and whatever else comes is a WireError."""
 
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -219,3 +221,9 @@ def test_batches_are_told_from_their_first_bytes(message: wire.EmulatorMessage) 
     assert wire.is_batch(wire.encode(message)) == isinstance(message, wire.Batch)
     packets_only = isinstance(message, wire.Batch) and not message.fixes
     assert wire.is_packets_only(wire.encode(message)) == packets_only
+
+
+def test_a_sender_is_one_object_wherever_its_packets_are_received() -> None:
+    batch = wire.decode_rx(wire.encode(wire.Batch([], 0, [wire.WirePacket("v02", "v01", 1, 2, b"x")] * 2)))
+    assert isinstance(batch, wire.Batch)
+    assert all(each.packet().sender is sys.intern("v01") for each in batch.packets)
