@@ -14,7 +14,6 @@ program takes a packet.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -321,7 +320,7 @@ class Engine:
         rules: OwnRules | None = None,
         arrivals: Grid = ANY_TIME,
     ) -> None:
-        self._node_ids = tuple(map(sys.intern, node_ids))
+        self._node_ids = tuple(node_ids)
         self._radio = radio
         self._max_payload_bytes = radio.max_payload_bytes
         self._periods_ms = () if radio.sidelink is None else radio.sidelink.periods_ms

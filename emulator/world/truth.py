@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -310,7 +311,7 @@ class World:
     ) -> None:
         motion = with_units(motion, scenario.roadside)
         count = len(motion.node_ids)
-        self.node_ids = motion.node_ids
+        self.node_ids = tuple(sys.intern(str(node)) for node in motion.node_ids)  # as agents have them
         self.moves = scenario.network.moves
         self.period_ns = scenario.period_ns
         self.periods = periods_of(scenario)

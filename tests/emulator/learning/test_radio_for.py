@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from mpe2 import simple_reference_v3, simple_speaker_listener_v4
+from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import emulator
@@ -260,3 +261,27 @@ def test_who_acts_has_an_observation() -> None:
     radio.reset(seed=1)
     with pytest.raises(VnetError, match="'car_1' acts, and env has given no observation of it"):
         radio.step(dict.fromkeys(env.agents, 1))
+
+
+@pytest.mark.parametrize("agents", [[0, 1], [("car", 0), ("car", 1)]], ids=["numbers", "tuples"])
+def test_agents_have_ids_of_any_kind(agents: list[Any]) -> None:
+    class Standing(ParallelEnv[Any, Any, Any]):  # type: ignore[misc]
+        possible_agents = agents
+
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+            self.agents = [*agents]
+            return dict.fromkeys(agents, 0), {agent: {} for agent in agents}
+
+        def step(self, actions: dict[Any, Any]) -> Any:
+            no = dict.fromkeys(agents, False)
+            return dict.fromkeys(agents, 0), dict.fromkeys(agents, 0.0), no, no, {agent: {} for agent in agents}
+
+    radio = emulator.radio_for(
+        Standing(),
+        PERFECT,
+        position_m=lambda agent: (0.0, 0.0),
+        send=lambda *_: b"x",
+        receive=lambda agent, observation, packets: [packet.sender for packet in packets],
+    )
+    radio.reset(seed=1)
+    assert radio.step(dict.fromkeys(agents, 1))[0] == {agents[0]: [agents[1]], agents[1]: [agents[0]]}

@@ -129,13 +129,6 @@ def test_next_times_are_those_of_the_earliest_arrival() -> None:
     assert subject.next_arrivals_ns()[0] == NO_ARRIVAL_NS
 
 
-def test_a_sender_is_one_object_wherever_its_packets_are_received() -> None:
-    subject = engine(place(5, 3, 2000))
-    subject.transmit(0, 0, [b"x"])
-    delivered = list(subject.advance(10**9))
-    assert delivered and all(each.packet.sender is sys.intern("v0") for each in delivered)
-
-
 def test_moving_changes_who_hears_from_then_on() -> None:
     subject = engine(np.array([[0.0, 0.0], [1e4, 0.0]]))
     subject.transmit(0, 0, [b"x"])

@@ -1,6 +1,7 @@
 """The world: truth and fixes have the statistics that the scenario asks for, and every vehicle its own streams."""
 
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -279,3 +280,7 @@ def test_an_exception_for_a_vehicle_that_is_not_there_is_refused() -> None:
     program = {"exceptions": [{"nodes": ["nobody"], "entry": "agents.beacon:main"}]}
     with pytest.raises(ScenarioError, match="'nobody': no such vehicle; the network has "):
         build_world(Scenario.model_validate({"network": {"vehicles": 3}, "program": program}))
+
+
+def test_the_name_of_a_vehicle_is_one_object_in_the_run_and_at_its_program() -> None:
+    assert build_world(scenario()).node_ids[0] is sys.intern("v01")
