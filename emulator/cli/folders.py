@@ -163,10 +163,11 @@ def report(
         print(path, flush=True)
         if index is None and not (run / VERDICT_FILE).exists():
             tell(f"{run}: has no verdict: the run is still going on, or was ended from outside")
-        if show and not webbrowser.open(path.resolve().as_uri()):
-            raise VnetError(f"--open: no browser was found here; open {path}")
+        is_shown = not show or webbrowser.open(path.resolve().as_uri())
         if damages:
             raise VnetError(f"{run}: its verdict stands on files that cannot be read: {'; '.join(damages)}")
+        if not is_shown:
+            raise VnetError(f"--open: no browser was found here; open {path}")
 
 
 def report_at_end(folder: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import webbrowser
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -334,11 +335,12 @@ def test_compare_refuses_an_unfinished_run(beacon_run: Path, beacon: Path) -> No
 @pytest.mark.usefixtures("no_charts")
 @pytest.mark.parametrize("damaged", ["trace.parquet", "states.parquet", "scenario.toml"])
 def test_report_of_a_damaged_run_bears_no_verdict_and_ends_with_an_error(
-    beacon: Path, damaged: str, capsys: pytest.CaptureFixture[str]
+    beacon: Path, damaged: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(webbrowser, "open", lambda uri: False)
     content = (beacon / damaged).read_bytes()
     (beacon / damaged).write_bytes(content[: len(content) // 2])
     assert "The verdict, valid, stood on files that cannot be read" in page_of(beacon).text
     with pytest.raises(typer.Exit) as ended:
-        report_cli.report(beacon)
+        report_cli.report(beacon, show=True)
     assert ended.value.exit_code == 2 and damaged.split(".")[0] in capsys.readouterr().err
