@@ -404,8 +404,8 @@ CHECKS: list[Check] = [
         MACHINE,
         "The private memory of agents' processes, in events `memory` {node, time_s, private_kb}. A note names "
         f"those in which it grows steadily: it rises in at least {RISING_TENTHS} of the ten tenths of the second "
-        f"half of a process's life, and by at least {FLOOR_KIB:g} KiB in all. The emulator's own process keeps the "
-        "trace and is not judged.",
+        f"half of a process's life, and by at least {FLOOR_KIB:g} KiB in all without a step or two. The emulator's "
+        "own process keeps the trace and is not judged.",
         unknown="a process exceeded `run.memory_limit_mb`, which ended the run",
         not_applicable="not measured by vnet simulate, or measured for less than 30 s",
         without_positions=WithoutPositions.JUDGE,
