@@ -265,7 +265,7 @@ def test_who_acts_has_an_observation() -> None:
 
 @pytest.mark.parametrize("agents", [[0, 1], [("car", 0), ("car", 1)]], ids=["numbers", "tuples"])
 def test_agents_have_ids_of_any_kind(agents: list[Any]) -> None:
-    class Standing(ParallelEnv[Any, Any, Any]):  # type: ignore[misc]
+    class Motionless(ParallelEnv[Any, Any, Any]):  # type: ignore[misc]
         possible_agents = agents
 
         def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -277,7 +277,7 @@ def test_agents_have_ids_of_any_kind(agents: list[Any]) -> None:
             return dict.fromkeys(agents, 0), dict.fromkeys(agents, 0.0), no, no, {agent: {} for agent in agents}
 
     radio = emulator.radio_for(
-        Standing(),
+        Motionless(),
         PERFECT,
         position_m=lambda agent: (0.0, 0.0),
         send=lambda *_: b"x",
