@@ -33,7 +33,7 @@ $(READY): pyproject.toml studies/pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { echo "vnet needs Python 3.11 or newer: apt-get install python3 python3-venv"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "vnet needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) -V). Try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "Python's venv module is missing: apt-get install python3-venv"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' -e ./studies
 	@$(PYTHON) -c '$(OPTIMIZED)' || echo "note: $(PYTHON) was built without optimization: a simulation takes 1.15 times the CPU time of Debian's"
 	@touch $(READY)
