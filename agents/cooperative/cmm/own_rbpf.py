@@ -22,7 +22,6 @@ from agents.cooperative.cmm.information import (
     Five,
     Information,
     inverse,
-    inverted,
     new_at_mean,
     plain_moments,
     square_root,
@@ -41,8 +40,11 @@ a map are metres apart."""
 SIZE_STEP = 1.5
 """Ratio by which the number of particles that is wanted must differ before it changes: each change resamples."""
 LARGEST_PULL = 1.0
-"""Largest distance, in deviations of the cloud, by which what others know moves its mean in a period: further out
-there are too few particles."""
+"""Largest distance, in deviations of what was known, by which what others know moves the mean in a period: further
+out there are too few particles."""
+PULL_REACH = 3.0
+"""Deviations from the mean beyond which a particle is drawn no more than there: a hump on a lane far away, however
+unlikely, would outweigh all others."""
 _IDENTITY = np.eye(2)
 
 
@@ -214,25 +216,26 @@ class OwnRbpf:
         humps are narrow, and the moments say much more after a fix than its increment does: then what is new is
         what `pooled` says beyond the belief before the fix and the increment. So it is where increments of others
         are those of lanes (`is_of_lanes`). Less than nothing is never new: it would drive the cloud outward. Beside
-        what is new, which is at the mean of `pooled`, the cloud moves to that mean.
+        what is new, which is at the mean of `pooled`, the cloud moves as the mean of what is replaced does.
         """
         before = self._said if self._is_precise or is_of_lanes else self.belief
         a, b, d, x, y = new_at_mean(before, pooled).numbers
-        pull_x, pull_y = self._pull(pooled)
-        x, y = x + pull_x, y + pull_y
         c_x, c_y = self.common_m
-        self._log_weight = self._log_weight + c_x * (x - 0.5 * (a * c_x) - b * c_y) + c_y * (y - 0.5 * (d * c_y))
+        new = c_x * (x - 0.5 * (a * c_x) - b * c_y) + c_y * (y - 0.5 * (d * c_y))
+        self._log_weight = self._log_weight + new + self._pull(before, pooled)
         self._settle()
 
-    def _pull(self, pooled: Information) -> tuple[float, float]:
-        """Return the vector that moves the mean of the cloud to that of `pooled`, by `LARGEST_PULL` at most."""
-        x, y, *_ = plain_moments(*pooled.numbers)
-        m_x, m_y, p, q, r = self.plain_moments
-        a, b, d = inverted(p, q, r)
-        off_x, off_y = x - m_x, y - m_y
+    def _pull(self, before: Information, pooled: Information) -> Array:
+        """Return log weights (K,) that move the mean of `before` to that of `pooled`, by `LARGEST_PULL` at most."""
+        to_x, to_y, *_ = plain_moments(*pooled.numbers)
+        from_x, from_y, *_ = plain_moments(*before.numbers)
+        a, b, d, _, _ = before.numbers
+        off_x, off_y = to_x - from_x, to_y - from_y
         x, y = a * off_x + b * off_y, b * off_x + d * off_y
-        share = min(1.0, LARGEST_PULL / math.sqrt(max(off_x * x + off_y * y, 1e-300)))
-        return share * x, share * y
+        distance = math.sqrt(max(off_x * x + off_y * y, 1e-300))
+        (m_x, m_y), (c_x, c_y) = self.estimate_m.tolist(), self.common_m
+        along = (x * (c_x - m_x) + y * (c_y - m_y)) / distance
+        return np.asarray(min(distance, LARGEST_PULL) * np.clip(along, -PULL_REACH, PULL_REACH))
 
     def _settle(self) -> None:
         """After the weights have changed: drop lanes, and resample if it is due."""

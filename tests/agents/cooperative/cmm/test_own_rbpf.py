@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from agents.cooperative.cmm.information import Information
@@ -241,3 +243,27 @@ def test_others_who_know_less_take_nothing_away_while_lanes_compete(noise_m2: Ar
 
     assert_allclose(known(2.0).estimate_covariance_m2, known(1.01).estimate_covariance_m2)
     assert np.linalg.eigvalsh(known(2.0).estimate_covariance_m2)[1] < 30
+
+
+@given(
+    beside_m=st.floats(8.0, 30.0),
+    across_m=st.floats(-3.0, 3.0),
+    sigma_m=st.sampled_from([0.1, 0.3, 1.0]),
+    is_of_lanes=st.booleans(),
+)
+@example(14.7, 2.5, 0.1, True)
+def test_others_who_know_less_make_no_far_lane_likely(
+    beside_m: float, across_m: float, sigma_m: float, is_of_lanes: bool
+) -> None:
+    """What they know excludes no lane: if it draws to one at all, a lane that is out of question stays so."""
+    lanes = np.array([[0.0, 0.0], [0.0, beside_m]]), np.zeros(2)
+    own = OwnRbpf(lanes, LaneModel(), 1000, np.random.default_rng(3))
+    before = own.belief
+    own.predict(0.1)
+    assert own.take(np.array([1.0, across_m]), sigma_m**2 * np.eye(2)) is not None
+    unlikely = own.lane_probability.min() if len(own.lane_probability) > 1 else 0.0
+    own.absorb(before, is_of_lanes)
+    remaining = own.decided() or own
+    assert remaining.position_m()[0][1] < beside_m / 2
+    if remaining is own:
+        assert own.lane_probability.min() < 30 * unlikely
