@@ -323,10 +323,14 @@ class Radio:
         return number
 
     def _checked_period(self, call: str, period_ms: float | None) -> float | None:
-        """Return a period as a float, None if the radio reserves nothing. Raise ValueError for an unknown one."""
-        if period_ms is None or not self.periods_ms:
+        """Return a period as a float, None if the radio reserves nothing. Raise ValueError for one that is none."""
+        if period_ms is None:
             return None
         number = number_or_nan(period_ms)
+        if not self.periods_ms:
+            if not 0 < number < math.inf:
+                raise ValueError(f"{call}(period_ms={shown(period_ms)}): a number above 0 is needed")
+            return None
         if number not in self.periods_ms:
             short = [f"{each:g}" for each in self.periods_ms if each < 100]
             text = ", ".join(short) if len(short) < 5 else f"{short[0]} to {short[-1]}"

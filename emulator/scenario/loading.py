@@ -149,7 +149,7 @@ def wrong_value(path: PurePath, problem: str, overrides: Sequence[str]) -> Scena
 
     A problem of several keys begins with their section, and with the one that is to blame if there is one.
     """
-    found = re.match(r"([^\s:=]+)(?:: (\w+) = )?", problem)
+    found = re.match(r"([^\s:=]+)(?:: ([\w.]+) = )?", problem)
     named = "".join(f"{part}." for part in found.groups() if part) if found else "."
     keys = [override.partition("=")[0].strip() for override in overrides]
     of_key = [key for key in keys if named.startswith(f"{key}.")]

@@ -132,12 +132,12 @@ def test_fading_of_short_frames_on_the_resources_of_long_ones_is_not_judged(tmp_
     assert check_run(tmp_path / "run").verdict.value == "valid", "the periods that it told are in the trace"
 
 
-CHOICES: dict[str, dict[str, Any]] = {"rate": {"rate_mbps": 6.0}, "period": {"period_ms": 30.0}}
+CHOICES: dict[str, dict[str, Any]] = {"rate": {"rate_mbps": 6.0}, "period": {"period_ms": 30.0}, "none": {"period_ms": -1}}
 
 
 async def asks(node: Node) -> None:
     """Try what only some radios have."""
-    for call in ("send", "rate", "period"):
+    for call in ("send", *CHOICES):
         try:
             if call == "send":
                 await node.radio.send("v02", b"x")
@@ -162,6 +162,7 @@ def test_programs_are_told_what_a_sidelink_does_not_have(tmp_path: Path) -> None
     assert "802.11p" in lte["send"]["error"] and "802.11p" in lte["rate"]["error"]
     assert "allowed are 20, 50, 100" in lte["period"]["error"] and lte["busy"]["ratio"] >= 0
     assert csma["send"]["ok"] and csma["rate"]["ok"] and csma["period"]["ok"]
+    assert "allowed are" in lte["none"]["error"] and "above 0" in csma["none"]["error"]
 
 
 def test_window_is_as_long_as_a_frame_takes_at_least() -> None:

@@ -16,3 +16,5 @@ def test_of_several_overrides_of_a_section_none_is_blamed_for_what_all_make() ->
         path, "radio.mac: reservation_ms = 150: 100 or 200", ["radio.mac.kind=a", "radio.mac.reservation_ms=150"]
     )
     assert isinstance(of_one, OverrideError) and of_one.key == "radio.mac.reservation_ms"
+    of_list = wrong_value(path, "radio.mac: bler.2 = 5: less", ["radio.mac.kind=a", "radio.mac.bler=[1, 5]"])
+    assert isinstance(of_list, OverrideError) and of_list.key == "radio.mac.bler"
