@@ -30,6 +30,7 @@ from docs.examples.its2.standard_messages import (
 )
 from emulator import SensedTruth
 from tests.support.paths import ROOT
+from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
 
@@ -145,6 +146,15 @@ def test_a_bsm_comes_through(path: Any, message: Message) -> None:
     assert_close(Message(message.station, 0, message.position_m, message.heading_rad), decoded)
     assert decoded is not None and decoded.time_ns == message.time_ns % 60_000_000_000
     assert decoded.speed_m_s == pytest.approx(message.speed_m_s, abs=0.011)
+
+
+def test_another_schema_than_that_of_a_bsm_is_told_in_one_line(tmp_path: Path) -> None:
+    other = tmp_path / "other.asn"
+    other.write_text(STAND_IN.read_text().replace("long ", "lon "))
+    with pytest.raises(VnetError, match=r"^program\.options\.asn1: .*$"):
+        encode_bsm(Message(2**40, 0, (0.0, 0.0), 0.0, -3.0), 0, schema(other))
+    with pytest.raises(VnetError, match="5"):
+        schema(5)
 
 
 def test_a_bsm_is_read_by_a_second_codec_and_written_with_the_same_bytes(tmp_path: Path) -> None:

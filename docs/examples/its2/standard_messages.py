@@ -14,7 +14,7 @@ from typing import Any
 
 import asn1tools
 
-from vnet.errors import VnetError
+from vnet.errors import VnetError, printable
 
 PROFILE = Path(__file__).with_name("its2.asn")
 ORIGIN_DEG = 48.7758, 9.1829
@@ -43,7 +43,7 @@ def schema(path: str | Path = PROFILE, *needed: str) -> Any:
 
     Raises VnetError in one line, also if one of the types `needed` is not there.
     """
-    path = Path(path)
+    path = Path(str(path))
     files = sorted(path.rglob("*.asn")) if path.is_dir() else [path]
     if not files or not all(file.is_file() for file in files):
         raise VnetError(f"program.options.asn1 = '{path}': a file of ASN.1, or a folder with *.asn, is needed")
@@ -195,18 +195,21 @@ def decode_vam(payload: bytes, types: Any, now_ns: int) -> Message | None:
 
 
 def encode_bsm(message: Message, count: int, types: Any) -> bytes:
-    """Return a `MessageFrame` with a BSM, the `count`-th of its station, whose core data say what is not known."""
+    """Return a `MessageFrame` with a BSM, the `count`-th of its station, whose core data say what is not known.
+
+    Raises VnetError in one line for `types` that have other fields.
+    """
     place = _place(message.position_m)
     core = {
         "msgCnt": count % 128,
-        "id": message.station.to_bytes(4, "big"),
+        "id": (message.station % 2**32).to_bytes(4, "big"),
         "secMark": message.time_ns // 1_000_000 % 60_000,
         "lat": place["latitude"],
         "long": place["longitude"],
         "elev": -4096,
         "accuracy": {"semiMajor": 255, "semiMinor": 255, "orientation": 65535},
         "transmission": "unavailable",
-        "speed": min(round(message.speed_m_s / 0.02), 8190),
+        "speed": min(round(abs(message.speed_m_s) / 0.02), 8190),
         "heading": round(math.degrees(math.pi / 2 - message.heading_rad) % 360 / 0.0125) % 28800,
         "angle": 127,
         "accelSet": {"long": 2001, "lat": 2001, "vert": -127, "yaw": 0},
@@ -216,8 +219,11 @@ def encode_bsm(message: Message, count: int, types: Any) -> bytes:
         },
         "size": {"width": 180, "length": 450},
     }
-    value = types.encode("BasicSafetyMessage", {"coreData": core})
-    return bytes(types.encode("MessageFrame", {"messageId": BSM, "value": value}))
+    try:
+        value = types.encode("BasicSafetyMessage", {"coreData": core})
+        return bytes(types.encode("MessageFrame", {"messageId": BSM, "value": value}))
+    except asn1tools.EncodeError as error:
+        raise VnetError(f"program.options.asn1: not the BSM of J2735: {printable(str(error), 80)}") from None
 
 
 def decode_bsm(payload: bytes, types: Any) -> Message | None:

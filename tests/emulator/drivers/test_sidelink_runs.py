@@ -132,7 +132,11 @@ def test_fading_of_short_frames_on_the_resources_of_long_ones_is_not_judged(tmp_
     assert check_run(tmp_path / "run").verdict.value == "valid", "the periods that it told are in the trace"
 
 
-CHOICES: dict[str, dict[str, Any]] = {"rate": {"rate_mbps": 6.0}, "period": {"period_ms": 30.0}, "none": {"period_ms": -1}}
+CHOICES: dict[str, dict[str, Any]] = {
+    "rate": {"rate_mbps": 6.0},
+    "period": {"period_ms": 30.0},
+    "none": {"period_ms": -1},
+}
 
 
 async def asks(node: Node) -> None:
