@@ -255,7 +255,7 @@ def test_others_who_know_less_take_nothing_away_while_lanes_compete(noise_m2: Ar
 def test_others_who_know_less_make_no_far_lane_likely(
     beside_m: float, across_m: float, sigma_m: float, is_of_lanes: bool
 ) -> None:
-    """What they know excludes no lane, and a lane that is out of question stays so."""
+    """Others who know less exclude no lane, and a lane that is out of question stays so."""
     lanes = np.array([[0.0, 0.0], [0.0, beside_m]]), np.zeros(2)
     own = OwnRbpf(lanes, LaneModel(), 1000, np.random.default_rng(3))
     before = own.belief
