@@ -13,6 +13,10 @@ independent, and add up exactly. `CommonMemory` is a Gaussian over c, its value 
 Multipath is part of the offset, and makes it larger and last longer. So there are *families* of kinds, by deviation
 and correlation time of the offset relative to those of a receiver without multipath, rounded up.
 
+Where nobody has so precise a receiver (`PRECISE_M2`) increments are about c: they also hold what fixes say along
+the lane (4 % of the error of c), and what the vehicle has learned of c from others. A receiver that states
+multipath is always taken for a precise one.
+
 An increment of a lane is written as (a_x, a_y, −kind, w, age): Λ = a aᵀ and η = a w about c − u. The exchange of a
 vehicle holds its own increments, and those that it takes.
 """
@@ -25,7 +29,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from agents.cooperative.cmm.information import NOTHING, Five, Information, Three, inverted, plain_moments
+from agents.cooperative.cmm.information import (
+    NOTHING,
+    PRECISE_M2,
+    Five,
+    Information,
+    Three,
+    inverted,
+    plain_moments,
+)
 from agents.cooperative.cmm.kalman_bound import LaneModel
 from agents.cooperative.cmm.own_kalman import OwnKalman
 from agents.cooperative.cmm.own_vehicle import OwnVehicle
@@ -60,11 +72,6 @@ NOT_BEGUN: Five = (0.0, 0.0, -1.0, 0.0, -1.0)
 UNDERSTATED = 0.5
 """Share by which averaged priors understate what is new: a vehicle adds the increments within two hops, and the
 averages hold those of all. Without it the ANEES of c is 0.55 to 0.9 on N1, N2 and N3, the bound's 1.1 to 1.3."""
-LEAST_NOISE_M2 = 0.64
-"""Variance (m²) of fixes across the lane below which the movement of c between fixes shows in increments about c
-(0.8 m). Where nobody has so precise a receiver increments are about c: they also hold what fixes say along the lane
-(4 % of the error of c), and what the vehicle has learned of c from others. A receiver that states multipath is
-always taken for a precise one."""
 SMOOTHING = 0.05
 """Weight of the latest period in the share of increments that come from out of range."""
 
@@ -483,7 +490,7 @@ class LaneExchange:
     def _is_precise(self, lane: OwnKalman, fix: Observation | None) -> bool:
         if fix is None:
             return False
-        return self._own.model is not self._model or lane.noise_across(fix.white_covariance_m2) < LEAST_NOISE_M2
+        return self._own.model is not self._model or lane.noise_across(fix.white_covariance_m2) < PRECISE_M2
 
     def _advance(self, periods: int) -> None:
         if self._begins:

@@ -14,6 +14,10 @@ So each hypothesis is a Gaussian over [c, p, v, l], the common error, position a
 That the vehicle is on no road is the last hypothesis: anywhere within 15 m of one. From it lanes are found again.
 
 Multipath that a receiver states is part of p and of l: p is then what fixes show, up to c and white noise.
+
+A precise receiver counts as one of `PRECISE_M2`, as far as its fixes are about c: with what they say beyond that
+the vehicles would correct c by many times its movement, and it would diverge. The position has their full
+precision.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cooperative.cmm.information import NOTHING, Five, Information, gained, inverse, transport
+from agents.cooperative.cmm.information import NOTHING, PRECISE_M2, Five, Information, gained, inverse, transport
 from agents.cooperative.cmm.kalman_bound import common_step
 from agents.cooperative.cmm.map_matching import MAX_GATE_M, MAX_LANES, MIN_GATE_M, OFF_ROAD_WITHIN_M, STAND_M
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
@@ -330,6 +334,7 @@ class OwnVehicleOnMap:
         self._outliers_s = 0.0
         self._heading_rad: float | None = None
         self._multipath = (0.0, 0.0)
+        self._rest: tuple[Array, Array] | None = None  # what the latest fix says of c + p beyond `PRECISE_M2`
         self.owed = NOTHING
         self._take_moments()
         self.prior = Information.of(*self.belief)
@@ -368,7 +373,14 @@ class OwnVehicleOnMap:
         """Return position (2,) and covariance (2, 2); None as long as no fix tells it."""
         if not self._is_placed:
             return None
-        return self._mean[2:4], self._covariance[2:4, 2:4] + self._multipath[0] ** 2 * np.eye(2)
+        mean_m, covariance_m2 = self._mean[2:4], self._covariance[2:4, 2:4]
+        if self._rest:
+            seen_m, noise_m2 = self._rest
+            rows = self._covariance[:4, :2] + self._covariance[:4, 2:4]
+            gain = rows[2:] @ inverse(rows[:2] + rows[2:] + noise_m2)
+            mean_m = mean_m + gain @ (seen_m - self._mean[:2] - mean_m)
+            covariance_m2 = covariance_m2 - gain @ rows[2:].T
+        return mean_m, covariance_m2 + self._multipath[0] ** 2 * np.eye(2)
 
     def sample(self, count: int) -> Array:
         """Draw `count` hypotheses (count, 2) of the common error."""
@@ -381,20 +393,26 @@ class OwnVehicleOnMap:
         self._predict(dt_s)
         self._take_moments()
         self.prior = Information.of(*self.belief)
+        self._rest = None
         if fix is None:
             return NOTHING
         if fix.heading_rad is not None:
             self._heading_rad = fix.heading_rad
+        exact_m2 = fix.white_covariance_m2
+        more_m2 = max(PRECISE_M2 - float(exact_m2.diagonal().min()), 0.0)
+        noise_m2 = exact_m2 + more_m2 * np.eye(2)
         if not self._is_placed:
-            self._place(fix)
+            self._place(fix, noise_m2)
         elif self._is_outlier(fix):
             self._outliers_s += dt_s
             if self._outliers_s < LOST_S:
                 return NOTHING
-            self._place(fix)
+            self._place(fix, noise_m2)
         else:
-            self._hypotheses.update(fix.position_m, fix.white_covariance_m2)
+            self._hypotheses.update(fix.position_m, noise_m2)
         self._outliers_s = 0.0
+        if more_m2:  # 1 / R − 1 / (R + more) is left
+            self._rest = fix.position_m, exact_m2 + exact_m2 @ exact_m2 / more_m2
         self._look(fix)
         self._take_moments()
         return self._gained()
@@ -419,14 +437,14 @@ class OwnVehicleOnMap:
         seen = rows[:, :2] + rows[:, 2:4] + fix.white_covariance_m2
         return bool(off_m @ np.linalg.solve(seen, off_m) > self._config.gate_sigmas**2)
 
-    def _place(self, fix: Observation) -> None:
-        """Begin where the fix says, on an unknown lane, with what is known of c."""
+    def _place(self, fix: Observation, noise_m2: Array) -> None:
+        """Begin where the fix says up to noise (2, 2), on an unknown lane, with what is known of c."""
         mean_m, covariance_m2 = self.belief
         mean, covariance = np.zeros(SIZE), np.zeros((SIZE, SIZE))
         mean[:2], mean[2:4] = mean_m, fix.position_m - mean_m
         covariance[:2, :2] = covariance_m2
         covariance[:2, 2:4] = covariance[2:4, :2] = -covariance_m2
-        covariance[2:4, 2:4] = covariance_m2 + fix.white_covariance_m2
+        covariance[2:4, 2:4] = covariance_m2 + noise_m2
         covariance[4:OFFSET, 4:OFFSET] = self._config.driving_m_s**2 * np.eye(2)
         self._hypotheses = RoadHypotheses(mean, covariance, self._config.off_road, self._config.lateral_m)
         self._anchor_m = np.full(2, np.nan)

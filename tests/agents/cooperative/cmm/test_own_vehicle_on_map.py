@@ -154,3 +154,33 @@ def test_a_belief_from_outside_replaces_its_own() -> None:
     vehicle.absorb(Information.of(COMMON_M, 0.1 * np.eye(2)))
     assert_allclose(vehicle.sample(2000).mean(axis=0), COMMON_M, atol=0.05)
     assert vehicle.step(0.1, None).matrix.any() == np.False_
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 0.1, 0.3, 1.0])
+def test_many_precise_receivers_do_not_drive_c_away(sigma_m: float) -> None:
+    """All see the same movement of c between fixes, and each corrects it: added up, that is many times too much."""
+    rng, noise_m2 = np.random.default_rng(7), sigma_m**2 * np.eye(2)
+    vehicles = [vehicle_on(roads((0, 0, EAST), (0, -200, NORTH), sigma_m=0.5), RbpfConfig()) for _ in range(20)]
+    common_m, aside_m = COMMON_M.copy(), rng.normal(0, 0.5, 20)
+    for step in range(200):
+        common_m += 0.055 * rng.standard_normal(2)
+        way_m = np.full(20, 50 + 1.2 * step)
+        place_m = np.stack([way_m, aside_m], axis=1)
+        place_m[1::2] = place_m[1::2, ::-1]  # every other drives north
+        fix_m = place_m + common_m + sigma_m * rng.standard_normal((20, 2))
+        said = [
+            vehicle.step(0.1, Observation(fix_m[k], noise_m2, (EAST, NORTH)[k % 2]))
+            for k, vehicle in enumerate(vehicles)
+        ]
+        pooled = vehicles[0].prior
+        for increment in said:
+            pooled = pooled.plus(increment)
+        for vehicle in vehicles:
+            vehicle.absorb(pooled)
+    off_m, covariance_m2 = pooled.moments()[0] - common_m, pooled.moments()[1]
+    assert off_m @ np.linalg.solve(covariance_m2, off_m) < 18.4  # of 10⁴ honest ones one is further off
+    for k, vehicle in enumerate(vehicles):
+        found = vehicle.position_m()
+        assert found is not None
+        off_m = found[0] - place_m[k]
+        assert off_m @ np.linalg.solve(found[1], off_m) < 18.4
