@@ -7,7 +7,7 @@ payload asks for. Both sides of the wall read them: gateways and emulated sessio
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from itertools import count
 from typing import Annotated, Any, Literal
@@ -27,6 +27,8 @@ MOST_UNFINISHED = 64
 MOST_WHOLE = 1024
 """Messages of one frame that are kept decoded, for all who receive it."""
 MOST_FRAGMENTS = 65_535
+ZID_BYTES, EID_BYTES = 16, 4
+"""Bytes of the ids of a session and of its entity."""
 MOST_MESSAGES = 2**32
 """Messages that an incarnation of a sender has numbers for."""
 
@@ -39,15 +41,10 @@ Nanoseconds = Annotated[int, msgspec.Meta(ge=0, lt=NS_PER_S)]
 TimestampId = Annotated[bytes, msgspec.Meta(min_length=1, max_length=16)]
 
 
-SourceOf = Callable[[Any], tuple[bytes, int]]
-"""Returns what stands for a `SourceInfo` on the radio."""
-
-
 class CrossingSample(msgspec.Struct, array_like=True, frozen=True, tag="sample"):
     """A sample on its way over the radio.
 
-    `time` is seconds, nanoseconds and id of its timestamp. `source` stands for its `SourceInfo`, which Python
-    cannot construct: process and number there. Gateways of other processes put the sample without.
+    `time` is seconds, nanoseconds and id of its timestamp, `source` the publisher and its number for the sample.
     """
 
     key: str
@@ -102,7 +99,13 @@ class Fragment(msgspec.Struct, array_like=True, frozen=True):
     content: bytes
 
 
-def crossing_sample(sample: Any, stamp: zenoh.Timestamp | None, source_of: SourceOf) -> CrossingSample:
+def entity_bytes(entity: Any) -> bytes:
+    """Return the id of an entity: that of its session, and its number there."""
+    eid: int = entity.eid
+    return bytes(entity.zid).ljust(ZID_BYTES, b"\0") + eid.to_bytes(EID_BYTES, "little")
+
+
+def crossing_sample(sample: Any, stamp: zenoh.Timestamp | None) -> CrossingSample:
     """Return what of a sample crosses the radio, with a timestamp that it need not have had itself."""
     time, source = None, sample.source_info
     if stamp is not None:
@@ -118,7 +121,7 @@ def crossing_sample(sample: Any, stamp: zenoh.Timestamp | None, source_of: Sourc
         _name_of(sample.congestion_control),
         sample.express,
         time,
-        None if source is None else source_of(source),
+        None if source is None else (entity_bytes(source.source_id), source.source_sn),
     )
 
 
@@ -128,10 +131,10 @@ def crossing_query(number: int, query: Any) -> CrossingQuery:
     return CrossingQuery(number, str(query.selector), _bytes(query.payload), encoding, _bytes(query.attachment))
 
 
-def crossing_reply(asker: str, query: CrossingQuery, reply: Any, source_of: SourceOf) -> CrossingReply:
+def crossing_reply(asker: str, query: CrossingQuery, reply: Any) -> CrossingReply:
     """Return what of a reply to another vehicle's query crosses the radio."""
     if reply.ok is not None:
-        return CrossingReply(asker, query.number, crossing_sample(reply.ok, reply.ok.timestamp, source_of))
+        return CrossingReply(asker, query.number, crossing_sample(reply.ok, reply.ok.timestamp))
     return CrossingReply(asker, query.number, None, (reply.err.payload.to_bytes(), str(reply.err.encoding)))
 
 

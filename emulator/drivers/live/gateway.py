@@ -9,13 +9,9 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import secrets
 import ssl
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache
-from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,6 +29,7 @@ from vnet.gateway.frames import (
     Message,
     crossing_reply,
     crossing_sample,
+    entity_bytes,
     sample_options,
 )
 from vnet.gateway.keys import REPORT_KEY
@@ -40,17 +37,14 @@ from vnet.gateway.radio_side import RadioSide
 from vnet.gateway.ros2 import Ros2
 from vnet.transport.session import open_local_router, router_endpoint
 
-MOST_SOURCES = 100_000
-"""Instances of `SourceInfo` that are kept for samples on their way."""
-PROCESS_ID_BYTES = 8
 ECHO_S = 2.0
 """Seconds after a token was taken back in which Zenoh's echoes of it are not taken for a program's own."""
 REMOTE = zenoh.Locality.REMOTE
 
 T = TypeVar("T")
 
-_sources: OrderedDict[int, zenoh.SourceInfo] = OrderedDict()
-_source_numbers = count()
+_publishers: dict[bytes, zenoh.EntityGlobalId] = {}
+"""Ids of publishers whose samples have numbers, which Python cannot construct."""
 
 
 class Gateway(RadioSide[zenoh.Query]):
@@ -132,7 +126,8 @@ class Gateway(RadioSide[zenoh.Query]):
         if self.crosses(str(sample.key_expr)) and self._session is not None:
             # A delete has none, and the routers of receivers would give it theirs.
             stamp = sample.timestamp or self._session.new_timestamp()
-            self._tell("message", crossing_sample(sample, stamp, _source_of))
+            _keep_publisher(sample)
+            self._tell("message", crossing_sample(sample, stamp))
 
     def _asked(self, query: zenoh.Query) -> None:
         if self.crosses(str(query.key_expr)):
@@ -221,7 +216,8 @@ class Gateway(RadioSide[zenoh.Query]):
         assert self._session is not None
 
         def answered(reply: zenoh.Reply) -> None:
-            self._tell("message", crossing_reply(asker, query, reply, _source_of))
+            _keep_publisher(reply.ok)
+            self._tell("message", crossing_reply(asker, query, reply))
 
         self._session.get(
             query.selector,
@@ -324,23 +320,13 @@ def check_trust(settings: ZenohSessions) -> None:
         ) from None
 
 
+def _keep_publisher(sample: zenoh.Sample | None) -> None:
+    if sample is not None and sample.source_info is not None:
+        publisher = sample.source_info.source_id
+        _publishers[entity_bytes(publisher)] = publisher
+
+
 def _known_source(sample: CrossingSample) -> zenoh.SourceInfo | None:
-    """Return the `SourceInfo` of a sample that a gateway of this process has sent."""
-    if sample.source is None or sample.source[0] != _this_process():
-        return None
-    return _sources.get(sample.source[1])
-
-
-@cache
-def _this_process() -> bytes:
-    """Return an id that no process on any host shares."""
-    return secrets.token_bytes(PROCESS_ID_BYTES)
-
-
-def _source_of(source: zenoh.SourceInfo) -> tuple[bytes, int]:
-    """Return what stands for a `SourceInfo` on the radio."""
-    number = next(_source_numbers)
-    _sources[number] = source
-    if len(_sources) > MOST_SOURCES:
-        _sources.popitem(last=False)
-    return _this_process(), number
+    """Return the `SourceInfo` of a sample if a gateway of this process knows its publisher."""
+    publisher = None if sample.source is None else _publishers.get(sample.source[0])
+    return None if sample.source is None or publisher is None else zenoh.SourceInfo(publisher, sample.source[1])

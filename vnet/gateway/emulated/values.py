@@ -31,14 +31,12 @@ from vnet.gateway.emulated.strands import (
     idle,
     look,
 )
-from vnet.gateway.frames import MOST_WHOLE, CrossingReply, CrossingSample, sample_options
+from vnet.gateway.frames import MOST_WHOLE, ZID_BYTES, CrossingReply, CrossingSample, sample_options
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
 
 MOST_COUNT = 2**64
 """Bound of counts, and of seconds."""
-ZID_BYTES, EID_BYTES = 16, 4
-"""Bytes of the ids of a session and of its entity, as they cross the radio."""
 
 
 class _Value(msgspec.Struct, frozen=True, eq=False, gc=False):
@@ -277,12 +275,6 @@ def timestamp_at(unix_ns: int, zid: ZenohId) -> zenoh.Timestamp:
     return zenoh.Timestamp(zenoh.NTP64(*divmod(unix_ns, NS_PER_S)), bytes(zid))
 
 
-def origin_of(source: SourceInfo) -> tuple[bytes, int]:
-    """Return what stands for a `SourceInfo` on the radio."""
-    zid, eid = source.source_id.zid.number, source.source_id.eid
-    return zid.to_bytes(ZID_BYTES, "little") + eid.to_bytes(EID_BYTES, "little"), source.source_sn
-
-
 PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
 NOTHING = zenoh.ZBytes(b"")
 NO_ENCODING = zenoh.Encoding.ZENOH_BYTES
@@ -322,10 +314,11 @@ def token_sample(key: zenoh.KeyExpr, alive: bool) -> Sample:
 @lru_cache(maxsize=MOST_WHOLE)
 def sample_of(crossing: CrossingSample) -> Sample:
     """Return the sample that has crossed the radio. Raises ZError, ValueError or OverflowError for none."""
-    origin, source = crossing.source, None
-    if origin is not None:
-        zid, eid = (int.from_bytes(part, "little") for part in (origin[0][:ZID_BYTES], origin[0][ZID_BYTES:]))
-        source = SourceInfo(EntityGlobalId(ZenohId(zid), eid), origin[1])
+    source = None
+    if crossing.source is not None:
+        entity, number = crossing.source
+        zid, eid = (int.from_bytes(part, "little") for part in (entity[:ZID_BYTES], entity[ZID_BYTES:]))
+        source = SourceInfo(EntityGlobalId(ZenohId(zid), eid), number)
     return Sample(
         key_of(crossing.key),
         zenoh.ZBytes(crossing.payload),

@@ -30,7 +30,6 @@ from vnet.gateway.emulated.values import (
     Sample,
     ZenohId,
     key_of,
-    origin_of,
     result_of,
     sample_of,
     timestamp_at,
@@ -145,7 +144,7 @@ class Vehicle(RadioSide[Asking]):
                 stamped = msgspec.structs.replace(sample, timestamp=self.new_timestamp(self.zid))
             if self.crosses(key):
                 # Also a delete: by the radio Zenoh's routers would give it a later one, of the receiver's.
-                self._send(crossing_sample(stamped, stamped.timestamp or self.new_timestamp(self.zid), origin_of))
+                self._send(crossing_sample(stamped, stamped.timestamp or self.new_timestamp(self.zid)))
             elif key == REPORT_KEY:
                 self._report(sample)
             others = [each for each in matching if each.session is not session and each.is_remote]
@@ -209,7 +208,7 @@ class Vehicle(RadioSide[Asking]):
         """Ask the sessions of this vehicle on behalf of another, and send their replies by radio."""
 
         def reply(reply: Reply) -> None:
-            self._send(crossing_reply(asker, query, reply, origin_of))
+            self._send(crossing_reply(asker, query, reply))
 
         asking = Asking(
             zenoh.Selector(query.selector),
