@@ -162,15 +162,15 @@ class AdvancedPublisher(Publisher):
         self._told = 0
         eid = self.id.eid if misses is not None else _WITHOUT_ID
         own_key = key_of(f"{self.key_expr}/@adv/pub/{session.zid()}/{eid}/_")
-        self._cache, self._ends = None if cache is None else _Cache(session, cache), []
+        self._cache = None if cache is None else _Cache(session, cache)
         if self._cache is not None:
             queryable = Entity("queryable", session, session.id, own_key, Direct(self._cache.answer))
-            self._ends.append(session.declare(queryable))
+            self.until_end(session.declare(queryable))
         if publisher_detection:
-            self._ends.append(LivelinessToken(session, own_key).undeclare_if_declared)
+            self.until_end(LivelinessToken(session, own_key).end)
         if misses is not None and (period_s := misses.heartbeat or misses.sporadic_heartbeat) is not None:
             heart = _every(period_s, partial(self._beat, own_key, misses.heartbeat is None))
-            self._ends.append(session.until_closed(heart.cancel))
+            self.until_end(session.until_end(heart.cancel))
 
     def _beat(self, key: zenoh.KeyExpr, sporadic: bool) -> None:
         number = self._number or 0
@@ -269,7 +269,7 @@ class SampleMissListener(Listening):
     def __init__(self, subscriber: AdvancedSubscriber, handler: Any = None) -> None:
         super().__init__(handler, subscriber.session.outlet)
         subscriber.miss_sinks.append(self._sink)
-        self._ends = [partial(subscriber.miss_sinks.remove, self._sink), self._sink.close]
+        self._ends = dict.fromkeys([partial(subscriber.miss_sinks.remove, self._sink), self._sink.close])
 
 
 class AdvancedSubscriber(Subscriber):
@@ -298,13 +298,13 @@ class AdvancedSubscriber(Subscriber):
         self.miss_sinks: list[Sink] = []
         """Destinations of what is missed for good."""
         super().__init__(session, key_expr, handler, allowed_origin=allowed_origin)
-        ends = [*(self._ends or ()), session.until_closed(self._stop)]
+        self.until_end(session.until_end(self._stop))
         publishers = key_of(f"{self.key_expr}/@adv/pub/**")
 
         def declare(kind: Literal["subscriber", "watcher"], take: Callable[[Sample], None]) -> Entity:
             sink = Direct(take, has_room=self._sink.has_room)
             entity = Entity(kind, session, self.id, publishers, sink, allowed_origin)
-            ends.append(session.declare(entity))
+            self.until_end(session.declare(entity))
             return entity
 
         if history is not None:
@@ -315,8 +315,7 @@ class AdvancedSubscriber(Subscriber):
             declare("subscriber", self._hear_heartbeat)
         if subscriber_detection:
             token = LivelinessToken(session, f"{self.key_expr}/@adv/sub/{session.zid()}/{self.id.eid}/_")
-            ends.append(token.undeclare_if_declared)
-        self._ends = ends
+            self.until_end(token.end)
 
     def _intake(self) -> Sink:
         return Direct(self._take, self._sink.close, self._sink.has_room)

@@ -53,19 +53,41 @@ _REFUSED_SETTINGS = (
 LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
 
 
-class Declared:
-    """An entity that a session has declared; a `with` block undeclares it."""
+class Ending:
+    """A session, or an entity that it has declared; a `with` block ends it."""
 
-    _ends: list[Callable[[], object]] | None = None
-    """Undeclare it, one after another; None unless it is declared."""
-    _noun = "LivelinessToken"
-    """Word of Zenoh's messages for it."""
+    _ends: dict[Callable[[], object], None] | None = None
+    """Called at its end, in this order; None unless it is open or declared."""
 
     def __enter__(self) -> Any:
         return self
 
     def __exit__(self, *_args: object, **_kwargs: object) -> None:
-        self.undeclare_if_declared()
+        self.end()
+
+    def until_end(self, end: Callable[[], object]) -> Callable[[], None]:
+        """Have `end` called at its end; return what calls it before."""
+        assert self._ends is not None
+        self._ends[end] = None
+        return partial(self._end_before, end)
+
+    def _end_before(self, end: Callable[[], object]) -> None:
+        if self._ends and end in self._ends:
+            del self._ends[end]
+            end()
+
+    def end(self) -> None:
+        """End it unless it has ended."""
+        ends, self._ends = self._ends, None
+        for end in ends or ():
+            end()
+
+
+class Declared(Ending):
+    """An entity that a session has declared."""
+
+    _noun = "LivelinessToken"
+    """Word of Zenoh's messages for it."""
 
     def check_declared(self) -> None:
         """Raise ZError if it has been undeclared."""
@@ -75,13 +97,7 @@ class Declared:
     def undeclare(self) -> None:
         """Undeclare it. Raises ZError if it has been."""
         self.check_declared()
-        self.undeclare_if_declared()
-
-    def undeclare_if_declared(self) -> None:
-        """Undeclare it unless it has been."""
-        ends, self._ends = self._ends, None
-        for end in ends or ():
-            end()
+        self.end()
 
 
 class Listening(Declared):
@@ -92,7 +108,7 @@ class Listening(Declared):
     def __init__(self, handler: Any, outlet: Outlet) -> None:
         self._sink, self._handler = sink_of(handler, outlet)
         self._is_background = callable(handler)
-        self._ends = [self._sink.close]
+        self._ends = {self._sink.close: None}
 
     _is_background = True
     """True if it goes on when the program discards it, as a callback does."""
@@ -121,20 +137,20 @@ class Listening(Declared):
         finally:
             self._readers -= 1
 
-    def undeclare_if_declared(self) -> None:
+    def end(self) -> None:
         """Undeclare it unless it has been. Raises RuntimeError while a thread is in `recv`, as Zenoh's Python."""
         if self._readers:
             if (node := present_node()) is not None:
                 node.log("undeclare() while a thread is in recv() raises RuntimeError, as at Zenoh", "warning")
             raise RuntimeError("Already borrowed")
-        super().undeclare_if_declared()
+        super().end()
 
     def __iter__(self) -> Any:
         return iter(self.handler)
 
     def __del__(self) -> None:
         if not self._is_background:
-            self.undeclare_if_declared()
+            self.end()
 
 
 class Subscriber(Listening):
@@ -157,7 +173,7 @@ class Subscriber(Listening):
         super().__init__(handler, session.outlet)
         self.session = session
         self._entity = Entity(self.kind, session, own_id, key, self._intake(), allowed_origin, bool(complete))
-        self._ends = [session.declare(self._entity)]
+        self._ends = {session.declare(self._entity): None}
 
     id = property(lambda self: self._entity.id)
     key_expr = property(lambda self: self._entity.key)
@@ -189,10 +205,10 @@ class LivelinessToken(Declared):
     """A token."""
 
     def __init__(self, session: Session, key: Any) -> None:
-        self._ends = [session.declare(Entity("token", session, session.new_id(), key_of(key)))]
+        self._ends = {session.declare(Entity("token", session, session.new_id(), key_of(key))): None}
 
     def __del__(self) -> None:
-        self.undeclare_if_declared()
+        self.end()
 
 
 class CancellationToken:
@@ -264,7 +280,7 @@ class MatchingListener(Listening):
     def __init__(self, owner: Sending, handler: Any = None) -> None:
         super().__init__(handler, owner.session.outlet)
         self._owner, self._matching = owner, False
-        self._ends = [owner.until_undeclared(self._stop)]
+        self._ends = {owner.until_undeclared(self._stop): None}
         owner.session.vehicle.on_matching.append(self._look)
         self._look()
 
@@ -289,19 +305,12 @@ class Sending(Declared):
 
     def __init__(self, session: Session, key: Any) -> None:
         self.session, self.id, self.key_expr = session, session.new_id(), key_of(key)
-        self._ends = []
+        self._ends = {}
 
     def until_undeclared(self, end: Callable[[], object]) -> Callable[[], None]:
         """Have `end` called when it is undeclared, or its session closed; return what calls it before."""
         self.check_declared()
-        assert self._ends is not None
-        self._ends.append(ends := self.session.until_closed(end))
-        return partial(self._end, ends)
-
-    def _end(self, ends: Callable[[], object]) -> None:
-        if self._ends and ends in self._ends:
-            self._ends.remove(ends)
-        ends()
+        return self.until_end(self.session.until_end(end))
 
     @property
     def matching_status(self) -> MatchingStatus:
@@ -419,16 +428,14 @@ class SessionInfo:
     declare_link_events_listener = declare_transport_events_listener
 
 
-class Session:
+class Session(Ending):
     """A session."""
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, config: zenoh.Config) -> None:
         check({"config": config})
         self.vehicle, self.outlet = vehicle, outlet
         self._entity_numbers = count(1)
-        self._is_closed = False
-        self._ends: dict[Callable[[], object], None] = {}
-        """Undeclare what is declared, in the order of declarations."""
+        self._ends = {}
 
         def setting(name: str) -> Any:
             return msgspec.json.decode(config.get_json(name))
@@ -443,12 +450,6 @@ class Session:
         self.stamps = bool(enabled.get(mode) if isinstance(enabled, dict) else enabled)
         """True if its samples have timestamps of its own."""
 
-    def __enter__(self) -> Session:
-        return self
-
-    def __exit__(self, *_args: object, **_kwargs: object) -> None:
-        self.close()
-
     info = property(SessionInfo)
     id = property(lambda self: EntityGlobalId(self._zid, 0))
 
@@ -459,22 +460,22 @@ class Session:
         """Return the session's id."""
         return self._zid
 
-    def close(self) -> None:
+    def end(self) -> None:
         """Undeclare all that the session has declared."""
-        if not self._is_closed:
-            self._is_closed = True
-            for end in list(self._ends):
-                self._end(end)
+        if not self.is_closed():
+            super().end()
             give_way()  # to what is called in answer
+
+    close = end
 
     def is_closed(self) -> bool:
         """Return whether it has been closed."""
-        return self._is_closed
+        return self._ends is None
 
     def check_open(self) -> None:
         """Raise ZError if it has been closed."""
         go_no_further_if_ended()
-        if self._is_closed:
+        if self.is_closed():
             raise zenoh.ZError("session closed")
 
     def new_id(self) -> EntityGlobalId:
@@ -485,17 +486,7 @@ class Session:
     def declare(self, entity: Entity) -> Callable[[], None]:
         """Declare an entity until the session is closed; return what undeclares it before."""
         self.vehicle.declare(entity)
-        return self.until_closed(partial(self.vehicle.undeclare, entity))
-
-    def until_closed(self, end: Callable[[], object]) -> Callable[[], None]:
-        """Have `end` called when the session is closed; return what calls it before."""
-        self._ends[end] = None
-        return partial(self._end, end)
-
-    def _end(self, end: Callable[[], object]) -> None:
-        if end in self._ends:
-            del self._ends[end]
-            end()
+        return self.until_end(partial(self.vehicle.undeclare, entity))
 
     def undeclare(self, obj: Any) -> None:
         """Undeclare a key expression, which is none the less valid."""
@@ -547,7 +538,7 @@ class Session:
 
     def get(self, selector: Any, handler: Any = None, **options: Any) -> Any:
         """Ask for replies."""
-        return self.query(self.until_closed, selector, handler, **options)
+        return self.query(self.until_end, selector, handler, **options)
 
     def query(
         self,
@@ -604,4 +595,4 @@ class Scout(Listening):
         if matcher.matches(zenoh.WhatAmI.ROUTER):
             self._sink.push(Hello(zenoh.WhatAmI.ROUTER, vehicle.zid, []))
 
-    stop = Listening.undeclare_if_declared
+    stop = Listening.end
