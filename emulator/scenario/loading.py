@@ -556,11 +556,11 @@ def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str
     if isinstance(source, (str, Path)):
         return load_scenario(Path(source), overrides, checks)
     if isinstance(source, Scenario):
-        # Without defaults: another `kind` of a section has others. What is the default for some programs stays.
+        # Without defaults: another `kind` of a section has others.
         data = source.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
         if "max_payload_bytes" not in source.radio.model_fields_set:  # it follows from the MAC
             data.get("radio", {}).pop("max_payload_bytes", None)
-        if source.program.kind == "zenoh":
+        if "jitter_ms" in source.radio.model_fields_set:  # whose default is that of the kind of program
             data.setdefault("radio", {})["jitter_ms"] = source.radio.jitter_ms
         source = data
     if not isinstance(source, Mapping):

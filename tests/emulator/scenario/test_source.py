@@ -26,10 +26,13 @@ def test_a_path_a_name_data_and_a_scenario_are_sources() -> None:
 def test_what_was_given_stays_also_if_it_is_the_default_of_others(jitter_ms: float | None) -> None:
     """Zenoh programs have no jitter by default, others 1 ms."""
     radio = {} if jitter_ms is None else {"jitter_ms": jitter_ms}
-    data = {"program": {"kind": "zenoh", "command": ["python", "-m", "x"]}, "radio": radio}
-    given = scenario_of(data, {})
+    program = {"kind": "zenoh", "command": ["python", "-m", "x"]}
+    given = scenario_of({"program": program, "radio": radio}, {})
     assert given.radio.jitter_ms == scenario_of(given, {"run.seed": 2}).radio.jitter_ms == (jitter_ms or 0.0)
-    assert scenario_of({"radio": radio}, {}).radio.jitter_ms == (1.0 if jitter_ms is None else jitter_ms)
+    other = scenario_of({"radio": radio}, {})
+    assert other.radio.jitter_ms == (1.0 if jitter_ms is None else jitter_ms)
+    to_zenoh = {f"program.{key}": value for key, value in program.items()}
+    assert scenario_of(other, to_zenoh).radio.jitter_ms == (jitter_ms or 0.0)
 
 
 def test_a_resolved_scenario_may_have_another_kind_of_radio() -> None:
