@@ -512,6 +512,7 @@ def test_a_program_that_reports_about_once_a_second_is_alive_until_it_falls_sile
     recorded = simulated(program=f"{__name__}:about_once_a_second")
     found = checked(recorded, "liveness")
     assert found.verdict is Verdict.INVALID and [row["node"] for row in found.figures["rows"]] == ["v03"]
+    assert found.text.endswith("silent for over 2.0 s, v03 from period 28")
 
 
 async def nearly_stops(node: Node) -> None:
