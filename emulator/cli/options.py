@@ -338,7 +338,9 @@ def load(
             chosen = "--option"
         raise ScenarioError(f"{chosen}: {error}") from None
     if order_seed is not None and scenario.run.order == "fifo" and not scenario.run.order_slack_us:
-        raise ScenarioError(f"--order-seed {order_seed}: the order is FIFO, which has no seed; add --order shuffle")
+        is_fifo = scenario.run.tape is None
+        kind, hint = ("FIFO", "; add --order shuffle") if is_fifo else ("that of the tape", "")
+        raise ScenarioError(f"--order-seed {order_seed}: the order is {kind}, which has no seed{hint}")
     return scenario
 
 

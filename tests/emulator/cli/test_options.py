@@ -39,7 +39,11 @@ def test_what_is_shown_is_what_was_asked_for() -> None:
     assert (shown.quiet, shown.verbose, shown.report) == (True, True, False)
 
 
-def test_seed_of_an_order_is_refused_where_the_order_is_fifo() -> None:
+def test_seed_of_an_order_is_refused_where_the_order_is_fifo(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="--order-seed 3: the order is FIFO"):
         load(Path("beacon"), None, order_seed=3)
     assert load(Path("beacon"), ["run.order_slack_us=10"], order_seed=3).run.order_seed == 3
+    tape = tmp_path / "tape.jsonl"
+    tape.write_text("")
+    with pytest.raises(ScenarioError, match=r"--order-seed 3: the order is that of the tape, which has no seed$"):
+        load(Path("beacon"), None, order_seed=3, tape=tape)
