@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.system.conftest import Finished, Vnet
 from tests.system.ros2_nodes import FIRST_OF_PAMOJA, PAMOJA_GID, TWIST
 from tests.system.test_zenoh import SLOW
-from vnet.gateway.ros2 import CLOCK_TYPE, FIX_TYPE, parse_attachment, parse_topic
+from vnet.gateway.ros2 import ATTACHMENT, CLOCK_TYPE, FIX_TYPE, parse_topic
 
 NODES = Path(__file__).parent / "ros2_nodes.py"
 SCENARIO = f"""
@@ -77,16 +77,13 @@ def test_two_clients_hear_ask_and_see_each_other_as_far_as_the_radio_carries(
 
     # Topics, both ways, each message with its attachment.
     ((gid,),) = lines(done, "v01", "gid")
-    heard = [(int(number), parse_attachment(bytes.fromhex(hexed))) for number, hexed in lines(done, "v02", "heard")]
-    of_sdk = [number for number, attachment in heard if attachment and attachment.gid.hex() == gid]
+    attached = lines(done, "v02", "heard")
+    heard = [(int(number), ATTACHMENT.unpack(bytes.fromhex(hexed))) for number, hexed in attached]
+    of_sdk = [number for number, (*_, sender) in heard if sender.hex() == gid]
     assert of_sdk == [number for number, _ in heard if number < FIRST_OF_PAMOJA]
     assert 0 < len(of_sdk) <= arrived("v01", "put", "/cmd_vel")
-    for number, attachment in heard:
-        assert attachment is not None
-        assert (attachment.sequence, attachment.gid.hex()) in [
-            (number, gid),
-            (number - FIRST_OF_PAMOJA, PAMOJA_GID.hex()),
-        ]
+    for number, (sequence, *_, sender) in heard:
+        assert (sequence, sender.hex()) in [(number, gid), (number - FIRST_OF_PAMOJA, PAMOJA_GID.hex())]
     of_pamoja = [number for (number,) in lines(done, "v01", "heard") if int(number) >= FIRST_OF_PAMOJA]
     assert 0 < len(of_pamoja) <= arrived("v02", "put", "/cmd_vel")
 
@@ -96,8 +93,8 @@ def test_two_clients_hear_ask_and_see_each_other_as_far_as_the_radio_carries(
         assert 0 < len(answers) <= arrived(other, "reply", f"/{other}/add")
         assert all(int(total) == int(number) + 1 for number, total, *_ in answers)
     for asked, _, hexed in lines(done, "v02", "answered"):
-        attachment = parse_attachment(bytes.fromhex(hexed))
-        assert attachment is not None and (attachment.sequence, attachment.gid) == (int(asked), PAMOJA_GID)
+        sequence, *_, sender = ATTACHMENT.unpack(bytes.fromhex(hexed))
+        assert (sequence, sender) == (int(asked), PAMOJA_GID)
 
     # The graph.
     seen: dict[str, list[str]] = {}

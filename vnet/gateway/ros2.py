@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
 from hashlib import blake2b
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import zenoh
 
@@ -44,24 +44,25 @@ MOST_KEYS = 4096
 EntityKind = Literal["NN", "MP", "MS", "SS", "SC"]
 """Node, publisher, subscription, service, client."""
 
-_TYPE = re.compile(r"(\w+)::(\w+)::dds_::(\w+)_", re.ASCII)
-_DATA = re.compile(rf"(\d{{1,9}})/(.+?)/({_TYPE.pattern})/([^/@]+)(?:/@adv/.*)?", re.ASCII)
-_ATTACHMENT = struct.Struct("<qqB16s")
+_TYPE = r"(\w+)::(\w+)::dds_::(\w+)_"
+_DATA = re.compile(rf"(\d{{1,9}})/(.+?)/{_TYPE}/([^/@]+)(?:/@adv/.*)?", re.ASCII)
+_NUMBER, _NAME = r"(\d{1,19})", "([^/]*)"
+_TOKEN = re.compile(
+    rf"{TOKENS}/{_NUMBER}/{_NAME}/{_NUMBER}/{_NUMBER}/(NN|MP|MS|SS|SC)/{_NAME}/{_NAME}/{_NAME}"
+    rf"(?:/{_NAME}/{_TYPE}/{_NAME}/{_NAME})?",
+    re.ASCII,
+)
 _TIME = struct.Struct("<4siI")
 _POSE = struct.Struct("<4siII4s7d36d")
 _CDR_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-GID_BYTES = 16
+ATTACHMENT, GID_BYTES = struct.Struct("<qqB16s"), 16
+"""Attachment of each sample, request and response: sequence number, time in ns, length of the sender's id, id."""
 
 
 def dds_type(ros_type: str) -> str:
     """Return the name of a type in keys: `std_msgs::msg::dds_::String_` of `std_msgs/msg/String`."""
     package, kind, name = ros_type.split("/")
     return f"{package}::{kind}::dds_::{name}_"
-
-
-def _ros_type(dds_name: str) -> str | None:
-    found = _TYPE.fullmatch(dds_name)
-    return None if found is None else "/".join(found.groups())
 
 
 class TopicKey(NamedTuple):
@@ -83,7 +84,7 @@ def parse_topic(key: str) -> TopicKey | None:
     found = _DATA.fullmatch(key)
     if found is None:
         return None
-    domain, topic, _, *names, type_hash = found.groups()
+    domain, topic, *names, type_hash = found.groups()
     return TopicKey(int(domain), f"/{topic}", "/".join(names), type_hash)
 
 
@@ -128,35 +129,17 @@ class GraphToken(NamedTuple):
 
 def parse_token(key: str) -> GraphToken | None:
     """Return what a token of ROS 2's graph says; None for any other key."""
-    space, *parts = key.split("/")
-    if space != TOKENS or len(parts) not in (8, 12):
+    found = _TOKEN.fullmatch(key)
+    if found is None:
         return None
-    domain, session, node_id, entity_id, kind, enclave, namespace, node, *rest = parts
-    numbers = [domain, node_id, entity_id]
+    domain, session, node_id, entity_id, kind, *names, topic, package, part, name, type_hash, qos = found.groups()
     is_node = kind == "NN"
-    if kind not in get_args(EntityKind) or is_node == bool(rest) or not all(map(_is_number, numbers)):
+    if is_node == (topic is not None):
         return None
-    endpoint = None
-    if rest:
-        topic, dds_name, type_hash, qos = rest
-        if (ros_type := _ros_type(dds_name)) is None:
-            return None
-        endpoint = Endpoint(_demangled(topic), ros_type, type_hash, qos)
-    return GraphToken(
-        int(domain),
-        session,
-        int(node_id),
-        int(entity_id),
-        kind,  # type: ignore[arg-type]
-        _demangled(enclave),
-        _demangled(namespace),
-        _demangled(node),
-        endpoint,
-    )
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) < 20
+    endpoint = None if is_node else Endpoint(_demangled(topic), f"{package}/{part}/{name}", type_hash, qos)
+    enclave, namespace, node = map(_demangled, names)
+    numbers = int(domain), session, int(node_id), int(entity_id)
+    return GraphToken(*numbers, kind, enclave, namespace, node, endpoint)  # type: ignore[arg-type]
 
 
 def _mangled(name: str) -> str:
@@ -165,26 +148,6 @@ def _mangled(name: str) -> str:
 
 def _demangled(name: str) -> str:
     return name.replace("%", "/")
-
-
-class Attachment(NamedTuple):
-    """The attachment of each sample, request and response: 33 bytes."""
-
-    sequence: int
-    time_ns: int
-    gid: bytes
-
-    def to_bytes(self) -> bytes:
-        """Return its form on the wire."""
-        return _ATTACHMENT.pack(self.sequence, self.time_ns, GID_BYTES, self.gid)
-
-
-def parse_attachment(content: bytes) -> Attachment | None:
-    """Return what an attachment says; None for what is none of ROS 2."""
-    if len(content) != _ATTACHMENT.size:
-        return None
-    sequence, time_ns, length, gid = _ATTACHMENT.unpack(content)
-    return Attachment(sequence, time_ns, gid) if length == GID_BYTES else None
 
 
 class Published(NamedTuple):
@@ -242,8 +205,8 @@ class Ros2:
     def _published(self, topic: str, ros_type: str, payload: bytes, time_ns: int) -> Published:
         self._sequences[topic] += 1
         gid = blake2b(f"{self._vehicle}{topic}".encode(), digest_size=GID_BYTES).digest()
-        attachment = Attachment(self._sequences[topic], time_ns, gid)
-        return Published(self._key(topic, ros_type), payload, attachment.to_bytes())
+        attachment = ATTACHMENT.pack(self._sequences[topic], time_ns, GID_BYTES, gid)
+        return Published(self._key(topic, ros_type), payload, attachment)
 
     def _key(self, topic: str, ros_type: str) -> str:
         return TopicKey(self._domain, topic, ros_type, TYPE_HASHES[ros_type]).key
