@@ -30,7 +30,7 @@ from weakref import WeakKeyDictionary
 from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NodeHandle, NumberedTimer
-from vnet.runtime.outside_loop import collected_by_schedule, collector, is_nobodys
+from vnet.runtime.outside_loop import JOBS, collected_by_schedule, collector, is_nobodys
 from vnet.runtime.own_asyncio import Future, Task, current_node, present_node
 from vnet.runtime.ready_queue import CpuMeter, EventChooser, OrderedQueue, ReadyQueue
 from vnet.transport.wire import ClockError, Deviation
@@ -474,7 +474,7 @@ class VirtualTimeLoop(SkewedLoop):
         self.before_job()
         context = _submitting(executor)
         if executor is None:
-            executor = asyncio_internals.default_executor(self, "vnet")
+            executor = asyncio_internals.default_executor(self, JOBS)
         job = context.run(executor.submit, func, *args)
         outer = Future(loop=self)
         outer.job_context = copy_context()
