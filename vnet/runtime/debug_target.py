@@ -51,7 +51,7 @@ def resolve(target: DebugTarget, folders: Sequence[Path], has_scripts: bool = Fa
     return DebugTarget(target.node, str(found[0]), target.line)
 
 
-def _lines_with_code(path: Path, of_modules: bool) -> set[int] | None:
+def _lines_with_code(path: Path, has_scripts: bool) -> set[int] | None:
     """Lines at which a debugger can stop within functions, or anywhere; None for a file that does not compile."""
     try:
         waiting = [compile(path.read_bytes(), str(path), "exec", dont_inherit=True)]
@@ -62,7 +62,7 @@ def _lines_with_code(path: Path, of_modules: bool) -> set[int] | None:
         code = waiting.pop()
         inner = [constant for constant in code.co_consts if inspect.iscode(constant)]
         waiting += inner
-        if of_modules or code.co_flags & inspect.CO_NEWLOCALS:
+        if has_scripts or code.co_flags & inspect.CO_NEWLOCALS:
             first = code.co_firstlineno if code.co_flags & inspect.CO_NEWLOCALS else 0
             lines.update(line for _, _, line in code.co_lines() if line is not None and line > first)
     return lines
