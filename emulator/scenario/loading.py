@@ -19,6 +19,7 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
+from datetime import date, time
 from functools import wraps
 from pathlib import Path, PurePath
 from typing import Any, ParamSpec, TypeVar
@@ -39,6 +40,7 @@ LARGEST_BYTES = 4 * 2**20
 """Largest size of a file; a matrix of links for a thousand vehicles takes three of the four megabytes."""
 DEEPEST = 32
 """Largest nesting depth of tables and arrays."""
+NOT_PLAIN = "a number, a boolean, a text, a list or a table is needed"
 _INTEGERS = range(-(2**63), 2**64)  # what msgpack can carry
 
 _KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
@@ -91,7 +93,7 @@ def check_plain(value: Any, key: str = "", depth: int = 0) -> None:
 
 
 def _problem(value: Any) -> str:
-    """Return the problem of a value that is no table or array; None if it has none."""
+    """Return the problem of a value that is no table or array; "" if it has none."""
     if isinstance(value, bool):
         return ""
     if isinstance(value, int):
@@ -99,7 +101,7 @@ def _problem(value: Any) -> str:
     if isinstance(value, float):
         return "" if math.isfinite(value) else "a finite number is needed"
     if not isinstance(value, str):
-        return "dates and times are written as text, in quotes"
+        return "dates and times are written as text, in quotes" if isinstance(value, (date, time)) else NOT_PLAIN
     try:
         value.encode()
     except UnicodeEncodeError:
@@ -173,7 +175,7 @@ def _toml(key: str, value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml(key, each) for each in value) + "]"
     if not isinstance(value, (bool, int, float, str, PurePath)):
-        raise ScenarioError(f"{key} = {shown(value)}: a number, a boolean, a text, a list or a table is needed")
+        raise ScenarioError(f"{key} = {shown(value)}: {NOT_PLAIN}")
     try:
         check_plain(str(value) if isinstance(value, PurePath) else value)
         return json.dumps(value if isinstance(value, (bool, int, float)) else str(value), ensure_ascii=False)

@@ -1,5 +1,6 @@
 """The scenario of a call from Python: its sources, its changes, and what is wrong with either in one line."""
 
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,16 @@ def test_values_of_all_kinds_reach_the_scenario() -> None:
             {},
             {"radio.loss": object()},
             r"^radio\.loss = <object .*>: a number, a boolean, a text, a list or a table",
+        ),
+        (
+            {"run": {"seed": np.int64(4)}},
+            {},
+            r"^scenario: run\.seed = np\.int64\(4\): a number, a boolean, a text, a",
+        ),
+        (
+            {"run": {"name": date(2026, 1, 1)}},
+            {},
+            r"run\.name = .*: dates and times are written as text, in quotes",
         ),
         ({}, {"loss": 1}, r"--set loss=1: write it as section\.key=value"),
         (3, {}, r"^scenario = 3: a path, a shipped scenario's name, or a dict is needed"),
