@@ -240,6 +240,7 @@ class RadioEnvironment(BaseParallelWrapper):
         if self._engine is None:
             raise VnetError("step: no episode has begun: reset()")
         self._place(self._engine, self.env.agents)
+        payloads = {}
         for number, agent in enumerate(self._node_ids):
             if agent not in actions or agent not in self.env.agents:
                 continue
@@ -251,8 +252,10 @@ class RadioEnvironment(BaseParallelWrapper):
             if payload is not None and len(payload) > (most := self._scenario.radio.max_payload_bytes):
                 raise PayloadTooLargeError(len(payload), most)
             if payload is not None:
-                self._engine.transmit(self._time_ns, number, [payload])
-                self._frames += 1
+                payloads[number] = payload
+        for number, payload in payloads.items():
+            self._engine.transmit(self._time_ns, number, [payload])
+            self._frames += 1
         observations, *rest = self.env.step(actions)
         self._time_ns += self._step_ns
         packets: dict[str, list[Packet]] = {agent: [] for agent in self._node_ids}

@@ -261,6 +261,7 @@ def test_who_acts_has_an_observation() -> None:
     radio.reset(seed=1)
     with pytest.raises(VnetError, match="'car_1' acts, and env has given no observation of it"):
         radio.step(dict.fromkeys(env.agents, 1))
+    assert radio.outcomes == {}, "of a step that is refused nothing is sent"
 
 
 @pytest.mark.parametrize("agents", [[0, 1], [("car", 0), ("car", 1)]], ids=["numbers", "tuples"])
