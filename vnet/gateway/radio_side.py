@@ -76,14 +76,12 @@ class RadioSide(ABC, Generic[Q]):
         asyncio.get_running_loop().call_later(self._query_s, lambda: self._conclude(self._queries.pop(number)))
         return crossing_query(number, query)
 
-    def hear(self, sender: str, payload: bytes, time_ns: int, only_tokens: bool = False) -> None:
+    def hear(self, sender: str, payload: bytes, time_ns: int) -> None:
         """Give the programs what a frame carries. Raises ValueError for bytes that a fault has changed."""
         try:
             match self._reassembly.take(sender, payload):
                 case CrossingTokens() as tokens:
                     self.hear_tokens(sender, tokens, time_ns)
-                case _ if only_tokens:
-                    pass
                 case CrossingSample() as sample:
                     self._show(sample)
                 case CrossingQuery() as query:

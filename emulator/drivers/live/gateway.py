@@ -190,10 +190,10 @@ class Gateway(RadioSide[zenoh.Query]):
 
     # To the programs.
 
-    def hear(self, sender: str, payload: bytes, time_ns: int, only_tokens: bool = False) -> None:
+    def hear(self, sender: str, payload: bytes, time_ns: int) -> None:
         """As `RadioSide.hear`, while the router is open."""
         if self._session is not None:
-            super().hear(sender, payload, time_ns, only_tokens)
+            super().hear(sender, payload, time_ns)
 
     def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int) -> None:
         """As `RadioSide.hear_tokens`, while the router is open."""

@@ -67,7 +67,7 @@ class OwnProcess:
             "raise_signal": self.send,
             "pthread_kill": lambda thread, number: self.send(number),
             "pause": self._pause,
-            "sigwait": lambda signals: signal.Signals(self._await(signals)),
+            "sigwait": lambda signals: _named(self._await(signals)),
             "sigwaitinfo": lambda signals: _siginfo(self._await(signals)),
             "sigtimedwait": self._await_for,
             "sigpending": lambda: set(map(_named, self._pending)),
@@ -127,29 +127,23 @@ class OwnProcess:
     def _pause(self) -> None:
         self._handled.wait()
 
-    def _await(self, signals: Iterable[int]) -> int:
-        """Block until one of these signals comes; it is then not handled."""
-        number = self._await_until(set(signals), -1)
-        assert number is not None
-        return number
-
     def _await_for(self, signals: Iterable[int], timeout: float) -> signal.struct_siginfo | None:
         if timeout < 0:
             raise ValueError("timeout must be non-negative")
-        number = self._await_until(set(signals), timeout)
-        return None if number is None else _siginfo(number)
+        number = self._await(signals, timeout)
+        return _siginfo(number) if number else None
 
-    def _await_until(self, signals: set[int], timeout: float) -> int | None:
-        """Return a signal that has come, None after `timeout` seconds (-1: never)."""
-        end_s = asyncio.get_running_loop().time() + timeout
-        self._awaited.append(signals)
+    def _await(self, signals: Iterable[int], timeout: float = -1) -> int:
+        """Block until one of these signals comes, which is then not handled; return 0 after `timeout` seconds."""
+        awaited, end_s = set(signals), asyncio.get_running_loop().time() + timeout
+        self._awaited.append(awaited)
         try:
-            while not (came := self._pending & signals):
+            while not (came := self._pending & awaited):
                 left_s = -1 if timeout == -1 else max(0.0, end_s - asyncio.get_running_loop().time())
                 if not self._arrivals.wait(left_s):
-                    return None
+                    return 0
         finally:
-            self._awaited.remove(signals)
+            self._awaited.remove(awaited)
         self._pending.discard(min(came))
         return min(came)
 

@@ -25,13 +25,13 @@ from vnet.gateway.emulated.values import (
     Outlet,
     Reply,
     Sample,
-    Selector,
     Sink,
     ZenohId,
     bytes_or_none,
     check,
     encoding_of,
     key_of,
+    ordered,
     sink_of,
     token_sample,
     zbytes_of,
@@ -397,7 +397,7 @@ class Querier(Sending):
     def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
         """Ask for replies."""
         self.check_declared()
-        selector = Selector(self.key_expr, parameters)
+        selector = zenoh.Selector(self.key_expr, ordered(parameters))
         return self.session.query(self.until_undeclared, selector, handler, **self._options, **options)
 
 

@@ -148,9 +148,12 @@ class MatchingStatus(_Value, frozen=True, eq=False, gc=False):
 
 
 class _StandIn(type):
-    """A class that stands for one of Zenoh's, whose values it makes in a way of its own."""
+    """A class that stands for one of Zenoh's, and makes values of that."""
 
-    real: type
+    real: type[Any]
+
+    def __call__(cls, *args: Any, **options: Any) -> Any:
+        return cls.real(*map(ordered, args), **{name: ordered(each) for name, each in options.items()})
 
     def __instancecheck__(cls, instance: object) -> bool:
         return isinstance(instance, cls.real)
@@ -173,17 +176,11 @@ class Parameters(metaclass=_StandIn):
 
     real = zenoh.Parameters
 
-    def __new__(cls, *parameters: Any) -> zenoh.Parameters:  # type: ignore[misc]
-        return zenoh.Parameters(*map(ordered, parameters))
-
 
 class Selector(metaclass=_StandIn):
     """Zenoh's own selector."""
 
     real = zenoh.Selector
-
-    def __new__(cls, arg: Any, /, parameters: Any = None) -> zenoh.Selector:  # type: ignore[misc]
-        return zenoh.Selector(arg, ordered(parameters))
 
 
 class Config(metaclass=_StandIn):
@@ -192,9 +189,6 @@ class Config(metaclass=_StandIn):
     real = zenoh.Config
     environ: ClassVar[Mapping[str, str]] = {}
     DEFAULT_CONFIG_PATH_ENV = "ZENOH_CONFIG"
-
-    def __new__(cls) -> zenoh.Config:  # type: ignore[misc]
-        return zenoh.Config()
 
     @classmethod
     def from_env(cls) -> zenoh.Config:

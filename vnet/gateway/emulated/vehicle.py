@@ -290,11 +290,11 @@ class Vehicle(RadioSide[Asking]):
                     radio.broadcast(payload).send(None)  # which never waits
 
     def _listen(self) -> None:
-        """Have the radio's packets wake this vehicle from now on; of what it has heard before tokens count."""
+        """Have the radio's packets wake this vehicle from now on; of those before, tokens alone find somebody."""
         if not self._hears.is_set():
             self._hears.set()
             for packet in self.node.radio.drain():
-                self._take(packet, only_tokens=True)
+                self._take(packet)
 
     def tasks(self) -> list[Coroutine[Any, Any, None]]:
         """Return what is to run beside the programs."""
@@ -311,9 +311,9 @@ class Vehicle(RadioSide[Asking]):
             self.due.is_held = False
             self.due.run()
 
-    def _take(self, packet: Packet, only_tokens: bool = False) -> None:
+    def _take(self, packet: Packet) -> None:
         try:
-            self.hear(packet.sender, packet.payload, packet.received_ns, only_tokens)
+            self.hear(packet.sender, packet.payload, packet.received_ns)
         except ValueError as error:  # bytes that a fault has changed
             self.node.log(f"a frame of {packet.sender} is no sample: {error}", "debug")
 
