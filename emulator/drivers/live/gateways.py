@@ -36,8 +36,9 @@ from vnet.gateway import filled_in
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
 from vnet.gateway.ros2 import Ros2
 from vnet.radio import SentFrame
-from vnet.reports import Report, Reporter
+from vnet.reports import Reporter
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
+from vnet.runtime.host import Outbox
 from vnet.transport import wire
 from vnet.transport.access import Access
 from vnet.transport.session import RUNTIME_VARIABLE
@@ -73,10 +74,7 @@ class _Vehicle:
     """Queries of its programs and the latest sample of each key, which wait until its turn then."""
     replaced: int = 0
     """Samples that a later one of their key has replaced there."""
-    outbox: list[SentFrame] = field(default_factory=list)
-    reports: list[Report] = field(default_factory=list)
-    notes: list[wire.Note] = field(default_factory=list)
-    endings: list[wire.Ending] = field(default_factory=list)
+    outbox: Outbox = field(default_factory=Outbox)
     receipts: wire.Receipts = field(default_factory=wire.Receipts)
     unicasts: int = 0
     is_due: bool = False
@@ -257,7 +255,7 @@ class Gateways:
         elif not vehicle.names and not vehicle.is_ready:
             self._say_hello(vehicle, failure=f"its commands have ended before they had connected: {HOW}")
         elif not vehicle.names:
-            vehicle.endings.append(wire.Ending(node, "finished"))
+            vehicle.outbox.endings.append(wire.Ending(node, "finished"))
             self._flush_soon(vehicle)
         return True
 
@@ -269,7 +267,7 @@ class Gateways:
         vehicle = self._vehicles.get(node)
         if vehicle is None:
             return []
-        if vehicle.early or vehicle.outbox:
+        if vehicle.early or vehicle.outbox.frames:
             self._flush(vehicle, final=True)
         vehicle.on_air = False
         del self._vehicles[node]
@@ -441,16 +439,17 @@ class Gateways:
             return
         if isinstance(message, CrossingReply) and vehicle.acknowledges:
             to = message.to
-        before, most = len(vehicle.outbox), self._emulation.scenario.radio.queue_frames
+        frames, most = vehicle.outbox.frames, self._emulation.scenario.radio.queue_frames
+        before = len(frames)
         try:
             for payload in vehicle.fragments.of(message):
-                vehicle.outbox.append(SentFrame(node, payload, to=to, number=vehicle.unicasts))
+                frames.append(SentFrame(node, payload, to=to, number=vehicle.unicasts))
                 vehicle.unicasts += to is not None
         except TooLargeError as error:
             self._note(vehicle, "error", str(error))
-        if (frames := len(vehicle.outbox) - before) > most and not vehicle.has_warned:
+        if (number := len(frames) - before) > most and not vehicle.has_warned:
             vehicle.has_warned = True
-            text = f"a message of {frames} frames, which cannot arrive: radio.queue_frames = {most}"
+            text = f"a message of {number} frames, which cannot arrive: radio.queue_frames = {most}"
             self._note(vehicle, "warning", text)
 
     def _enqueue_early(self, vehicle: _Vehicle) -> None:
@@ -470,11 +469,11 @@ class Gateways:
         except (msgspec.MsgspecError, TypeError, ValueError) as error:
             self._note(vehicle, "error", f"a report is refused: {error}")
         else:
-            vehicle.reports.append(report)
+            vehicle.outbox.reports.append(report)
             self._flush_soon(vehicle)
 
     def _note(self, vehicle: _Vehicle, level: Literal["debug", "info", "warning", "error"], text: str) -> None:
-        vehicle.notes.append(wire.Note(vehicle.gateway.node_id, self._now_ns(), "log", level, text))
+        vehicle.outbox.notes.append(wire.Note(vehicle.gateway.node_id, self._now_ns(), "log", level, text))
         self._flush_soon(vehicle)
 
     def _flush_soon(self, vehicle: _Vehicle) -> None:
@@ -490,12 +489,10 @@ class Gateways:
         self._enqueue_early(vehicle)
         if vehicle.is_paused and not final:
             return
-        if vehicle.outbox and not self._emulation.up[vehicle.gateway.node_id]:
-            lost, vehicle.outbox = counted(len(vehicle.outbox), "frame"), []
+        if vehicle.outbox.frames and not self._emulation.up[vehicle.gateway.node_id]:
+            lost, vehicle.outbox.frames = counted(len(vehicle.outbox.frames), "frame"), []
             self._note(vehicle, "warning", f"{lost} not sent: the vehicle has ended")
-        traffic = wire.Traffic(vehicle.outbox, vehicle.reports, vehicle.endings, notes=vehicle.notes)
-        vehicle.outbox, vehicle.reports, vehicle.endings, vehicle.notes = [], [], [], []
-        frames = vehicle.receipts.frames(vehicle.nonce, traffic, final)
+        frames = vehicle.receipts.frames(vehicle.nonce, vehicle.outbox.take(()), final)
         self._tell("frames", vehicle.gateway.node_id, (frames, arrived_ns or time.monotonic_ns()))
 
     # Sessions.

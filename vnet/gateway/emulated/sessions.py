@@ -337,20 +337,19 @@ class Publisher(Sending):
         reliability: zenoh.Reliability | None = None,
         allowed_destination: zenoh.Locality | None = None,
     ) -> None:
-        given = {"express": express, "priority": priority, "congestion_control": congestion_control}
-        check({**given, "reliability": reliability, "allowed_destination": allowed_destination})
+        self._qos: dict[str, Any] = {
+            "congestion_control": congestion_control,
+            "priority": priority,
+            "express": express,
+            "allowed_destination": allowed_destination,
+        }
+        check({**self._qos, "reliability": reliability})
         super().__init__(session, key_expr)
         self._matches = partial(session.vehicle.matches_subscriber, self.key_expr)
         self.encoding = encoding_of(encoding)
         self.congestion_control = congestion_control or zenoh.CongestionControl.DEFAULT
         self.priority = priority or zenoh.Priority.DEFAULT
         self.reliability = reliability or zenoh.Reliability.RELIABLE
-        self._qos: dict[str, Any] = {
-            "congestion_control": self.congestion_control,
-            "priority": self.priority,
-            "express": express,
-            "allowed_destination": allowed_destination,
-        }
 
     encoding: zenoh.Encoding
     congestion_control: zenoh.CongestionControl
