@@ -5,7 +5,8 @@ the fix and the map have added to that.
 
 Given the lanes that a vehicle has driven on, all is linear: its fix is z = p + c + n, and a lane with normal n says
 n·p = offset + l, where the vehicle's own offset l from the lane of the map stays what it is for hundreds of metres.
-So each hypothesis is a Gaussian over [c, p, v, l], the common error, position and velocity, and the offset:
+So each hypothesis is a Gaussian over [c, p, v, l, m], the common error, position and velocity, the offset, and
+multipath:
 
 - l ~ N(0, σ²) is new when the vehicle comes upon a lane or has turned into it;
 - as it drives, l is renewed by and by: a Gauss-Markov process of the way, exp(−way / `lateral_m`);
@@ -13,7 +14,7 @@ So each hypothesis is a Gaussian over [c, p, v, l], the common error, position a
 
 That the vehicle is on no road is the last hypothesis: anywhere within 15 m of one. From it lanes are found again.
 
-Multipath that a receiver states is part of p and of l: p is then what fixes show, up to c and white noise.
+Multipath m that a receiver states is one more state, a Gauss-Markov process in time: fixes show c + p + m.
 
 A precise receiver counts as one of `PRECISE_M2`, as far as its fixes are about c: with what they say beyond that
 the vehicles would correct c by many times its movement, and it would diverge. The position has their full
@@ -32,6 +33,7 @@ from numpy.typing import NDArray
 from agents.cooperative.cmm.information import NOTHING, PRECISE_M2, Five, Information, gained, inverse, transport
 from agents.cooperative.cmm.kalman_bound import common_step
 from agents.cooperative.cmm.map_matching import MAX_GATE_M, MAX_LANES, MIN_GATE_M, OFF_ROAD_WITHIN_M, STAND_M
+from agents.cooperative.cmm.plausibility import scaled_by
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
 from agents.cooperative.cmm.tracks import transition, white_acceleration
 from vnet.roads.road_map import RoadMap
@@ -39,6 +41,8 @@ from vnet.types import Array
 
 OFFSET = 6
 """Coordinate of the offset in the lane, after c, p and v."""
+MULTIPATH = slice(OFFSET + 1, OFFSET + 3)
+"""Coordinates of multipath, which only states of receivers that state it have."""
 BEND_M = 0.3
 """Deviation (m) of a vehicle from its own offset: lanes of a map have corners, which vehicles cut."""
 OFF_ROAD = -1
@@ -73,7 +77,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """One Gaussian over [c, p, v, l], and the lane on which the vehicle is."""
+    """One Gaussian over [c, p, v, l, m], and the lane on which the vehicle is."""
 
     log_weight: float
     mean: Array
@@ -87,12 +91,12 @@ class _Hypothesis:
 class RoadHypotheses:
     """Weighted Gaussians of one vehicle, lanes and no road.
 
-    log_weight: (H,), normalized. mean: (H, 7) and covariance: (H, 7, 7) of [c, p, v, l]. lane: (H,), `OFF_ROAD` for
-    none.
+    log_weight: (H,), normalized. mean: (H, n) and covariance: (H, n, n) of [c, p, v, l], and m if there is
+    multipath. lane: (H,), `OFF_ROAD` for none.
     """
 
     def __init__(self, mean: Array, covariance: Array, off_road: float, lateral_m: float) -> None:
-        """Begin off the road with mean (7,) and covariance (7, 7)."""
+        """Begin off the road with mean (n,) and covariance (n, n)."""
         self.mean, self.covariance = mean[None].copy(), covariance[None].copy()
         self.log_weight = np.zeros(1)
         self.lane = np.array([OFF_ROAD], dtype=np.intp)
@@ -109,7 +113,7 @@ class RoadHypotheses:
         return np.asarray(np.exp(self.log_weight))
 
     def moments(self) -> tuple[Array, Array]:
-        """Return mean (7,) and covariance (7, 7) over all hypotheses."""
+        """Return mean (n,) and covariance (n, n) over all hypotheses."""
         return mixture(self.weight, self.mean, self.covariance)
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
@@ -119,16 +123,23 @@ class RoadHypotheses:
         return np.asarray(self.mean[rows, :2] + (roots[rows] @ rng.standard_normal((count, 2, 1)))[:, :, 0])
 
     def predict(self, move: Array, noise: Array) -> None:
-        """Map each hypothesis by `move` (7, 7) and add noise of covariance (7, 7)."""
+        """Map each hypothesis by `move` (n, n) and add noise of covariance (n, n)."""
         self.mean = self.mean @ move.T
         self.covariance = move @ self.covariance @ move.T + noise
 
+    def spread(self, more_m2: float) -> None:
+        """Let multipath be off by this variance more in each axis; the first time it becomes part of the state."""
+        if self.mean.shape[1] == MULTIPATH.start:
+            self.mean = np.pad(self.mean, ((0, 0), (0, 2)))
+            self.covariance = np.pad(self.covariance, ((0, 0), (0, 2), (0, 2)))
+        self.covariance[:, MULTIPATH, MULTIPATH] += more_m2 * np.eye(2)
+
     def update(self, fix_m: Array, noise_m2: Array) -> None:
         """Take a fix (2,) with noise covariance (2, 2)."""
-        cross = self.covariance[:, :, :2] + self.covariance[:, :, 2:4]
-        seen = cross[:, :2] + cross[:, 2:4] + noise_m2
+        cross = _seen(self.covariance)
+        seen = _seen(cross.swapaxes(1, 2)).swapaxes(1, 2) + noise_m2
         root = np.linalg.inv(np.linalg.cholesky(seen))
-        off = fix_m - self.mean[:, :2] - self.mean[:, 2:4]
+        off = _off(fix_m, self.mean)
         white = (root @ off[:, :, None])[:, :, 0]
         gain = cross @ root.transpose(0, 2, 1)
         self.mean = self.mean + (gain @ white[:, :, None])[:, :, 0]
@@ -290,6 +301,18 @@ class RoadHypotheses:
         self.log_weight = self.log_weight - math.log(float(np.exp(self.log_weight).sum()))
 
 
+def _seen(values: Array) -> Array:
+    """Return of the last axis of values (…, n) what fixes show (…, 2): c + p, and m."""
+    seen = values[..., :2] + values[..., 2:4]
+    return seen + values[..., MULTIPATH] if values.shape[-1] > MULTIPATH.start else seen
+
+
+def _off(fix_m: Array, mean: Array) -> Array:
+    """Return how far a fix (2,) is from what means (…, n) lead to expect."""
+    off_m = fix_m - mean[..., :2] - mean[..., 2:4]
+    return off_m - mean[..., MULTIPATH] if mean.shape[-1] > MULTIPATH.start else off_m
+
+
 def mixture(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """Return mean (n,) and covariance (n, n) of H Gaussians.
 
@@ -302,8 +325,10 @@ def mixture(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array
     return middle, np.asarray(np.tensordot(weight, covariance, 1) + (spread.T * weight) @ spread)
 
 
-SIZE = OFFSET + 1
-"""Coordinates of a hypothesis."""
+MULTIPATH_SHARE = 0.3
+"""Share of an increment that is told where the offset is multipath alone. That lasts while c moves, for all
+vehicles alike: told whole, increments of 15 vehicles add up to half the deviation that c has. Where the offset is
+that of a lane, which changes with each turn, they are told whole."""
 LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else."""
 SAME_LANE_M = 0.5
@@ -325,7 +350,7 @@ class OwnVehicleOnMap:
         self.largest_increment = 1 / float(self._sigma_m.min(initial=config.common_sigma_m)) ** 2
         self._rng = rng
         sigma_m = config.start_sigma_m or config.common_sigma_m
-        mean, covariance = np.zeros(SIZE), np.eye(SIZE)
+        mean, covariance = np.zeros(OFFSET + 1), np.eye(OFFSET + 1)
         mean[:2] = config.start_m
         covariance[:2, :2] *= sigma_m**2
         self._hypotheses = RoadHypotheses(mean, covariance, config.off_road, config.lateral_m)
@@ -333,8 +358,8 @@ class OwnVehicleOnMap:
         self._anchor_m = np.full(2, np.nan)
         self._outliers_s = 0.0
         self._heading_rad: float | None = None
-        self._multipath = (0.0, 0.0)
-        self._rest: tuple[Array, Array] | None = None  # what the latest fix says of c + p beyond `PRECISE_M2`
+        self._multipath, self._told = (0.0, 0.0), 1.0  # and the share of increments that is told
+        self._rest: tuple[Array, Array] | None = None  # what the latest fix says beyond `PRECISE_M2`
         self.owed = NOTHING
         self._take_moments()
         self.prior = Information.of(*self.belief)
@@ -376,11 +401,11 @@ class OwnVehicleOnMap:
         mean_m, covariance_m2 = self._mean[2:4], self._covariance[2:4, 2:4]
         if self._rest:
             seen_m, noise_m2 = self._rest
-            rows = self._covariance[:4, :2] + self._covariance[:4, 2:4]
-            gain = rows[2:] @ inverse(rows[:2] + rows[2:] + noise_m2)
-            mean_m = mean_m + gain @ (seen_m - self._mean[:2] - mean_m)
-            covariance_m2 = covariance_m2 - gain @ rows[2:].T
-        return mean_m, covariance_m2 + self._multipath[0] ** 2 * np.eye(2)
+            cross = _seen(self._covariance)
+            gain = cross[2:4] @ inverse(_seen(cross.T) + noise_m2)
+            mean_m = mean_m + gain @ _off(seen_m, self._mean)
+            covariance_m2 = covariance_m2 - gain @ cross[2:4].T
+        return mean_m, covariance_m2
 
     def sample(self, count: int) -> Array:
         """Draw `count` hypotheses (count, 2) of the common error."""
@@ -388,9 +413,9 @@ class OwnVehicleOnMap:
 
     def step(self, dt_s: float, fix: Observation | None) -> Information:
         """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
-        if fix is not None:
-            self._multipath = fix.multipath
         self._predict(dt_s)
+        if fix is not None:
+            self._suit(fix.multipath)
         self._take_moments()
         self.prior = Information.of(*self.belief)
         self._rest = None
@@ -415,12 +440,12 @@ class OwnVehicleOnMap:
             self._rest = fix.position_m, exact_m2 + exact_m2 @ exact_m2 / more_m2
         self._look(fix)
         self._take_moments()
-        return self._gained()
+        return Information(scaled_by(self._gained().numbers, self._told))
 
     def _predict(self, dt_s: float) -> None:
         config = self._config
         keep, variance_m2 = common_step(config.common_sigma_m, config.common_tau_s, config.common_walk_m, dt_s)
-        move, noise = np.eye(SIZE), np.zeros((SIZE, SIZE))
+        move, noise = np.eye(len(self._mean)), np.zeros_like(self._covariance)
         move[:2, :2] *= keep
         move[2:OFFSET, 2:OFFSET] = transition(np.array([dt_s]))[0]
         noise[:2, :2] = variance_m2 * np.eye(2)
@@ -428,23 +453,35 @@ class OwnVehicleOnMap:
         noise[2:OFFSET, 2:OFFSET] = gain @ white_acceleration(self._heading_rad, config.driving_m2_s4) @ gain.T
         sigma_m, tau_s = self._multipath
         if sigma_m:
-            noise[2:4, 2:4] += sigma_m**2 * (1 - math.exp(-2 * dt_s / tau_s)) * np.eye(2)
+            keep = math.exp(-dt_s / tau_s)
+            move[MULTIPATH, MULTIPATH] *= keep
+            noise[MULTIPATH, MULTIPATH] = sigma_m**2 * (1 - keep**2) * np.eye(2)
         self._hypotheses.predict(move, noise)
 
+    def _suit(self, multipath: tuple[float, float]) -> None:
+        """Take the model of a receiver with this multipath, deviation (m) and correlation time (s)."""
+        if multipath == self._multipath:
+            return
+        more_m2 = multipath[0] ** 2 - self._multipath[0] ** 2
+        self._hypotheses.spread(max(more_m2, 0.0))
+        self._multipath = multipath
+        lane_m2 = float(np.mean(self._sigma_m**2))
+        self._told = (lane_m2 + MULTIPATH_SHARE * multipath[0] ** 2) / (lane_m2 + multipath[0] ** 2)
+
     def _is_outlier(self, fix: Observation) -> bool:
-        off_m = fix.position_m - self._mean[:2] - self._mean[2:4]
-        rows = self._covariance[:2] + self._covariance[2:4]
-        seen = rows[:, :2] + rows[:, 2:4] + fix.white_covariance_m2
+        off_m = _off(fix.position_m, self._mean)
+        seen = _seen(_seen(self._covariance).T) + fix.white_covariance_m2
         return bool(off_m @ np.linalg.solve(seen, off_m) > self._config.gate_sigmas**2)
 
     def _place(self, fix: Observation, noise_m2: Array) -> None:
-        """Begin where the fix says up to noise (2, 2), on an unknown lane, with what is known of c."""
-        mean_m, covariance_m2 = self.belief
-        mean, covariance = np.zeros(SIZE), np.zeros((SIZE, SIZE))
-        mean[:2], mean[2:4] = mean_m, fix.position_m - mean_m
-        covariance[:2, :2] = covariance_m2
-        covariance[:2, 2:4] = covariance[2:4, :2] = -covariance_m2
-        covariance[2:4, 2:4] = covariance_m2 + noise_m2
+        """Begin where the fix says up to noise (2, 2), on an unknown lane, with what is known of c and m."""
+        mean, covariance = np.zeros_like(self._mean), np.zeros_like(self._covariance)
+        known = [0, 1, *range(MULTIPATH.start, len(mean))]
+        mean[known], covariance[np.ix_(known, known)] = self._mean[known], self._covariance[np.ix_(known, known)]
+        cross = _seen(covariance)
+        mean[2:4] = _off(fix.position_m, mean)
+        covariance[2:4], covariance[:, 2:4] = -cross.T, -cross
+        covariance[2:4, 2:4] = _seen(cross.T) + noise_m2
         covariance[4:OFFSET, 4:OFFSET] = self._config.driving_m_s**2 * np.eye(2)
         self._hypotheses = RoadHypotheses(mean, covariance, self._config.off_road, self._config.lateral_m)
         self._anchor_m = np.full(2, np.nan)
@@ -454,7 +491,7 @@ class OwnVehicleOnMap:
         """Look at the map, if the vehicle has driven since it did."""
         self._take_moments()
         # Where the receiver says that it is: what is learned of c does not move it.
-        seen_m = self._mean[:2] + self._mean[2:4]
+        seen_m = _seen(self._mean)
         driven_m = float(np.hypot(*(seen_m - self._anchor_m)))
         if driven_m <= STAND_M:
             return
@@ -485,7 +522,7 @@ class OwnVehicleOnMap:
             normal=roads.normal[found],
             offset_m=roads.offset_m[found],
             heading_rad=roads.heading_rad[found],
-            sigma_m=np.hypot(self._sigma_m[found], self._multipath[0]),
+            sigma_m=self._sigma_m[found],
         )
 
     def _gained(self) -> Information:
@@ -509,8 +546,9 @@ class OwnVehicleOnMap:
     def restart(self, belief: Information) -> None:
         """Begin again with this belief about c, and seek the lane again."""
         mean_m, covariance_m2 = belief.moments()
-        mean, covariance = np.zeros(SIZE), np.eye(SIZE)
+        mean, covariance = np.zeros(OFFSET + 1), np.eye(OFFSET + 1)
         mean[:2], covariance[:2, :2] = mean_m, covariance_m2
+        self._multipath = (0.0, 0.0)  # until a fix states it again
         self._hypotheses = RoadHypotheses(mean, covariance, self._config.off_road, self._config.lateral_m)
         self.owed = NOTHING
         self._is_placed = False

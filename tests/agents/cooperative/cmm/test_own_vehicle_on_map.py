@@ -184,3 +184,21 @@ def test_many_precise_receivers_do_not_drive_c_away(sigma_m: float) -> None:
         assert found is not None
         off_m = found[0] - place_m[k]
         assert off_m @ np.linalg.solve(found[1], off_m) < 18.4
+
+
+@pytest.mark.slow
+def test_multipath_that_is_told_is_one_thing_on_all_roads() -> None:
+    """Given c, a vehicle that has driven in two directions has seen it whole, and takes it off its position."""
+    multipath_m, vehicle = np.array([2.0, -1.0]), vehicle_on(roads((0, 0, EAST), (300, 0, NORTH), sigma_m=0.3))
+    vehicle.absorb(Information.of(COMMON_M, 0.01 * np.eye(2)))
+    rng = np.random.default_rng(2)
+    for at_m, heading_rad in (((120.0, 0.0), EAST), ((300.0, 5.0), NORTH)):
+        for place_m in driving(15, at_m, heading_rad):
+            fix_m = place_m + COMMON_M + multipath_m + rng.standard_normal(2)
+            told = Observation(fix_m, (1 + 2.0**2) * np.eye(2), heading_rad, multipath=(2.0, 1e4))
+            vehicle.step(0.1, told)
+    found = vehicle.position_m()
+    assert found is not None
+    off_m, covariance_m2 = found[0] - place_m, found[1]
+    assert np.trace(covariance_m2) < 2 and np.linalg.norm(off_m) < 1.5
+    assert off_m @ np.linalg.solve(covariance_m2, off_m) < 9.2  # of a hundred honest ones one is further off
