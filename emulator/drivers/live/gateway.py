@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import ssl
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -37,13 +38,15 @@ from vnet.gateway.radio_side import RadioSide
 from vnet.gateway.ros2 import Ros2
 from vnet.transport.session import open_local_router, router_endpoint
 
+MOST_PUBLISHERS = 100_000
+"""Publishers whose ids are kept for samples on their way."""
 ECHO_S = 2.0
 """Seconds after a token was taken back in which Zenoh's echoes of it are not taken for a program's own."""
 REMOTE = zenoh.Locality.REMOTE
 
 T = TypeVar("T")
 
-_publishers: dict[bytes, zenoh.EntityGlobalId] = {}
+_publishers: OrderedDict[bytes, zenoh.EntityGlobalId] = OrderedDict()
 """Ids of publishers whose samples have numbers, which Python cannot construct."""
 
 
@@ -324,6 +327,8 @@ def _keep_publisher(sample: zenoh.Sample | None) -> None:
     if sample is not None and sample.source_info is not None:
         publisher = sample.source_info.source_id
         _publishers[entity_bytes(publisher)] = publisher
+        if len(_publishers) > MOST_PUBLISHERS:
+            _publishers.popitem(last=False)  # which is there again with its next sample
 
 
 def _known_source(sample: CrossingSample) -> zenoh.SourceInfo | None:
