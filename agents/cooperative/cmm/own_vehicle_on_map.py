@@ -148,19 +148,18 @@ class RoadHypotheses:
             self.log_weight = self.log_weight + np.log(root[:, 0, 0] * root[:, 1, 1]) - 0.5 * (white**2).sum(axis=1)
             self._normalize()
 
-    def absorb(self, pooled: Information) -> None:
-        """Replace what is known of c by `pooled`: a lane that fits better to it becomes more likely.
+    def absorb(self, said: Information, pooled: Information) -> None:
+        """Replace what has been `said` of c by `pooled`: a lane that fits better to it becomes more likely.
 
-        A hypothesis is multiplied by what is new. Where more is taken from it than it had, it is moved.
+        A hypothesis is multiplied by what is new. Where more is taken from it than it had, it is moved. What could
+        not be said, as lanes become more or less likely, stays: taken back, it would move hypotheses apart.
         """
-        mean, covariance = self.moments()
-        x, p = mean[:2], covariance[:2, :2]
-        before = Information.of(x, p)
         new_x, new_p = pooled.moments()
-        matrix, vector = pooled.matrix - before.matrix, pooled.vector - before.vector
         if len(self.mean) == 1:
             self._condition(0, new_x, new_p)
             return
+        x, p = said.moments()
+        matrix, vector = pooled.matrix - said.matrix, pooled.vector - said.vector
         for row in range(len(self.mean)):
             own = Information.of(self.mean[row, :2], self.covariance[row, :2, :2])
             after = Information.from_arrays(own.matrix + matrix, own.vector + vector)
@@ -362,7 +361,7 @@ class OwnVehicleOnMap:
         self._rest: tuple[Array, Array] | None = None  # what the latest fix says beyond `PRECISE_M2`
         self.owed = NOTHING
         self._take_moments()
-        self.prior = Information.of(*self.belief)
+        self.prior = self._said = Information.of(*self.belief)
 
     def _take_moments(self) -> None:
         self._mean, self._covariance = self._hypotheses.moments()
@@ -417,7 +416,7 @@ class OwnVehicleOnMap:
         if fix is not None:
             self._suit(fix.multipath)
         self._take_moments()
-        self.prior = Information.of(*self.belief)
+        self.prior = self._said = Information.of(*self.belief)
         self._rest = None
         if fix is None:
             return NOTHING
@@ -440,7 +439,9 @@ class OwnVehicleOnMap:
             self._rest = fix.position_m, exact_m2 + exact_m2 @ exact_m2 / more_m2
         self._look(fix)
         self._take_moments()
-        return Information(scaled_by(self._gained().numbers, self._told))
+        gain = self._gained()
+        self._said = self.prior.plus(gain)
+        return Information(scaled_by(gain.numbers, self._told))
 
     def _predict(self, dt_s: float) -> None:
         config = self._config
@@ -540,7 +541,7 @@ class OwnVehicleOnMap:
 
     def absorb(self, pooled: Information) -> None:
         """Replace what is known of c by `pooled`."""
-        self._hypotheses.absorb(pooled)
+        self._hypotheses.absorb(self._said, pooled)
         self._take_moments()
 
     def restart(self, belief: Information) -> None:
@@ -552,5 +553,5 @@ class OwnVehicleOnMap:
         self._hypotheses = RoadHypotheses(mean, covariance, self._config.off_road, self._config.lateral_m)
         self.owed = NOTHING
         self._is_placed = False
-        self.prior = belief
+        self.prior = self._said = belief
         self._take_moments()

@@ -202,3 +202,18 @@ def test_multipath_that_is_told_is_one_thing_on_all_roads() -> None:
     off_m, covariance_m2 = found[0] - place_m, found[1]
     assert np.trace(covariance_m2) < 2 and np.linalg.norm(off_m) < 1.5
     assert off_m @ np.linalg.solve(covariance_m2, off_m) < 9.2  # of a hundred honest ones one is further off
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("common_m", [(6.0, -7.5), (-4.0, 8.0), (1.0, 6.5)])
+def test_what_a_vehicle_hears_again_of_itself_changes_nothing(common_m: tuple[float, float]) -> None:
+    """Also where it may be on a road or on none, and each fix makes one less likely: that cannot be said."""
+    rng = np.random.default_rng(4)
+    alone, vehicle = (vehicle_on(roads((0, 0, EAST)), RbpfConfig(common_tau_s=1e9)) for _ in range(2))
+    for place_m in driving(40, (50, 0), EAST):
+        fix = Observation(place_m + np.array(common_m) + rng.standard_normal(2), np.eye(2), EAST)
+        alone.step(0.1, fix)
+        said = vehicle.step(0.1, fix)
+        vehicle.absorb(vehicle.prior.plus(said))
+    assert_allclose(vehicle.estimate_m, alone.estimate_m, atol=0.5)
+    assert vehicle.lanes[0] == pytest.approx(alone.lanes[0], abs=0.1)
