@@ -42,7 +42,7 @@ from vnet.types import Array
 OFFSET = 6
 """Coordinate of the offset in the lane, after c, p and v."""
 MULTIPATH = slice(OFFSET + 1, OFFSET + 3)
-"""Coordinates of multipath, which only states of receivers that state it have."""
+"""Coordinates of multipath, if the receiver states it."""
 BEND_M = 0.3
 """Deviation (m) of a vehicle from its own offset: lanes of a map have corners, which vehicles cut."""
 OFF_ROAD = -1
@@ -127,12 +127,11 @@ class RoadHypotheses:
         self.mean = self.mean @ move.T
         self.covariance = move @ self.covariance @ move.T + noise
 
-    def spread(self, more_m2: float) -> None:
-        """Let multipath be off by this variance more in each axis; the first time it becomes part of the state."""
-        if self.mean.shape[1] == MULTIPATH.start:
-            self.mean = np.pad(self.mean, ((0, 0), (0, 2)))
-            self.covariance = np.pad(self.covariance, ((0, 0), (0, 2), (0, 2)))
-        self.covariance[:, MULTIPATH, MULTIPATH] += more_m2 * np.eye(2)
+    def add_multipath(self, sigma_m: float) -> None:
+        """Take multipath of this deviation in each axis, of which nothing is known, into the state."""
+        self.mean = np.pad(self.mean, ((0, 0), (0, 2)))
+        self.covariance = np.pad(self.covariance, ((0, 0), (0, 2), (0, 2)))
+        self.covariance[:, MULTIPATH, MULTIPATH] = sigma_m**2 * np.eye(2)
 
     def update(self, fix_m: Array, noise_m2: Array) -> None:
         """Take a fix (2,) with noise covariance (2, 2)."""
@@ -463,10 +462,10 @@ class OwnVehicleOnMap:
         """Take the model of a receiver with this multipath, deviation (m) and correlation time (s)."""
         if multipath == self._multipath:
             return
-        more_m2 = multipath[0] ** 2 - self._multipath[0] ** 2
-        self._hypotheses.spread(max(more_m2, 0.0))
         self._multipath = multipath
-        lane_m2 = float(np.mean(self._sigma_m**2))
+        if len(self._mean) == MULTIPATH.start:
+            self._hypotheses.add_multipath(multipath[0])
+        lane_m2 = 1 / self.largest_increment
         self._told = (lane_m2 + MULTIPATH_SHARE * multipath[0] ** 2) / (lane_m2 + multipath[0] ** 2)
 
     def _is_outlier(self, fix: Observation) -> bool:

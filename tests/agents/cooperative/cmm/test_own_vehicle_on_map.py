@@ -23,7 +23,7 @@ STEADY = RbpfConfig(common_tau_s=1e9, off_road=0.001)
 def roads(*lanes: tuple[float, float, float], sigma_m: float = 1.0, half_width_m: float = 0.85) -> RoadMap:
     """A map of lanes of 2 km that begin at (x, y) in metres, with a heading."""
     count = len(lanes)
-    x_m, y_m, heading_rad = np.array(lanes).T
+    x_m, y_m, heading_rad = np.reshape(lanes, (-1, 3)).T
     return RoadMap(
         point_m=np.column_stack([x_m, y_m]),
         heading_rad=heading_rad,
@@ -217,3 +217,16 @@ def test_what_a_vehicle_hears_again_of_itself_changes_nothing(common_m: tuple[fl
         vehicle.absorb(vehicle.prior.plus(said))
     assert_allclose(vehicle.estimate_m, alone.estimate_m, atol=0.5)
     assert vehicle.lanes[0] == pytest.approx(alone.lanes[0], abs=0.1)
+
+
+def test_multipath_that_is_told_now_and_then_leaves_all_finite() -> None:
+    """Also where the map has no road at all."""
+    for lanes in (roads((0, 0, EAST)), roads()):
+        vehicle, said = vehicle_on(lanes), []
+        for k, place_m in enumerate(driving(10, (50, 0), EAST)):
+            told = (1.0 + k % 3, 60.0) if k % 5 else (0.0, 0.0)
+            fix = Observation(place_m + COMMON_M, (1 + told[0] ** 2) * np.eye(2), EAST, multipath=told)
+            said.append(vehicle.step(0.1, fix))
+        found = vehicle.position_m()
+        assert found is not None and np.isfinite([increment.numbers for increment in said]).all()
+        assert 0 < np.trace(found[1]) < 2 * (3.0**2 + 3.0**2 + 1 + 1)
