@@ -12,6 +12,7 @@ from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
 MEAN_TOLERANCE_M = 1.0
+"""Distance of a mean from its component's, where the vehicle does not state more, as with receivers of 30 m."""
 AT_REST_S = 5.0
 """Time after the start, or the last fault, that the consensus has to settle."""
 WITHIN_S = 10.0
@@ -50,11 +51,15 @@ def check_consensus_mean(run: Any) -> Result:
         text = "no component in which all vehicles run the scenario's program, are up and report a mean"
         return name, "not applicable", text
     worst_m = float(np.nanmax(off_m))
-    over = np.flatnonzero(off_m > MEAN_TOLERANCE_M).tolist()
+    covariance_m2 = run.column("common_error_covariance_m2")[-1]
+    tolerance_m = np.fmax(MEAN_TOLERANCE_M, np.sqrt(covariance_m2[:, 0] + covariance_m2[:, 3]))
+    over = np.flatnonzero(off_m > tolerance_m).tolist()
     off = [{"node": run.nodes[node], "off_m": float(off_m[node])} for node in over]
     figures = {"vehicles": judged, "worst_m": worst_m, "tolerance_m": MEAN_TOLERANCE_M}
     means = counted(judged, "vehicle")
-    broken_text = f"means of {len(off)} of {means} over {MEAN_TOLERANCE_M:g} m off their component's"
+    broken_text = (
+        f"means of {len(off)} of {means} over {MEAN_TOLERANCE_M:g} m, and more than stated, off their component's"
+    )
     if off and run.rested_s < WITHIN_S:
         return name, "unknown", f"{broken_text}, {run.rested_s:.1f} s at rest; {WITHIN_S:g} s are allowed", figures
     text = f"means of {means} within {worst_m:.2f} m of their component's"

@@ -28,9 +28,11 @@ async def believes(node: Node) -> None:
     number = int(node.id[1:])
     async for fix in node.gnss:
         await node.radio.broadcast(b"hello")
-        values = {"common_error_m": [0.02 * number, 0.0], "mean_m": [0.05, 0.0]}
+        values: dict[str, Any] = {"common_error_m": [0.02 * number, 0.0], "mean_m": [0.05, 0.0]}
         if wrong and node.id == wrong["node"] and wrong["from_s"] <= fix.time_ns / 1e9 < wrong["to_s"]:
             values[wrong["what"]][1] += wrong["by_m"]
+        if "stated_m2" in wrong:
+            values["common_error_covariance_m2"] = [[wrong["stated_m2"], 0.0], [0.0, wrong["stated_m2"]]]
         node.report(fix.position_m, fix.covariance_m2, **values)
 
 
@@ -48,9 +50,10 @@ def run(
     from_s: float = 0,
     to_s: float = 0,
     by_m: float = 0,
+    **more: float,
 ) -> RecordedRun:
     """Four vehicles in a world without a common error, one of which errs for a time."""
-    wrong = {"node": "v03", "what": what, "from_s": from_s, "to_s": to_s, "by_m": by_m} if what else {}
+    wrong = {"node": "v03", "what": what, "from_s": from_s, "to_s": to_s, "by_m": by_m, **more} if what else {}
     return simulated(
         *faults,
         run={"duration_s": duration_s, "settle_s": 2.0},
@@ -116,6 +119,12 @@ def test_a_mean_that_is_none_is_found() -> None:
     rows = checked(recorded, "consensus_mean").figures["rows"]
     assert [row["node"] for row in rows] == ["v03"]
     assert rows[0]["off_m"] == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("stated_m2", "found"), [(0.4, {"consensus_mean": Verdict.INVALID}), (4.0, {})])
+def test_a_mean_may_be_as_far_off_as_the_vehicle_states(stated_m2: float, found: dict[str, Verdict]) -> None:
+    recorded = run(duration_s=12.0, what="mean_m", from_s=3.0, to_s=12.0, by_m=2.0, stated_m2=stated_m2)
+    assert not_valid(recorded) == found
 
 
 def test_a_mean_has_some_seconds_to_settle() -> None:
