@@ -136,9 +136,9 @@ class RoadHypotheses:
     def update(self, fix_m: Array, noise_m2: Array) -> None:
         """Take a fix (2,) with noise covariance (2, 2)."""
         cross = _seen(self.covariance)
-        seen = _seen(cross.swapaxes(1, 2)).swapaxes(1, 2) + noise_m2
+        seen = _seen(cross.swapaxes(1, 2)) + noise_m2
         root = np.linalg.inv(np.linalg.cholesky(seen))
-        off = _off(fix_m, self.mean)
+        off = fix_m - _seen(self.mean)
         white = (root @ off[:, :, None])[:, :, 0]
         gain = cross @ root.transpose(0, 2, 1)
         self.mean = self.mean + (gain @ white[:, :, None])[:, :, 0]
@@ -305,12 +305,6 @@ def _seen(values: Array) -> Array:
     return seen + values[..., MULTIPATH] if values.shape[-1] > MULTIPATH.start else seen
 
 
-def _off(fix_m: Array, mean: Array) -> Array:
-    """Return how far a fix (2,) is from what means (…, n) lead to expect."""
-    off_m = fix_m - mean[..., :2] - mean[..., 2:4]
-    return off_m - mean[..., MULTIPATH] if mean.shape[-1] > MULTIPATH.start else off_m
-
-
 def mixture(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
     """Return mean (n,) and covariance (n, n) of H Gaussians.
 
@@ -325,8 +319,8 @@ def mixture(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array
 
 MULTIPATH_SHARE = 0.3
 """Share of an increment that is told where the offset is multipath alone. That lasts while c moves, for all
-vehicles alike: told whole, increments of 15 vehicles add up to half the deviation that c has. Where the offset is
-that of a lane, which changes with each turn, they are told whole."""
+vehicles alike: told whole, increments of 15 vehicles add up to less than half the deviation that c has. Where the
+offset is that of a lane, which changes with each turn, they are told whole."""
 LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else."""
 SAME_LANE_M = 0.5
@@ -356,7 +350,7 @@ class OwnVehicleOnMap:
         self._anchor_m = np.full(2, np.nan)
         self._outliers_s = 0.0
         self._heading_rad: float | None = None
-        self._multipath, self._told = (0.0, 0.0), 1.0  # and the share of increments that is told
+        self._multipath = (0.0, 0.0)
         self._rest: tuple[Array, Array] | None = None  # what the latest fix says beyond `PRECISE_M2`
         self.owed = NOTHING
         self._take_moments()
@@ -401,7 +395,7 @@ class OwnVehicleOnMap:
             seen_m, noise_m2 = self._rest
             cross = _seen(self._covariance)
             gain = cross[2:4] @ inverse(_seen(cross.T) + noise_m2)
-            mean_m = mean_m + gain @ _off(seen_m, self._mean)
+            mean_m = mean_m + gain @ (seen_m - _seen(self._mean))
             covariance_m2 = covariance_m2 - gain @ cross[2:4].T
         return mean_m, covariance_m2
 
@@ -440,7 +434,9 @@ class OwnVehicleOnMap:
         self._take_moments()
         gain = self._gained()
         self._said = self.prior.plus(gain)
-        return Information(scaled_by(gain.numbers, self._told))
+        lane_m2, multipath_m2 = 1 / self.largest_increment, self._multipath[0] ** 2
+        told = (lane_m2 + MULTIPATH_SHARE * multipath_m2) / (lane_m2 + multipath_m2)
+        return Information(scaled_by(gain.numbers, told))
 
     def _predict(self, dt_s: float) -> None:
         config = self._config
@@ -465,11 +461,9 @@ class OwnVehicleOnMap:
         self._multipath = multipath
         if len(self._mean) == MULTIPATH.start:
             self._hypotheses.add_multipath(multipath[0])
-        lane_m2 = 1 / self.largest_increment
-        self._told = (lane_m2 + MULTIPATH_SHARE * multipath[0] ** 2) / (lane_m2 + multipath[0] ** 2)
 
     def _is_outlier(self, fix: Observation) -> bool:
-        off_m = _off(fix.position_m, self._mean)
+        off_m = fix.position_m - _seen(self._mean)
         seen = _seen(_seen(self._covariance).T) + fix.white_covariance_m2
         return bool(off_m @ np.linalg.solve(seen, off_m) > self._config.gate_sigmas**2)
 
@@ -479,7 +473,7 @@ class OwnVehicleOnMap:
         known = [0, 1, *range(MULTIPATH.start, len(mean))]
         mean[known], covariance[np.ix_(known, known)] = self._mean[known], self._covariance[np.ix_(known, known)]
         cross = _seen(covariance)
-        mean[2:4] = _off(fix.position_m, mean)
+        mean[2:4] = fix.position_m - _seen(mean)
         covariance[2:4], covariance[:, 2:4] = -cross.T, -cross
         covariance[2:4, 2:4] = _seen(cross.T) + noise_m2
         covariance[4:OFFSET, 4:OFFSET] = self._config.driving_m_s**2 * np.eye(2)

@@ -230,3 +230,12 @@ def test_multipath_that_is_told_now_and_then_leaves_all_finite() -> None:
         found = vehicle.position_m()
         assert found is not None and np.isfinite([increment.numbers for increment in said]).all()
         assert 0 < np.trace(found[1]) < 2 * (3.0**2 + 3.0**2 + 1 + 1)
+
+
+def test_a_vehicle_that_begins_again_has_forgotten_its_multipath() -> None:
+    vehicle, fresh = vehicle_on(roads((0, 0, EAST))), vehicle_on(roads((0, 0, EAST)))
+    vehicle.step(0.1, Observation(np.zeros(2), 5 * np.eye(2), EAST, multipath=(2.0, 60.0)))
+    for each in (vehicle, fresh):
+        each.restart(Information.of(COMMON_M, np.eye(2)))
+    seen = fixes(driving(3, (50, 0), EAST), EAST)
+    assert run(vehicle, seen).numbers == run(fresh, seen).numbers
