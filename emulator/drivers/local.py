@@ -302,6 +302,8 @@ class HostedPrograms:
 
 _lock = threading.Lock()
 _simulations: list[tuple[Callable[[Node], bool], NodeLogs]] = []
+_streams: tuple[Any, Any] = sys.stdout, sys.stderr
+"""Stdout and stderr as they were before programs ran."""
 
 
 @contextmanager
@@ -311,27 +313,43 @@ def output_kept(is_its_own: Callable[[Node], bool], logs: NodeLogs) -> Iterator[
     What is printed on nobody's behalf, as by a module that is imported, goes to the terminal alone.
     """
     simulation = (is_its_own, logs)
+    global _streams
     with _lock:
+        if not _simulations:
+            _streams = sys.stdout, sys.stderr
+            sys.stdout, sys.stderr = map(_Branched, _streams)
         _simulations.append(simulation)
-        if not isinstance(sys.stdout, _Branched):
-            sys.stdout = _Branched(sys.stdout)
-        if not isinstance(sys.stderr, _Branched):
-            sys.stderr = _Branched(sys.stderr)
     try:
         yield
     finally:
         with _lock:
             _simulations.remove(simulation)
-            if not _simulations:
-                sys.stdout, sys.stderr = _trunk(sys.stdout), _trunk(sys.stderr)
+            if not _simulations:  # also where a program has set others
+                sys.stdout, sys.stderr = _streams
         logs.end_lines()
 
 
 class _Branched:
-    """Stands for stdout or stderr while programs run; all but what it also writes to logs is that of `stream`."""
+    """Stands for stdout or stderr while programs run; all but what it also writes to logs is that of `stream`.
+
+    No program closes it: it has the output of all, and of vnet.
+    """
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
+
+    @property
+    def buffer(self) -> io.BufferedIOBase:
+        """What takes bytes."""
+        return _BranchedBytes(self)
+
+    def close(self) -> None:
+        """Write what is held back."""
+        self.stream.flush()
+
+    def detach(self) -> io.BufferedIOBase:
+        """Return what takes bytes."""
+        return self.buffer
 
     def write(self, text: str) -> int:
         """Write to the stream, and to the log of the node on whose behalf the present code runs."""
@@ -352,8 +370,29 @@ class _Branched:
         return getattr(self.stream, name)
 
 
-def _trunk(stream: Any) -> Any:
-    return stream.stream if isinstance(stream, _Branched) else stream
+class _BranchedBytes(io.BufferedIOBase):
+    """Stands for the `buffer` of stdout or stderr. What closes it, as `io.TextIOWrapper` does, closes it alone."""
+
+    def __init__(self, text: _Branched) -> None:
+        self._text = text
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Write bytes as text."""
+        content = bytes(data)
+        self._text.write(content.decode(errors="replace"))
+        return len(content)
+
+    def flush(self) -> None:
+        """Write what is held back."""
+        self._text.stream.flush()
+
+    def fileno(self) -> int:
+        """Return the descriptor of the stream."""
+        return int(self._text.stream.fileno())
 
 
 class ProcessDiedError(VnetError):

@@ -1,9 +1,11 @@
 """Output of simulated programs is in the log of their vehicle, and in the terminal."""
 
 import asyncio
+import io
 import sys
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -84,6 +86,29 @@ def test_prints_and_a_crash_are_in_order() -> None:
     lines = log_of(emulation, "v01").splitlines()
     assert lines[:2] == ["0", "v01 crashed"]
     assert lines[-1] == "ValueError: boom"
+
+
+async def takes_the_stream_for_its_own(node: Node) -> None:
+    out: Any = sys.stdout
+    out.buffer.write("bytes ä\n".encode())
+    for stream in out.buffer, out.detach():
+        io.TextIOWrapper(stream, encoding="utf-8").write("wrapped\n")  # which closes it as it is collected
+    out.close()
+    print("further")
+    sys.stdout = io.StringIO()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run_together, run_forked])
+def test_no_program_closes_the_output_of_all(
+    capsys: pytest.CaptureFixture[str], run: Callable[[Scenario], Emulation]
+) -> None:
+    before = sys.stdout
+    emulation = run(scenario_of([], f"{__name__}:takes_the_stream_for_its_own", vehicles=1))
+    assert sys.stdout is before
+    said = ["bytes ä", "wrapped", "wrapped", "further"]
+    assert log_of(emulation, "v01").splitlines() == [*said, "v01 finished"]
+    assert [line for line in capsys.readouterr().out.splitlines() if line in said] == said
 
 
 async def never_ends_a_line(node: Node) -> None:
