@@ -146,7 +146,7 @@ def z_liveliness(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
 
 
 def z_advanced(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
-    """z_advanced_pub and z_advanced_sub: a late subscriber has the history, a plain one what comes."""
+    """z_advanced_pub and z_advanced_sub: a late subscriber has the history, in which a delete is an empty put."""
     ext = zenoh.ext
     heard: queue.Queue[Any] = queue.Queue()
     session = open_session()
@@ -157,13 +157,14 @@ def z_advanced(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
         sample_miss_detection=ext.MissDetectionConfig(heartbeat=5),
         publisher_detection=True,
     )
-    for index in range(5):
+    for index in range(4):
         publisher.put(str(index))
+    publisher.delete()
     settle()
     subscriber = ext.declare_advanced_subscriber(
         open_session(),
         "demo/**",
-        lambda sample: heard.put((sample.payload.to_string(), sample.source_info.source_sn)),
+        lambda sample: heard.put((str(sample.kind), sample.payload.to_string(), sample.source_info.source_sn)),
         history=ext.HistoryConfig(detect_late_publishers=True, max_samples=2),
         recovery=ext.RecoveryConfig(heartbeat=True),
         subscriber_detection=True,
@@ -176,7 +177,8 @@ def z_advanced(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
         publisher.put(str(index))
         told.append(heard.get())
     publisher.delete()
-    return [*told, heard.get()]
+    unasked = [reply.ok for reply in session.get("demo/advanced/@adv/**")]  # of keys that the query does not match
+    return [*told, heard.get(), unasked]
 
 
 def z_matching(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:

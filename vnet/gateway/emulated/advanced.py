@@ -25,6 +25,7 @@ from vnet.gateway.emulated.queries import ALL_REPLIES, ANY_KEY, Asking, Entity, 
 from vnet.gateway.emulated.sessions import Listening, LivelinessToken, Publisher, Session, Subscriber, Watcher
 from vnet.gateway.emulated.values import (
     BOOL,
+    PUT,
     Direct,
     EntityGlobalId,
     Reply,
@@ -208,6 +209,7 @@ class _Cache:
             query.reply_sample(
                 msgspec.structs.replace(
                     sample,
+                    kind=PUT,  # also of a delete, as Zenoh 1.10 does
                     congestion_control=self._replies.congestion_control or zenoh.CongestionControl.BLOCK,
                     priority=self._replies.priority or zenoh.Priority.DATA,
                     express=bool(self._replies.express),

@@ -106,6 +106,10 @@ class Asking:
             "express": bool(self.express),
         }
 
+    def accepts(self, key: zenoh.KeyExpr) -> bool:
+        """Return whether a reply may have this key."""
+        return self.takes_any_key or self.key.intersects(key)
+
     def expire_after(self, seconds: float) -> None:
         """End it then if it goes on; who has been asked before concludes first at the same instant."""
         if not self.is_over:
@@ -234,8 +238,9 @@ class Query:
         self._answer(ReplyError(zbytes_of(payload), encoding_of(encoding)))
 
     def reply_sample(self, sample: Sample) -> None:
-        """Reply with a sample that has been published, as caches do."""
-        self._answer(sample)
+        """Reply with a sample that has been published, as caches do, if the query matches its key."""
+        if self._asking.accepts(sample.key_expr):
+            self._answer(sample)
 
     def _reply(
         self,
@@ -253,7 +258,7 @@ class Query:
         check({"congestion_control": congestion_control, "priority": priority, "express": express})
         check({"timestamp": timestamp})
         asking, key_expr = self._asking, key_of(key)
-        if not asking.takes_any_key and not asking.key.intersects(key_expr):
+        if not asking.accepts(key_expr):
             raise zenoh.ZError(f"Attempted to reply on `{key_expr}`, which does not intersect query `{asking.key}`")
         options = {**asking.qos, "attachment": bytes_or_none(attachment), "timestamp": timestamp}
         if express is not None:
