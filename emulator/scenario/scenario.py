@@ -449,9 +449,9 @@ class Scenario(Section):
             for words in self.program.all_commands:
                 if not PYTHON_NAME.fullmatch(Path(words[0]).name) or not python_words(words):
                     raise ValueError(
-                        f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT … "
-                        f"or python -m MODULE …, perhaps with {' '.join(sorted(PYTHON_FLAGS))}; any other needs "
-                        'run.pacing = "realtime"'
+                        f"program.command = {shown(shlex.join(words))}: in lockstep a command is python SCRIPT …, "
+                        "python -m MODULE … or python -c CODE …, perhaps with "
+                        f'{" ".join(sorted(PYTHON_FLAGS))}; any other needs run.pacing = "realtime"'
                     )
             if any(fault.kind == "router_restart" for fault in self.fault):
                 raise ValueError('router_restart needs run.pacing = "realtime": in lockstep there is no router')

@@ -12,7 +12,7 @@ STARTUP = Path(__file__).with_name("startup")
 """Folder on `PYTHONPATH` by which programs in Python heed `ZENOH_CONFIG_OVERRIDE`, whatever they open."""
 FILLED_IN = ("{id}", "{endpoint}", "{port}")
 """Words of a command that vnet fills in."""
-PYTHON_FLAGS = frozenset(["-u", "-B", "-E", "-I", "-O", "-OO", "-s", "-S", "-P", "-q"])
+PYTHON_FLAGS = frozenset(["-u", "-B", "-E", "-s", "-S", "-q"])
 """Options of Python's command line that change nothing on virtual time."""
 
 

@@ -49,7 +49,7 @@ NOBODY = contextvars.Context()
 NOBODY.run(current_node.set, None)
 
 _SEED_BYTES = 16
-_system_bytes, _seed = os.urandom, random.Random.seed
+_system_bytes, _seed, _system_entropy = os.urandom, random.Random.seed, os.getrandom
 _numpy_state = np.random.mtrand._rand
 _OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
 """Functions of `numpy.random` that are no methods of its generator, and the methods that they call."""
@@ -83,6 +83,15 @@ def _runs_programs(loop: object) -> bool:
 
 def _next_number(node: Node | None) -> int:
     return next(_numbers_of_nobody if node is None else node._hashes)
+
+
+class Numbered:
+    """An object that hashes by a number of the present node, which is given when it is first asked for."""
+
+    def __hash__(self) -> int:
+        if "_vnet_number" not in vars(self):
+            self._vnet_number = _next_number(present_node())
+        return self._vnet_number
 
 
 def number_of(future: asyncio.Future[Any]) -> int:
@@ -205,6 +214,10 @@ def _random_bytes(size: int, /) -> bytes:
     return _system_bytes(size) if node is None else chance_of(node).system.randbytes(size)
 
 
+def _entropy(size: int, flags: int = 0) -> bytes:
+    return _system_entropy(size, flags) if _drawing_node() is None else _random_bytes(size)
+
+
 def _seeded(generator: random.Random, a: Any = None, version: int = 2) -> None:
     if a is None and _drawing_node() is not None:
         a = _random_bytes(_SEED_BYTES)
@@ -245,6 +258,7 @@ _shared_state = _SharedState()
 def _of_chance() -> list[tuple[Any, str, Any, Any]]:
     found: list[tuple[Any, str, Any, Any]] = [
         (os, "urandom", _system_bytes, _random_bytes),
+        (os, "getrandom", _system_entropy, _entropy),
         (random, "_urandom", _system_bytes, _random_bytes),  # asked by `secrets`, and by numpy for its seeds
         (random.Random, "seed", _seed, _seeded),
         (np.random.mtrand, "_rand", _numpy_state, _shared_state),

@@ -498,6 +498,26 @@ def test_a_program_has_a_working_directory_and_sleeps_of_its_own(drive: Drive) -
         assert log(run, node)[:2] == ["True", "True 0.6"]
 
 
+def test_input_and_output_are_not_closed_by_a_program(drive: Drive) -> None:
+    run = drive(
+        """
+        import os, sys, time
+        ends = [lambda: os.close(1), lambda: os.dup2(os.dup(0), 2), lambda: os.closerange(0, 9), sys.stdout.close]
+        for end in ends:
+            try:
+                end()
+            except OSError as error:
+                print(error)
+        try:
+            time.sleep(float("nan"))
+        except ValueError as error:
+            print(error)
+        """,
+    )
+    assert ["virtual time" in line for line in log(run)[:3]] == [True] * 3
+    assert log(run)[3] == "Invalid value NaN (not a number)"
+
+
 def test_cancelling_a_query_waits_for_its_callback_and_refuses_the_next(drive: Drive) -> None:
     run = drive(
         """
@@ -657,7 +677,8 @@ def test_the_end_of_a_run_is_no_failure_of_a_thread(drive: Drive) -> None:
 @pytest.mark.parametrize(
     ("words", "fault", "text"),
     [
-        (["python", "-W", "ignore", "talker.py"], [], "python SCRIPT … or python -m MODULE …, perhaps with -B -E"),
+        (["python", "-W", "ignore", "talker.py"], [], "in lockstep a command is .*, perhaps with -B -E"),
+        (["python", "-O", "talker.py"], [], "python SCRIPT …"),
         (["python3", "-um", "talker"], [], "python SCRIPT"),
         (["python", "-m"], [], "python SCRIPT"),
         (["ruby", "talker.rb"], [], "python SCRIPT"),

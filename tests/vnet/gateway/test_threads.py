@@ -2,6 +2,7 @@
 
 import re
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -431,9 +432,10 @@ def test_a_program_that_waits_busily_comes_to_its_time(drive: Drive) -> None:
 
 def test_options_of_python_that_change_nothing_are_no_script(drive: Drive, tmp_path: Path) -> None:
     (tmp_path / "hello.py").write_text("import sys; print(sys.argv[1:])")
-    command = ["python", "-u", "-B", str(tmp_path / "hello.py"), "{id}"]
+    command = ["/elsewhere/bin/python", "-u", "-B", str(tmp_path / "hello.py"), "{id}"]
     run = drive(program={"command": [command]})
-    assert log(run)[0] == "['v01']"
+    assert f"/elsewhere/bin/python is taken for {sys.executable}" in log(run)[0]
+    assert log(run)[1] == "['v01']"
 
 
 def test_a_command_is_told_an_endpoint_which_its_sessions_do_not_need(drive: Drive) -> None:
@@ -473,3 +475,83 @@ def test_a_module_of_a_program_is_loaded_again(drive: Drive, tmp_path: Path) -> 
             print(importlib.import_module("settings") is settings)
         """)
     assert log(run)[:2] == ["0 True 5 True", "True"]
+
+
+def test_a_program_that_puts_without_a_pause_comes_to_the_end_of_the_run(drive: Drive) -> None:
+    """As Zenoh's `z_pub_thr`; its own subscriber hears all, and other vehicles what the radio's queue takes."""
+    run = drive(
+        """
+        import zenoh
+        session, heard = zenoh.open(zenoh.Config()), []
+        subscriber = session.declare_subscriber("**", lambda sample: heard.append(sample.payload.to_string()))
+        publisher = session.declare_publisher("flood")
+        try:
+            while True:
+                publisher.put(str(len(heard)))
+        finally:
+            print(len(heard) // 1000)
+        """,
+        duration_s=0.02,
+    )
+    assert run.verdict != "invalid"
+    assert log(run)[0] in ("19", "20")
+
+
+def test_pools_of_multiprocessing_are_threads_on_emulated_time(drive: Drive) -> None:
+    run = drive(
+        """
+        import multiprocessing, multiprocessing.dummy, threading, time
+        from multiprocessing.pool import Pool, ThreadPool
+        def work(number, wait_s=0.1):
+            time.sleep(wait_s)
+            return number * number
+        with ThreadPool(3) as pool:
+            print(pool.map(work, range(6)), round(time.monotonic(), 3))
+            print(list(pool.imap_unordered(lambda each: work(each, 0.3 - each / 10), range(3))))
+        job = (pool := ThreadPool(1)).apply_async(work, (3,))
+        try:
+            job.get(0.05)
+        except multiprocessing.TimeoutError:
+            print("late", job.get(1))
+        pool.close()
+        pool.join()
+        for kind in multiprocessing.Pool, Pool, multiprocessing.dummy.Pool:
+            with kind(2) as pool:
+                print(pool.starmap(work, [(1,), (2,)]))
+        left = ThreadPool(2)
+        left.apply_async(work, (1, 60.0))
+        print(round(time.monotonic(), 3), len(multiprocessing.active_children()))
+        """,
+        vehicles=2,
+    )
+    for node in ("v01", "v02"):
+        lines = log(run, node)
+        assert lines[:3] == ["[0, 1, 4, 9, 16, 25] 0.2", "[4, 1, 0]", "late 9"]
+        assert lines[3:7] == [*["[1, 4]"] * 3, "0.9 0"]
+        assert lines[7].endswith("finished")
+    assert run.verdict != "invalid"
+
+
+def test_results_of_pools_and_compressed_bytes_replay(drive: Drive) -> None:
+    program = """
+        import email.utils, gzip, io, os, tarfile, threading, time, timeit, zipfile, zenoh
+        from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+        with ThreadPoolExecutor(4) as pool:
+            for collect in (lambda jobs: wait(jobs).done), as_completed:
+                time.sleep(0.25)
+                jobs = [pool.submit(lambda number=number: number, number=number) for number in range(20)]
+                print([job.result() for job in collect(jobs)])
+        print([int(each.name[7:].split()[0]) for each in {threading.Thread(target=print) for _ in range(20)}])
+        session = zenoh.open(zenoh.Config())
+        named = {session.declare_publisher(f"k/{number}") for number in range(20)}
+        print([str(each.key_expr) for each in named])
+        print(gzip.compress(b"x").hex(), timeit.default_timer(), email.utils.formatdate(), os.getrandom(4).hex())
+        for opened in zipfile.ZipFile(archive := io.BytesIO(), "w"), tarfile.open(fileobj=archive, mode="w:gz"):
+            with opened:
+                if isinstance(opened, zipfile.ZipFile):
+                    opened.writestr("a", "x")
+            print(archive.getvalue().hex())
+        """
+    first, again = drive(program), drive(program)
+    assert log(first) == log(again)
+    assert "0.5 Wed, 01 Jan 2025 00:00:00" in log(first)[4]

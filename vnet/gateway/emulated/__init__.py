@@ -10,6 +10,7 @@ import asyncio
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any
 
@@ -128,6 +129,10 @@ def _of_program(trace: TracebackType | None) -> TracebackType | None:
 
 async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
     """Run a program of a vehicle to its end. Raises what ends it, ProgramError for a status other than 0."""
+    python = Path(words[0])
+    if len(python.parts) > 1 and python.parent.resolve() != Path(sys.executable).parent.resolve():
+        text = f"{python} is taken for {sys.executable}: on virtual time programs have this Python and its packages"
+        vehicle.node.log(text, "warning")
     modules = ProgramModules(vehicle.node)
     modules.modules.update(zenoh_modules(vehicle, modules))
     try:

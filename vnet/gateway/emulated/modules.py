@@ -26,7 +26,7 @@ from contextvars import ContextVar
 from functools import cache, partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, NoReturn
 
 from greenlet import GreenletExit
@@ -38,6 +38,7 @@ from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_fu
 from vnet.gateway.emulated.shown import Facade, hide, import_shared, show
 from vnet.gateway.emulated.strands import Threads, look, set_generator_hooks, sleep
 from vnet.node import Node
+from vnet.runtime.own_asyncio import Numbered
 from vnet.units import NS_PER_S
 
 ENDPOINT = "tcp/127.0.0.1:1"
@@ -54,17 +55,30 @@ _OWN_COPIES = (
     "asyncio",
     "concurrent",
     "contextlib",
+    "email.utils",
     "fileinput",
+    "gzip",
     "logging",
+    "multiprocessing.dummy",
+    "multiprocessing.pool",
+    "multiprocessing.util",
     "optparse",
     "queue",
     "sched",
+    "tarfile",
     "tempfile",
     "threading",
+    "timeit",
     "uuid",
+    "zipfile",
 )
 """Modules and packages of the standard library of which each program has its own: they block, keep such
-objects, or read the words of the command."""
+objects, ask for the time, or read the words of the command."""
+_OWN_PARTS = {
+    parent: [name for name in _OWN_COPIES if name.startswith(f"{parent}.")]
+    for parent in ("email", "multiprocessing")
+}
+"""Packages that are shared but for these modules."""
 _ABSENT = ("_asyncio", "_queue")
 """Accelerators whose Python version is taken, as they block in C."""
 _SHARED = ("vnet", "agents", "emulator", "greenlet")
@@ -134,10 +148,13 @@ class ProgramModules:
             "subprocess": lambda: Facade(subprocess, **subprocess_functions(self.environ, tell)),
             "sys": self._sys,
             "time": self._time,
+            **{name: partial(_facade_of, name) for name in _OWN_PARTS},
         }
         self._preparations: dict[str, Callable[[Any], None]] = {
             "asyncio": lambda module: prepare_asyncio(module, node, self.threads, self.process.set_handler),
             "concurrent.futures": self._prepare_futures,
+            "multiprocessing.pool": self._prepare_pools,
+            "multiprocessing.util": _prepare_finalizers,
             "queue": self._prepare_queue,
             "threading": self._prepare_threading,
             "uuid": _prepare_uuid,
@@ -230,6 +247,8 @@ class ProgramModules:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         if name in self._facades:
             module = self.modules[name] = self._facades[name]()
+            for part in _OWN_PARTS.get(name, ()):
+                self.load(part)
             return module
         if _is_own_copy(name):
             spec = importlib.util.find_spec(name)
@@ -384,6 +403,7 @@ class ProgramModules:
             return lambda thread: None if isinstance(sys.exception(), GreenletExit) else hook(thread)
 
         module._make_invoke_excepthook = make_silent_hook
+        module.Thread.__hash__ = Numbered.__hash__
         module.Event.is_set = module.Event.isSet = _looking(module.Event.is_set)
         module.active_count = module.activeCount = _looking(module.active_count)
         module.enumerate = _looking(module.enumerate)
@@ -420,8 +440,24 @@ class ProgramModules:
                 return super().map(function, *iterables, timeout=timeout)
 
         module.ProcessPoolExecutor = ProcessPoolExecutor
+        module.Future.__hash__ = Numbered.__hash__
         module.Future.done = _looking(module.Future.done)
         module._base.LOGGER.addFilter(lambda _: not isinstance(sys.exception(), GreenletExit))
+
+    def _prepare_pools(self, module: Any) -> None:
+        """Have jobs of processes run in threads here, too, and what keeps a pool wait for a queue, no pipe."""
+        base, package = module.Pool, self.modules["multiprocessing"]
+        vars(module)["get_context"] = partial(SimpleNamespace, SimpleQueue=module.queue.SimpleQueue)
+        module.ThreadPool._get_sentinels = lambda pool: []
+        module.ThreadPool._wait_for_updates = staticmethod(lambda sentinels, notifier: notifier.get())
+
+        class Pool(module.ThreadPool):  # type: ignore[misc]
+            def __init__(
+                self, processes: Any = None, initializer: Any = None, initargs: Any = (), *args: Any, **options: Any
+            ) -> None:
+                base.__init__(self, processes, initializer, initargs)
+
+        module.Pool = vars(package)["Pool"] = Pool
 
 
 def _import_on(sys: ModuleType, load: Callable[[str], ModuleType]) -> Callable[..., ModuleType]:
@@ -439,8 +475,20 @@ def _present_module(name: str) -> ModuleType | None:
     return None if program is None else program.modules.get(name)
 
 
+@cache
 def _is_own_copy(name: str) -> bool:
-    return name.partition(".")[0] in _OWN_COPIES
+    parent = name.rpartition(".")[0]
+    return name in _OWN_COPIES or (bool(parent) and _is_own_copy(parent))
+
+
+def _facade_of(name: str) -> ModuleType:
+    return Facade(import_shared(name))
+
+
+def _prepare_finalizers(module: Any) -> None:
+    """Have the end of a program leave child processes alone: they are those of all vehicles of this process."""
+    module.atexit.unregister(module._exit_function)
+    module.atexit.register(module._run_finalizers, 0)
 
 
 def _prepare_uuid(module: Any) -> None:

@@ -56,7 +56,9 @@ class OwnProcess:
             **dict.fromkeys(["kill", "killpg"], self._kill),
             "_exit": self._exit,
             "abort": lambda: self._exit(-signal.SIGABRT),
-            **{name: _refuse for name in vars(os) if name.startswith(("exec", "fork"))},
+            **{name: _refuse for name in vars(os) if name.startswith(("exec", "fork", "closerange"))},
+            "close": _but_of_all(os.close),
+            "dup2": _but_of_all(os.dup2),
         }
 
     def signal_functions(self) -> dict[str, Any]:
@@ -212,6 +214,17 @@ def _siginfo(number: int) -> signal.struct_siginfo:
 
 def _refuse(*args: object, **options: object) -> NoReturn:
     raise OSError(errno.ENOSYS, "not available on virtual time: the process has other vehicles, too")
+
+
+def _but_of_all(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that ends its last descriptor, but for input and output, which all vehicles have."""
+
+    def end(*descriptors: int, **options: Any) -> Any:
+        if descriptors[-1] in range(3):
+            _refuse()
+        return function(*descriptors, **options)
+
+    return end
 
 
 _programs, _path_before = 0, ""

@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from vnet.gateway.emulated.queries import ANY_KEY, Asking, Entity
-from vnet.gateway.emulated.strands import give_way, go_no_further_if_ended
+from vnet.gateway.emulated.strands import give_way, go_no_further_if_ended, look
 from vnet.gateway.emulated.values import (
     DELETE,
     NO_ENCODING,
@@ -37,7 +37,7 @@ from vnet.gateway.emulated.values import (
     zbytes_of,
 )
 from vnet.gateway.emulated.vehicle import Vehicle
-from vnet.runtime.own_asyncio import present_node
+from vnet.runtime.own_asyncio import Numbered, present_node
 
 QUERY_TIMEOUT_S = 10.0
 """Zenoh's own `queries_default_timeout`."""
@@ -53,7 +53,7 @@ _REFUSED_SETTINGS = (
 LOCAL, REMOTE = zenoh.Locality.SESSION_LOCAL, zenoh.Locality.REMOTE
 
 
-class Ending:
+class Ending(Numbered):
     """A session, or an entity that it has declared; a `with` block ends it."""
 
     _ends: dict[Callable[[], object], None] | None = None
@@ -523,6 +523,7 @@ class Session(Ending):
     ) -> Sample:
         """Put or delete a sample, and return it."""
         self.check_open()
+        look()  # a loop of puts that waits for nothing comes to the end of the run
         sample = Sample(
             key_of(key),
             zbytes_of(payload),
@@ -557,6 +558,7 @@ class Session(Ending):
         check({"accept_replies": accept_replies, "allowed_destination": allowed_destination})
         check({"cancellation_token": cancellation_token}, cancellation_token=CancellationToken)
         self.check_open()
+        look()
         sink, seen = sink_of(handler, self.outlet)
         selector = selector if isinstance(selector, zenoh.Selector) else zenoh.Selector(selector)
         if accept_replies == zenoh.ReplyKeyExpr.ANY and ANY_KEY not in selector.parameters:

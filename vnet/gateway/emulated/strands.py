@@ -35,7 +35,8 @@ T = TypeVar("T")
 MOST_EXITS = 10
 """Times that a strand is told to end which blocks in answer, or goes on."""
 MOST_LOOKS, BUSY_WAIT_S = 1000, 0.001
-"""Looks of a thread, at one instant, at what only time or others change, and how long it is let wait then."""
+"""Looks of a thread, at one instant, at what only time or others change, and how long it is let wait then. What it
+puts and asks counts like them."""
 LONGEST_WAIT_S = 1e9
 """Largest timeout of a lock in seconds, as `threading.TIMEOUT_MAX`."""
 
@@ -266,6 +267,8 @@ def block_on(awaitable: Awaitable[T]) -> T:
 
 def sleep(seconds: float) -> None:
     """Block the present strand for so long."""
+    if seconds != seconds:
+        raise ValueError("Invalid value NaN (not a number)")
     if seconds < 0:
         raise ValueError("sleep length must be non-negative")
     if _is_child:
