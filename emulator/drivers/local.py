@@ -340,7 +340,7 @@ class _Branched:
 
     @property
     def buffer(self) -> io.BufferedIOBase:
-        """What takes bytes."""
+        """The stream of bytes below it."""
         return _BranchedBytes(self)
 
     def close(self) -> None:
@@ -348,7 +348,7 @@ class _Branched:
         self.stream.flush()
 
     def detach(self) -> io.BufferedIOBase:
-        """Return what takes bytes."""
+        """Return the stream of bytes below it."""
         return self.buffer
 
     def write(self, text: str) -> int:
