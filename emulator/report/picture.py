@@ -72,10 +72,13 @@ def _picture(source: Source) -> Figure:
     curves = list(islice(_drawn(figures_of(source), CURVE_PX, problems), COLUMNS * ROWS))
     right = list(_packed(curves))
     right_px = max((one.end_px for one in right), default=0)
+    charts = list(_packed(_drawn(program_charts(source), MAP_PX // COLUMNS, problems)))
     events = [line[:LONGEST_LINE] for line in (*_events(source), *problems)]
     left_px = (TITLE_PX + chart[1].shape[0] if chart else 0) + (TITLE_PX + LINE_PX * len(events))
-    room_px = right_px - left_px - LINE_PX
-    own = [one for one in _packed(_drawn(program_charts(source), MAP_PX // COLUMNS, [])) if one.end_px <= room_px]
+    own = [one for one in charts if one.end_px <= right_px - left_px - 2 * LINE_PX]
+    if more := len(charts) - len(own):
+        events.append(f"and {counted(more, 'chart')} more of the program: see report.html")
+        left_px += LINE_PX
     height_px = HEADING_PX + max(left_px, right_px) + MARGIN_PX
     width_px = 3 * MARGIN_PX + MAP_PX + COLUMNS * CURVE_PX
     figure = Figure(figsize=(width_px / DPI, height_px / DPI), dpi=DPI)

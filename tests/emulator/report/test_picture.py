@@ -76,6 +76,14 @@ def test_a_picture_has_what_programs_report_and_tell(run: Path, monkeypatch: pyt
     assert "neighbours" in drawn and any("0.00 s   event   v01   begun" in text for text in drawn)
 
 
+def test_charts_that_do_not_fit_are_counted(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[str] = []
+    monkeypatch.setattr(Figure, "text", lambda self, x, y, text, **look: drawn.append(text))
+    monkeypatch.setattr("emulator.report.picture.ROWS", 1)
+    _picture(Source(run))
+    assert "neighbours" not in drawn and "and 1 chart more of the program: see report.html" in drawn
+
+
 def test_a_heading_ends_with_a_whole_figure(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("emulator.report.picture.LONGEST_HEADING", 60)
     assert _heading(Source(run))[1] == "packet delivery ratio 80.00% · attempted receptions 60 · …"
