@@ -26,6 +26,7 @@ from collections.abc import Callable, Collection, Coroutine, Generator, Iterable
 from contextlib import contextmanager, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import coroutine
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TextIO
 
@@ -254,7 +255,7 @@ class HostedPrograms:
 
     def run(self) -> None:
         """From the first grant to the last. Raises KeyboardInterrupt."""
-        with output_kept(self._owns, self._logs), caught(self._host.process_ended):
+        with process_kept(), output_kept(self._owns, self._logs), caught(self._host.process_ended):
             asyncio.set_event_loop(self.loop)
             try:
                 self._run()
@@ -296,6 +297,20 @@ class HostedPrograms:
         for name, arguments in calls:
             getattr(self._host, name)(*arguments)
         return self._host.open_window(grant, mail)
+
+
+@contextmanager
+def process_kept() -> Iterator[None]:
+    """Take back what programs have changed of this process within the block, which goes on without them."""
+    folder, variables, modules = Path.cwd(), dict(os.environ), list(sys.path)
+    try:
+        yield
+    finally:
+        os.chdir(folder)
+        sys.path[:] = modules
+        if os.environ != variables:
+            os.environ.clear()
+            os.environ.update(variables)
 
 
 # What simulated programs print goes to the terminal, and to `logs/NODE.log` as in a run of many processes.

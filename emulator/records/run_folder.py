@@ -412,7 +412,7 @@ class NodeLogs:
     """The logs of nodes in the folder `logs`. Raises VnetError where the disk refuses."""
 
     def __init__(self, logs: Path) -> None:
-        self._logs = logs
+        self._logs = logs.absolute()
         self._bytes: Counter[str] = Counter()
         self._begun: dict[str, str] = {}
         self._lock = threading.RLock()  # threads of programs print

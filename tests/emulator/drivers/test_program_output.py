@@ -2,16 +2,20 @@
 
 import asyncio
 import io
+import os
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.local import output_kept
+from emulator.drivers.session import Session
 from emulator.records import run_folder
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import NodeLogs
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, run_forked, run_together, scenario_of
@@ -109,6 +113,27 @@ def test_no_program_closes_the_output_of_all(
     said = ["bytes ä", "wrapped", "wrapped", "further"]
     assert log_of(emulation, "v01").splitlines() == [*said, "v01 finished"]
     assert [line for line in capsys.readouterr().out.splitlines() if line in said] == said
+
+
+async def changes_the_process(node: Node) -> None:
+    os.chdir("/")
+    os.environ.clear()
+    sys.path.clear()
+    print("moved")
+    node.event("moved")
+
+
+def test_what_programs_change_of_their_process_is_taken_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    variables, modules = dict(os.environ), set(sys.path)
+    session = Session(scenario_of([], f"{__name__}:changes_the_process", vehicles=2), Path("run")).open()
+    session.run()
+    session.close()
+    assert (dict(os.environ), Path.cwd()) == (variables, tmp_path) and modules <= set(sys.path)
+    assert (tmp_path / "run/logs/v01.log").read_text().startswith("moved\n")
+    assert [event.kind for event in RecordedRun.open(Path("run"), {}).events].count("event") == 2
 
 
 async def never_ends_a_line(node: Node) -> None:
