@@ -20,7 +20,8 @@ from emulator.scenario.program import from_here, split_file
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError, did_you_mean, printable, shown
-from vnet.runtime.programs import error_line, search_programs_in
+from vnet.runtime.error_text import error_line
+from vnet.runtime.programs import search_programs_in
 from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:

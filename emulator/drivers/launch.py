@@ -31,7 +31,7 @@ from typing import Protocol
 from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.usage import cpu_time_ns
 from vnet.errors import VnetError
-from vnet.runtime import forking
+from vnet.runtime import die_with_parent, forking
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
 from vnet.runtime.environment import KEPT_MEMORY, SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
@@ -68,8 +68,8 @@ STARVED_LOOK_S = 0.02
 CREDENTIALS = "{credentials}"
 PLACEHOLDERS = ("{endpoint}", "{run}", "{node}", CREDENTIALS)
 """Words in an agent's command that stand for what differs from one to the next."""
-TIED = (sys.executable, "-P", "-m", "vnet.runtime.die_with_parent")
-"""Words before a command that is to end when this process does."""
+TIED = (sys.executable, "-I", "-S", die_with_parent.__file__)
+"""Words before a command that is to end when this process does: of the environment they heed nothing."""
 MOST_ZYGOTES = 3
 """Attempts to fork an agent: a zygote that has ended is started again."""
 

@@ -45,9 +45,10 @@ from vnet.runtime import running_node
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.error_text import error_line
 from vnet.runtime.host import Disks, Host
 from vnet.runtime.outside_loop import caught, present_node
-from vnet.runtime.programs import Programs, error_line, load_programs
+from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.ready_queue import CpuMeter
 from vnet.runtime.running_node import LOOK_S, Patience, RunningNode
 from vnet.runtime.virtual_time import VirtualTimeLoop

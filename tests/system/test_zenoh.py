@@ -131,10 +131,43 @@ def test_what_programs_say_before_the_start_is_sent_then(vnet: Vnet, tmp_path: P
 def test_a_command_that_fails_is_a_crash_of_its_vehicle_alone(vnet: Vnet, tmp_path: Path) -> None:
     fails = command("time.sleep(1); sys.exit(3 if name == 'v02' else 0)")
     done = vnet("run", scenario(tmp_path, fails, *SHORT))
-    (death,) = done.events_of("died")
-    assert (done.status, death["node"]) == (1, "v02")
-    assert "status 3" in death["how"]
+    (crash,) = done.events_of("crashed")
+    assert (done.status, crash["node"]) == (1, "v02")
+    assert "ended with 3" in crash["error"]
     assert sorted(event["node"] for event in done.events_of("finished")) == ["v01", "v03", "v04"]
+
+
+def test_a_main_thread_that_fails_is_a_crash_in_the_words_of_virtual_time(vnet: Vnet, tmp_path: Path) -> None:
+    """Zenoh's thread of a callback would keep the process: v06, whose main thread returns, stays."""
+    lines = (
+        "import signal, sys, zenoh",
+        "session = zenoh.open(zenoh.Config.from_env())",
+        "session.declare_subscriber('car/**', print)",
+        "session.declare_subscriber('vnet/fix').recv()",
+        "name, fail = sys.argv[1], lambda: fail()",
+        "if name == 'v01': raise RuntimeError('motor failed')",
+        "if name == 'v02': sys.exit(7)",
+        "if name == 'v03': sys.exit('no camera')",
+        "if name == 'v04': fail()",
+        "if name == 'v05': signal.raise_signal(signal.SIGINT)",
+    )
+    (tmp_path / "fails.py").write_text("\n".join(lines))
+    words = '["python", "talker.py", "{id}"]', '["python", "fails.py", "{id}"]'
+    path = scenario(tmp_path, words, ("vehicles = 4", "vehicles = 6"), *SHORT)
+    live, simulated = vnet("run", path), vnet("simulate", path)
+    assert (live.status, simulated.status) == (1, 1)
+    told = {event["node"]: (event["error"], event["place"]) for event in live.events_of("crashed")}
+    file = tmp_path / "fails.py"
+    assert told == {
+        "v01": ("RuntimeError: motor failed", "fails.py:6"),
+        "v02": (f"ProgramError: python {file} v02 ended with 7", "fails.py:7"),
+        "v03": (f"ProgramError: python {file} v03 ended with 'no camera'", "fails.py:8"),
+        "v04": ("RecursionError: maximum recursion depth exceeded", "fails.py:5"),
+        "v05": (f"ProgramError: python {file} v05 ended with 130", "fails.py:10"),
+    }
+    errors = {event["node"]: event["error"] for event in simulated.events_of("crashed")}
+    assert errors == {node: error for node, (error, _) in told.items()}
+    assert not live.events_of("died") + live.events_of("finished")
 
 
 def test_a_session_at_another_vehicles_endpoint_is_no_isolation(vnet: Vnet, tmp_path: Path) -> None:

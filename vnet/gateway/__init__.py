@@ -9,7 +9,10 @@ from pathlib import Path
 from typing import Any
 
 STARTUP = Path(__file__).with_name("startup")
-"""Folder on `PYTHONPATH` by which programs in Python heed `ZENOH_CONFIG_OVERRIDE`, whatever they open."""
+"""Folder on `PYTHONPATH` by which programs in Python heed `ZENOH_CONFIG_OVERRIDE`, whatever they open, and tell of
+their failure."""
+FAILURE = "VNET_FAILURE"
+"""Variable with the path of the file to which they write it: `error`, `status` (or empty), `place`, `details`."""
 FILLED_IN = ("{id}", "{endpoint}", "{port}")
 """Words of a command that vnet fills in."""
 PYTHON_FLAGS = frozenset(["-u", "-B", "-E", "-s", "-S", "-q"])

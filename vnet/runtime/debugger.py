@@ -24,7 +24,7 @@ from typing import IO, Any, TextIO, cast
 
 from vnet.errors import LONGEST_MESSAGE, printable
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.programs import error_line
+from vnet.runtime.error_text import error_line
 from vnet.units import NS_PER_S
 
 _NOT_STEPPED_INTO = (

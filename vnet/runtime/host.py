@@ -34,12 +34,13 @@ from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap, map_from_wire
 from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, NodeClocks, Window
+from vnet.runtime.error_text import error_line, line_of_caller, own_line
 from vnet.runtime.outside_loop import ProcessEndedError
 from vnet.runtime.own_asyncio import Task, current_node, present_node
-from vnet.runtime.programs import Program, Programs, error_line
+from vnet.runtime.programs import Program, Programs
 from vnet.runtime.ready_queue import EventChooser, chooser_of, node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap
-from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, line_of_task, own_line
+from vnet.runtime.unhandled import UnhandledExceptions, line_of_task
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 from vnet.transport.wire import Deviation, Order, SentMessage, arrived_in_full

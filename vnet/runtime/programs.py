@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from vnet.errors import ProgramError, did_you_mean
 from vnet.extras import missed_by
+from vnet.runtime.error_text import error_line
 from vnet.runtime.own_packages import name_clash
 
 if TYPE_CHECKING:
@@ -92,25 +93,6 @@ def _origin(module: ModuleType) -> str:
 def _programs_of(module: ModuleType) -> list[str]:
     """Names of the functions of a module that could be programs."""
     return [name for name, value in vars(module).items() if inspect.iscoroutinefunction(value)]
-
-
-def error_line(error: BaseException) -> str:
-    """Return the type and the message of an exception in one line; of a group those of its first leaf."""
-    if isinstance(error, BaseExceptionGroup):
-        first, *others = leaves(error)
-        return f"{error_line(first)} (and {len(others)} more in its group)" if others else error_line(first)
-    try:
-        text = " ".join(str(error).split())
-    except Exception as another:  # of the exception's own __str__
-        text = f"(its text cannot be made: {type(another).__name__})"
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-def leaves(error: BaseException) -> list[BaseException]:
-    """Return the exceptions of a group that are no groups, in order; an exception alone is its only leaf."""
-    if not isinstance(error, BaseExceptionGroup):
-        return [error]
-    return [leaf for each in error.exceptions for leaf in leaves(each)]
 
 
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:

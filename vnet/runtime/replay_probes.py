@@ -15,7 +15,7 @@ from types import FrameType
 from vnet.node import Action
 from vnet.radio import SentFrame
 from vnet.reports import Report
-from vnet.runtime.unhandled import NOT_THE_PROGRAM
+from vnet.runtime.error_text import NOT_THE_PROGRAM
 from vnet.transport.wire import SentMessage
 
 CALLS_VARIABLE = "VNET_CALLS"

@@ -9,20 +9,18 @@ program ends: nothing here depends on when the collector runs.
 from __future__ import annotations
 
 import asyncio
-import sysconfig
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
+from vnet.runtime.error_text import error_line, line_of, own_line
 from vnet.runtime.outside_loop import ExecutorJob, ProcessEndedError, collector
 from vnet.runtime.own_asyncio import NOBODY, current_node, present_node
-from vnet.runtime.programs import error_line, leaves
 from vnet.runtime.ready_queue import node_of
 from vnet.runtime.virtual_time import SkewedLoop
 from vnet.transport.wire import Unhandled
@@ -33,11 +31,6 @@ MOST_HELD = 1000
 """Exceptions that a process keeps until its end; of a flood, the first ones."""
 FIRST_CLEANING = 1000
 """Failures that are remembered before those that have been retrieved are forgotten."""
-NOT_THE_PROGRAM = (
-    f"{Path(__file__).parents[1]}/",
-    *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")),
-)
-"""Folders of code that is no program: vnet, the standard library, installed packages."""
 _NOT_ITS_OWN = (KeyboardInterrupt, ProcessEndedError)
 """Exceptions that vnet has raised: the death of their vehicle has been told."""
 _SHIELDED = "exception in shielded future"
@@ -256,28 +249,9 @@ class UnhandledExceptions:
         return Unhandled(node, failure.time_ns, error_line(error), place, details)
 
 
-def own_line(error: BaseException) -> str:
-    """Return file and line of the innermost frame that is the program's own, or of the innermost of all."""
-    leaf = leaves(error)[0]
-    traces = [each.__traceback__ for each in ([error, leaf] if leaf is not error else [leaf])]
-    frames = [frame for trace in traces for frame in traceback.walk_tb(trace)]
-    return _own_of([(frame.f_code.co_filename, number) for frame, number in frames])
-
-
-def line_of_caller() -> str:
-    """Return file and line of the innermost frame of the present stack that is the program's own."""
-    frames = traceback.walk_stack(None)
-    return _own_of([(frame.f_code.co_filename, number) for frame, number in frames][::-1])
-
-
 def line_of_task(task: asyncio.Task[Any]) -> str:
     """Return file and line of the innermost frame in which a suspended task waits that is the program's own."""
-    return _own_of([(frame.f_code.co_filename, frame.f_lineno) for frame in asyncio_internals.suspended_in(task)])
-
-
-def _own_of(lines: Sequence[tuple[str, int]]) -> str:
-    own = [line for line in lines if not line[0].startswith(NOT_THE_PROGRAM)] or lines
-    return f"{Path(own[-1][0]).name}:{own[-1][1]}" if own else ""
+    return line_of((frame, frame.f_lineno) for frame in asyncio_internals.suspended_in(task))
 
 
 def _nothing() -> None:

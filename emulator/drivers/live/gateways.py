@@ -15,7 +15,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
@@ -32,7 +32,7 @@ from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from emulator.scenario.program import PYTHON
 from vnet.errors import ProgramError, VnetError, counted, first_names, shown
-from vnet.gateway import filled_in
+from vnet.gateway import FAILURE, filled_in
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments, Message, TooLargeError
 from vnet.gateway.ros2 import Ros2
 from vnet.radio import SentFrame
@@ -62,8 +62,8 @@ class _Vehicle:
     gateway: Gateway
     reporter: Reporter
     nice: int
-    names: list[str] = field(default_factory=list)
-    """Names of the processes of its commands that have not ended, as the launcher has them."""
+    commands: dict[str, str] = field(default_factory=dict)
+    """Its commands that have not ended, by the names of their processes, as the launcher has them."""
     fragments: Fragments | None = None
     acknowledges: bool = False
     is_ready: bool = False
@@ -212,7 +212,7 @@ class Gateways:
     def signal(self, name: str, number: signal.Signals) -> None:
         """Send a signal to the commands of a vehicle."""
         if (vehicle := self._vehicles.get(name)) is not None:
-            for process in vehicle.names:
+            for process in vehicle.commands:
                 self._launcher.signal_group(process, number)
             vehicle.is_paused = number == signal.SIGSTOP
             self._flush_soon(vehicle)
@@ -224,7 +224,9 @@ class Gateways:
 
     def detach(self, name: str) -> Callable[[float], None]:
         """Have a vehicle's commands end; returns what waits so many seconds for it, and kills them then."""
-        processes = self._close(name)
+        return self._told_to_end(self._close(name))
+
+    def _told_to_end(self, processes: Collection[str]) -> Callable[[float], None]:
         for process in processes:
             self._launcher.signal_group(process, signal.SIGTERM)
         waits = [self._launcher.detach(process) for process in processes]
@@ -244,35 +246,56 @@ class Gateways:
 
     def takes_end(self, name: str, how: Exit) -> bool:
         """Take the end of a command; it is the end of its vehicle if its status says that it has failed."""
-        vehicle = next((each for each in self._vehicles.values() if name in each.names), None)
+        vehicle = next((each for each in self._vehicles.values() if name in each.commands), None)
         if vehicle is None:
             return False
-        node = vehicle.gateway.node_id
-        vehicle.names.remove(name)
-        if how.status != 0:
+        node, words = vehicle.gateway.node_id, vehicle.commands.pop(name)
+        crash = self._crash(vehicle, name, words) if vehicle.on_air else None
+        if crash is not None:
+            others, vehicle.commands = vehicle.commands, {}
+            self._spawn(self._wait_or_kill(self._told_to_end(others)))
+            vehicle.outbox.endings.append(crash)
+            self._flush_soon(vehicle)
+        elif how.status != 0:
             self._spawn(self._end(node))
             self._tell("ended", node, how)
-        elif not vehicle.names and not vehicle.is_ready:
+        elif not vehicle.commands and not vehicle.is_ready:
             self._say_hello(vehicle, failure=f"its commands have ended before they had connected: {HOW}")
-        elif not vehicle.names:
+        elif not vehicle.commands:
             vehicle.outbox.endings.append(wire.Ending(node, "finished"))
             self._flush_soon(vehicle)
         return True
 
-    async def _end(self, node: str) -> None:
-        await asyncio.to_thread(self.detach(node), SHUT_DOWN_S)
+    def _failure_path(self, vehicle: _Vehicle, process: str) -> Path:
+        return Path(self._folder.name) / f"{process}.{vehicle.number}.failure"
 
-    def _close(self, node: str) -> list[str]:
+    def _crash(self, vehicle: _Vehicle, process: str, words: str) -> wire.Ending | None:
+        """Return what a command in Python that has ended has told of its failure, in the words of virtual time."""
+        try:
+            content = self._failure_path(vehicle, process).read_bytes()
+            told = msgspec.json.decode(content, type=dict[str, str])
+        except (OSError, msgspec.MsgspecError):
+            return None
+        error = f"ProgramError: {words} ended with {told['status']}" if told["status"] else told["error"]
+        return wire.Ending(vehicle.gateway.node_id, "crashed", error, told["details"], told["place"])
+
+    async def _end(self, node: str) -> None:
+        await self._wait_or_kill(self.detach(node))
+
+    async def _wait_or_kill(self, wait: Callable[[float], None]) -> None:
+        await asyncio.to_thread(wait, SHUT_DOWN_S)
+
+    def _close(self, node: str) -> Collection[str]:
         """Close a vehicle's gateway; return the names of the processes of its commands, which are its no more."""
         vehicle = self._vehicles.get(node)
         if vehicle is None:
-            return []
+            return ()
         if vehicle.early or vehicle.outbox.frames:
             self._flush(vehicle, final=True)
         vehicle.on_air = False
         del self._vehicles[node]
         self._closing[node] = asyncio.ensure_future(vehicle.gateway.close())
-        return vehicle.names
+        return vehicle.commands
 
     def restart_endpoints(self, down_s: float) -> None:
         """Close the routers of all vehicles, and open them again at their endpoints after so long."""
@@ -338,9 +361,10 @@ class Gateways:
         try:
             for number, words in enumerate(commands, start=1):
                 name = node if number == 1 else f"{node}~{number}"
-                words = filled_in(_located(words), node, endpoint)
-                self._launcher.start_command(name, words, environment, vehicle.nice)
-                vehicle.names.append(name)
+                environment[FAILURE] = str(self._failure_path(vehicle, name))
+                words = filled_in(words, node, endpoint)
+                self._launcher.start_command(name, _located(words), environment, vehicle.nice)
+                vehicle.commands[name] = " ".join(words)
         except VnetError as error:
             self._say_hello(vehicle, failure=str(error))
 

@@ -1,6 +1,7 @@
 """Start of Python in the commands of vehicles: `zenoh.open` heeds the environment, and loses nothing."""
 
 import base64
+import json
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vnet.gateway import STARTUP
+from vnet.gateway import FAILURE, STARTUP
 from vnet.transport.authority import issue_certificates
 
 pytestmark = pytest.mark.slow
@@ -90,3 +91,41 @@ def test_a_module_of_the_program_is_found_before_pythons(tmp_path: Path, name: s
     """It would not be if the start had loaded Python's."""
     (tmp_path / f"{name}.py").write_text("OWN = True")
     assert start(tmp_path, code=f"import zenoh, {name}; print({name}.OWN)").stdout == "True\n"
+
+
+STAYS = "import sys, threading, zenoh; threading.Thread(target=threading.Event().wait).start()"
+"""A program that Python alone would not end."""
+
+
+@pytest.mark.parametrize(
+    ("ends", "status", "told"),
+    [
+        ("raise SystemExit(3)", 3, "SystemExit: 3"),
+        ("try: sys.exit(4)\nfinally: print(end='')", 4, "SystemExit: 4"),
+        ("sys.excepthook = lambda *error: None; 1 / 0", 1, "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_main_thread_that_fails_ends_its_program_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: str, status: int, told: str
+) -> None:
+    monkeypatch.setenv(FAILURE, str(tmp_path / "failure"))
+    assert start(code=f"{STAYS}\n{ends}").returncode == status
+    assert json.loads((tmp_path / "failure").read_text())["error"] == told
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [
+        "sys.exit()",
+        "try: sys.exit(5)\nexcept SystemExit as error: assert error.code == 5",
+        "import subprocess; subprocess.run([sys.executable, '-c', 'import zenoh; 1 / 0'])",
+        "import os; os.fork() or sys.exit(6); os.wait()",
+        "thread = threading.Thread(target=sys.exit, args=[7]); thread.start()",
+    ],
+)
+def test_no_other_end_is_a_failure_of_the_main_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: str
+) -> None:
+    monkeypatch.setenv(FAILURE, str(tmp_path / "failure"))
+    assert start(code=f"import sys, threading, zenoh\n{ends}").returncode == 0
+    assert not (tmp_path / "failure").exists()

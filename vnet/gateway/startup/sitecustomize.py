@@ -1,7 +1,8 @@
 """Start of Python in the commands of Zenoh vehicles: `zenoh.open` heeds `ZENOH_CONFIG_OVERRIDE`, as rmw_zenoh does.
 
 Python finds it by `PYTHONPATH`, also where vnet is not installed. So programs with `zenoh.Config()`, or an endpoint
-of their own, are clients of their vehicle's router, and no peers of other vehicles past the radio.
+of their own, are clients of their vehicle's router, and no peers of other vehicles past the radio. `_vnet_failure`,
+beside it, tells vnet of a main thread that has failed.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ class ZenohFinder:
                 execute(module)
                 check_version(module)
                 open_with_override(module)
+                if reports:
+                    watch(reports.pop())
 
             spec.loader.exec_module = load  # type: ignore[method-assign]
         return spec
@@ -60,6 +63,9 @@ def open_with_override(zenoh: Any) -> None:
 
 
 sys.meta_path.insert(0, ZenohFinder())
+watch = import_module("_vnet_failure").watch
+reports = list(filter(None, [os.environ.pop("VNET_FAILURE", None)]))
+"""The file for a failure of this process, and of none that it starts."""
 # The one that this one hides runs as well.
 sys.path.remove(__file__.rpartition("/")[0])
 own = sys.modules.pop("sitecustomize")
