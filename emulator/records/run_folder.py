@@ -84,6 +84,8 @@ class RunFolder:
         self.is_open = False
         """True once there is a folder, whose files are kept."""
         self._has_own_number = self._is_scratch = False
+        self._events_file = path
+        """The file of events, wherever a program changes to."""
         self._lacks_events = False
         self.unkept: list[str] = []
         """A line for each file that the disk has refused at the end of the run."""
@@ -132,7 +134,8 @@ class RunFolder:
             self._digests = self._digests or _digests(scenario)
             self.is_open = True
             self.put_scenario(scenario)
-            (self.path / EVENTS_FILE).write_text("".join(event.line() for event in self.events))
+            self._events_file = (self.path / EVENTS_FILE).absolute()
+            self._events_file.write_text("".join(event.line() for event in self.events))
             if self._has_own_number:
                 _point_latest_to(self.path)
 
@@ -202,7 +205,7 @@ class RunFolder:
         self.events.append(event)
         if self.is_open and not self._lacks_events:
             try:
-                with (self.path / EVENTS_FILE).open("a") as file:
+                with self._events_file.open("a") as file:
                     file.write(event.line())
             except OSError:  # the run goes on, and writes them all at its end
                 self._lacks_events = True
