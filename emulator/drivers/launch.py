@@ -30,6 +30,7 @@ from typing import Protocol
 
 from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.usage import cpu_time_ns
+from emulator.records.node_logs import cut_log
 from vnet.errors import VnetError
 from vnet.runtime import die_with_parent, forking
 from vnet.runtime.die_with_parent import STARTED_BY_VNET
@@ -596,6 +597,11 @@ class Launcher:
             return ""
         return "\n".join(text.splitlines()[-LOG_TAIL_LINES:])
 
+    def cut_logs(self) -> None:
+        """Cut the logs that are full: processes write them by themselves, and are not to wait for anybody."""
+        for log in self.logs.glob("*.log"):
+            cut_log(log)
+
     def request_stack(self, name: str) -> None:
         """Have a process write its stacks to its log (its faulthandler answers SIGUSR1), if it is one of vnet's."""
         if name in self._processes and not self.agent_command:
@@ -669,6 +675,7 @@ class Launcher:
         for process in self._processes.values():
             process.wait()
         self._processes.clear()
+        self.cut_logs()
         if self._zygote is not None:
             self._zygote.close()
         return ends

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import zenoh
 
+from emulator.records.node_logs import LARGEST_LOG_BYTES, log_is_full
 from tests.support.paths import ROOT
 from tests.system.conftest import Finished, Vnet
 from vnet.transport.authority import issue_certificates
@@ -168,6 +169,24 @@ def test_a_main_thread_that_fails_is_a_crash_in_the_words_of_virtual_time(vnet: 
     errors = {event["node"]: event["error"] for event in simulated.events_of("crashed")}
     assert errors == {node: error for node, (error, _) in told.items()}
     assert not live.events_of("died") + live.events_of("finished")
+
+
+def test_the_log_of_a_command_is_cut_while_it_writes(vnet: Vnet, tmp_path: Path) -> None:
+    """It floods its log until that has become shorter: who writes waits for nobody."""
+    lines = (
+        "import os, zenoh",
+        "session, before = zenoh.open(zenoh.Config.from_env()), 0",
+        "while before <= (now := os.fstat(1).st_size) < 1e9:",
+        "    before = now",
+        "    print('x' * 10_000)",
+        "assert now < before",
+    )
+    (tmp_path / "floods.py").write_text("\n".join(lines))
+    words = '["python", "talker.py", "{id}"]', '["python", "floods.py"]'
+    done = vnet("run", scenario(tmp_path, words, *SHORT))
+    assert done.status in SLOW
+    log = (done.folder / "logs/v01.log").read_bytes()
+    assert (len(log), log.endswith(log_is_full().encode())) == (LARGEST_LOG_BYTES + 1 + len(log_is_full()), True)
 
 
 def test_a_session_at_another_vehicles_endpoint_is_no_isolation(vnet: Vnet, tmp_path: Path) -> None:

@@ -422,6 +422,7 @@ class HostProcess:
     def _look(self, time_ns: int, memory_limit_mb: float | None) -> None:
         self._cpu.look(self._launcher.pids)
         self._memory.look(time_ns, self._launcher.pids)
+        self._launcher.cut_logs()
         if over := first_over(memory_limit_mb, self._launcher.pids):
             self._relay.add(("memory", *over))
             self._relay.hurry()

@@ -47,6 +47,8 @@ RECORDER_WAIT_S = 20.0
 """Seconds for which a run that came to its end waits for its recorder to write all down."""
 SCENE_EVERY_PERIODS = 50
 """Periods between two messages with the scene, for observers that come late."""
+LOGS_LOOK_S = 0.2
+"""Seconds between two looks whether a log is full."""
 MEMORY_LOOK_S = 0.2
 """Seconds of wall clock after which processes are compared with `run.memory_limit_mb` again."""
 
@@ -136,10 +138,17 @@ class LiveSession:
     ) -> tuple[float, bool]:
         """Join, run, end. Returns the wall-clock seconds between time 0 and the end, and whether interrupted."""
         with self._processes.supervisor.watching_children():
+            short_logs = asyncio.ensure_future(self._keep_logs_short())
             try:
                 return await self._run(on_state, on_missing)
             finally:
+                short_logs.cancel()
                 self._processes.close()
+
+    async def _keep_logs_short(self) -> None:
+        while True:
+            self._launcher.cut_logs()
+            await asyncio.sleep(LOGS_LOOK_S)
 
     async def _run(
         self, on_state: Callable[[str], None], on_missing: Callable[[Sequence[str]], None]

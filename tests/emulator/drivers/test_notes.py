@@ -9,8 +9,8 @@ import pytest
 
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import MOST_NOTES, Emulation
+from emulator.records.node_logs import NodeLogs, cut_log
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import NodeLogs
 from emulator.records.tables import STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
@@ -108,13 +108,27 @@ def test_a_flood_is_cut_and_counted() -> None:
 
 
 def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.records.run_folder.LARGEST_LOG_BYTES", 20)
+    monkeypatch.setattr("emulator.records.node_logs.LARGEST_LOG_BYTES", 20)
     logs = NodeLogs(tmp_path)
     for number in range(5):
         logs.write("v01", f"line {number:03}")
     assert (tmp_path / "v01.log").read_text() == (
         "line 000\nline 001\n(the log is full: further lines are left out after 20 bytes)\n"
     )
+
+
+def test_a_log_of_a_process_is_cut_while_it_has_it_open(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("emulator.records.node_logs.LARGEST_LOG_BYTES", 20)
+    path, words = tmp_path / "v01.log", "(the log is full: further lines are left out after 20 bytes)\n"
+    with path.open("a", buffering=1) as log:
+        log.write("line 000\nline 001\n")
+        cut_log(path)
+        assert path.read_text() == "line 000\nline 001\n"
+        for _ in range(2):
+            log.write("line 002\nline 003\n")
+            cut_log(path)
+            assert path.read_text() == f"line 000\nline 001\nli\n{words}"
+    cut_log(tmp_path / "none.log")
 
 
 class Transport:
