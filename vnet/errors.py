@@ -33,6 +33,11 @@ def printable(text: str, longest: int = LONGEST_SHOWN) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
+def sendable(text: str) -> str:
+    """Return a text as UTF-8 can have it: lone surrogates, as in names of files that are none, are escaped."""
+    return text if text.isascii() else text.encode(errors="backslashreplace").decode()
+
+
 def shown(value: object) -> str:
     """Return any wrong value as a message quotes it."""
     try:

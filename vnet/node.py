@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vnet.errors import shown
+from vnet.errors import sendable, shown
 from vnet.radio import (
     NO_ABILITIES,
     Backbone,
@@ -289,7 +289,7 @@ class Node:
         """
         if not isinstance(name, str) or not name or name in MOMENTS_OF_FAULTS:
             raise ValueError(f"event({name!r}): a name is expected, other than {' and '.join(MOMENTS_OF_FAULTS)}")
-        values = {key: checked_detail(key, value) for key, value in details.items()}
+        values = {sendable(key): checked_detail(key, value) for key, value in details.items()}
         self._transport.send_note(self.id, "event", "info", name, values)
 
 

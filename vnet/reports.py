@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import ArrayLike
 
-from vnet.errors import shown
+from vnet.errors import sendable, shown
 
 LONGEST_TEXT = 64
 """Characters of a reported text: it names a state, and is no log."""
@@ -49,7 +49,7 @@ def checked_detail(name: str, value: object) -> NoteDetail:
         return str(value)
     if isinstance(value, int) and abs(value) >= 2**63:
         return str(value)
-    return value
+    return sendable(value) if isinstance(value, str) else value
 
 
 def checked_numbers(name: str, value: ArrayLike, size: int | None = None) -> list[float]:
@@ -109,7 +109,7 @@ def checked_value(name: str, value: ArrayLike) -> Value:
     if isinstance(value, str):
         if len(value) > LONGEST_TEXT:
             raise ValueError(f"report({name}=…): text of {len(value)} characters, at most {LONGEST_TEXT} allowed")
-        return str(value)
+        return sendable(value)
     flat = checked_numbers(name, value)
     return flat[0] if np.ndim(value) == 0 else flat
 

@@ -31,7 +31,7 @@ def error_line(error: BaseException) -> str:
         first, *others = leaves(error)
         return f"{error_line(first)} (and {len(others)} more in its group)" if others else error_line(first)
     try:
-        text = " ".join(str(error).split())
+        text = " ".join(str(error).encode(errors="backslashreplace").decode().split())
     except Exception as another:  # of the exception's own __str__
         text = f"(its text cannot be made: {type(another).__name__})"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

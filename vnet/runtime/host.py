@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from msgspec.structs import replace
 
-from vnet.errors import DeadlockError
+from vnet.errors import DeadlockError, sendable
 from vnet.node import Action, Fix, Node
 from vnet.radio import Mailbox, Packet, RadioAbilities, SentFrame, Waits
 from vnet.reports import NoteDetail, Report
@@ -204,7 +204,7 @@ class Host:
         if node in self._paused:
             self._late.append((node, partial(self._note, node, kind, level, text, details)))
             return
-        time_ns = self._clock() if time_ns is None else time_ns
+        time_ns, text = self._clock() if time_ns is None else time_ns, sendable(text)
         note = wire.Note(node, time_ns, kind, level, text[:LONGEST_NOTE], details)  # type: ignore[arg-type]
         self._outbox.notes.append(note)
         self._lines.add(node, time_ns, kind, level, text, details)
@@ -508,7 +508,7 @@ class Host:
         if isinstance(error, SystemExit) and not error.code:
             self._over(node, "finished")
         elif self._runs(node) and not self._closing:
-            details = "".join(traceback.format_exception(error)[-30:])
+            details = sendable("".join(traceback.format_exception(error)[-30:]))
             self._over(node, "crashed", error_line(error), details, own_line(error))
         else:
             self._unhandled.add(node, error, "in main")

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from vnet.errors import sendable
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.error_text import error_line, line_of, own_line
@@ -245,7 +246,7 @@ class UnhandledExceptions:
         node = self._fallback if failure.owner is None else failure.owner.id
         line = own_line(error)
         place = f"{failure.place} ({line})" if line else failure.place
-        details = "".join(traceback.format_exception(error))[-LONGEST_TRACEBACK:]
+        details = sendable("".join(traceback.format_exception(error)))[-LONGEST_TRACEBACK:]
         return Unhandled(node, failure.time_ns, error_line(error), place, details)
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
+from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.node import Node
 from vnet.reports import RESERVED_NAMES
@@ -41,6 +43,10 @@ async def floods(node: Node) -> None:
     for number in range(MOST_NOTES + 7):
         node.log(f"line {number}")
     await asyncio.sleep(9)
+
+
+def log_of(emulation: Emulation) -> str:
+    return (emulation.folder.logs / "v01.log").read_text()
 
 
 def told(emulation: Emulation) -> list[tuple[Any, ...]]:
@@ -187,3 +193,28 @@ def test_wrong_levels_and_details_are_refused(node: Node) -> None:
         node.event("fault_started")  # for properties it would be a fault
     with pytest.raises(ValueError, match=r"^event\(y=\[1\]\): a number, a boolean or a text is expected$"):
         node.event("x", y=[1])  # type: ignore[arg-type]
+
+
+async def says_what_utf_8_does_not_have(node: Node) -> None:
+    node.log("\udcff")
+    node.event("\udcff", **{"\udcff": "\udcff"})
+    node.report(note="\udcff")
+    logger.error("\udcff")
+    task = asyncio.create_task(fails("\udcff"))
+    await asyncio.wait([task])
+    await fails("\udcff")
+
+
+async def fails(text: str) -> None:
+    raise ValueError(text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run_together, run_forked])
+def test_lone_surrogates_are_escaped(run: Callable[[Scenario], Emulation]) -> None:
+    """Names of files that are no UTF-8 have them; a program that tells of such a file goes on."""
+    emulation = run(scenario_of([], f"{__name__}:says_what_utf_8_does_not_have", vehicles=1))
+    told = [event.details for event in emulation.folder.events if event.node == "v01"]
+    texts = [str(value) for details in told for value in (*details, *details.values())]
+    assert sum("\\udcff" in text for text in texts) >= 8
+    assert "\udcff" not in "".join(texts) + log_of(emulation)
