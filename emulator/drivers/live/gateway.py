@@ -285,7 +285,7 @@ def session_environment(
     if settings.authority is not None:
         transport["link"] = {"tls": {"root_ca_certificate": str(settings.authority)}}
     if settings.users is not None:
-        user, _, password = settings.users.read_text().partition("\n")[0].partition(":")
+        user, password = next(iter(read_users(settings.users).items()))
         transport["auth"] = {"usrpwd": {"user": user, "password": password}}
     if transport:
         client["transport"] = transport
@@ -294,6 +294,24 @@ def session_environment(
     path.chmod(0o600)
     python_path = os.pathsep.join(filter(None, [str(STARTUP), inherited.get("PYTHONPATH")]))
     return {**inherited, **session_variables(node, endpoint, client, path), "PYTHONPATH": python_path}
+
+
+def read_users(path: Path) -> dict[str, str]:
+    """Return the passwords of users as Zenoh reads them. Raise ProgramError for what it refuses without a line."""
+    named, users = f"program.zenoh.users = {shown(str(path))}", {}
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProgramError(f"{named}: cannot be read: {error}") from None
+    for number, line in enumerate(lines, start=1):
+        user, _, password = map(str.strip, line.partition(":"))
+        if user and password:
+            users[user] = password
+        elif line.strip():
+            raise ProgramError(f"{named}: line {number} is no user:password")
+    if not users:
+        raise ProgramError(f"{named}: has no line user:password")
+    return users
 
 
 def check_trust(settings: ZenohSessions) -> None:

@@ -27,7 +27,14 @@ import zenoh
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit, Launcher
-from emulator.drivers.live.gateway import Gateway, check_trust, is_peer, session_environment, session_name
+from emulator.drivers.live.gateway import (
+    Gateway,
+    check_trust,
+    is_peer,
+    read_users,
+    session_environment,
+    session_name,
+)
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, ChangeSignal
 from emulator.records.events import EventKind
 from emulator.scenario.program import PYTHON
@@ -135,6 +142,8 @@ class Gateways:
             _located(words)
         if self._starts:
             check_trust(self._settings)
+        if self._settings.users is not None:
+            read_users(self._settings.users)
         port = int(self._settings.listen.rpartition(":")[2])
         if port and port + len(node_ids) - 1 > HIGHEST_PORT:
             raise ProgramError(

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from emulator.drivers.live.gateway import Gateway, check_trust
+from emulator.drivers.live.gateway import Gateway, check_trust, read_users
 from emulator.scenario.program import ZenohSessions
 from vnet.errors import ProgramError
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments
@@ -445,3 +445,30 @@ def test_an_encrypted_private_key_is_named_and_no_password_is_asked_for(tmp_path
     settings = ZenohSessions(listen="tls/127.0.0.1:0", **{name: tmp_path / name for name in files})
     with pytest.raises(ProgramError, match="private_key' is encrypted"):
         check_trust(settings)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("", "has no line user:password"),
+        ("car:secret\nalice\n", "line 2 is no user:password"),
+        (":secret", "line 1 is no user:password"),
+        ("\n# users\ncar:secret", "line 2 is no user:password"),
+        ("car:", "line 1 is no user:password"),
+        ("caf\xe9:secret", "cannot be read"),
+    ],
+)
+def test_a_file_that_has_not_user_and_password_in_each_line_is_named(
+    tmp_path: Path, content: str, says: str
+) -> None:
+    path = tmp_path / "users"
+    path.write_text(content, encoding="latin-1")
+    with pytest.raises(ProgramError, match=f"program.zenoh.users = '{path}': {says}"):
+        read_users(path)
+
+
+def test_users_are_those_whom_zenoh_reads(tmp_path: Path) -> None:
+    """The last password of a user counts."""
+    path = tmp_path / "users"
+    path.write_bytes(b"\n car : a:b \r\nbus:c\ncar:d")
+    assert read_users(path) == {"car": "d", "bus": "c"}
