@@ -258,6 +258,9 @@ def test_a_program_that_never_connects_and_a_port_that_is_taken_are_named(vnet: 
     done = vnet("run", scenario(tmp_path, sleeps), "--set", "run.join_timeout_s=1")
     assert done.status == 2
     assert "v01 at tcp/127.0.0.1:" in done.stderr
+    both = '["python", "talker.py", "{id}"]', '[["python", "talker.py", "{id}"], ["sleep", "100"]]'
+    done = vnet("run", scenario(tmp_path, both), "--set", "run.join_timeout_s=4")
+    assert re.search(r"vehicles have not connected within 4 s: v01 at \S+ \('sleep 100'\), v02 at", done.stderr)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

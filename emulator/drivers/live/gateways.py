@@ -56,6 +56,8 @@ ENDPOINTS = "endpoints.json"
 HIGHEST_PORT = 65_535
 HOW = "ZENOH_CONFIG, VNET_ENDPOINT and {endpoint} have it, for Zenoh 1; in Python zenoh.open() finds it by itself"
 """Hint for those whose program does not connect."""
+_ESTABLISHED = "01"
+"""State of a connection in proc_net(5)."""
 TURNS_S = 0.1
 """Seconds over which vehicles begin, one after another, what all of them do: at one instant it would be late."""
 
@@ -359,8 +361,13 @@ class Gateways:
     def send_content(self, unit: str, payload: bytes) -> None:
         """Zenoh programs of roadside units have no way to the backbone."""
 
+    def _commands_of(self, node: str) -> dict[str, list[str]]:
+        """Return the words of the commands of a vehicle, by the names of their processes."""
+        commands = enumerate(self._program.commands_of(node) if self._starts else (), start=1)
+        words = {number: filled_in(words, node, self.endpoints[node]) for number, words in commands}
+        return {node if number == 1 else f"{node}~{number}": each for number, each in words.items()}
+
     def _start_commands(self, node: str, vehicle: _Vehicle) -> None:
-        commands = self._program.commands_of(node) if self._starts else []
         folder, endpoint = Path(self._folder.name), self.endpoints[node]
         inherited = {name: value for name, value in os.environ.items() if name != RUNTIME_VARIABLE}
         environment = session_environment(node, endpoint, self._settings, folder, inherited)
@@ -368,10 +375,8 @@ class Gateways:
         if self._ros2 is not None:
             environment["ROS_DOMAIN_ID"] = str(self._ros2.domain)
         try:
-            for number, words in enumerate(commands, start=1):
-                name = node if number == 1 else f"{node}~{number}"
+            for name, words in self._commands_of(node).items():
                 environment[FAILURE] = str(self._failure_path(vehicle, name))
-                words = filled_in(words, node, endpoint)
                 self._launcher.start_command(name, _located(words), environment, vehicle.nice)
                 vehicle.commands[name] = " ".join(words)
         except VnetError as error:
@@ -571,9 +576,17 @@ class Gateways:
                 self._found.add(who)
                 self._emulation.folder.event(self._now_ns(), EventKind.found_session, node, which=who)
 
+    def _silent(self, node: str) -> str:
+        """Return in brackets which of several commands of a vehicle are not connected, if some are."""
+        commands, pids = self._commands_of(node).items(), self._launcher.pids
+        groups = _groups_connected_to(self.endpoints[node].rpartition(":")[2]) if len(commands) > 1 else ()
+        silent = [shown(" ".join(words)) for name, words in commands if pids.get(name) not in groups]
+        return f" ({', '.join(silent)})" if 0 < len(silent) < len(commands) else ""
+
     def missed(self, nodes: Sequence[str], timeout_s: float) -> str:
         """Say in one line which programs have not connected in time."""
-        where = [f"{node} at {self.endpoints[node]}" for node in nodes if node in self.endpoints]
+        listening = filter(self.endpoints.__contains__, nodes)
+        where = [f"{node} at {self.endpoints[node]}{self._silent(node)}" for node in listening]
         total = len(self._emulation.world.node_ids)
         if not where:
             return f"{len(nodes)} of {total} endpoints do not listen within {timeout_s:g} s: {first_names(nodes)}"
@@ -581,6 +594,21 @@ class Gateways:
             f"programs of {len(where)} of {total} vehicles have not connected within {timeout_s:g} s: "
             f"{first_names(where)}: {HOW}"
         )
+
+
+def _groups_connected_to(port: str) -> set[int]:
+    """Return the process groups that are connected to a TCP port of this machine, if the system says so."""
+    sockets, groups = set(), set()
+    for table in map(Path, ("/proc/net/tcp", "/proc/net/tcp6")):
+        lines = table.read_text().splitlines()[1:] if table.exists() else []
+        for _, _, remote, state, *_, inode in (line.split()[:10] for line in lines):
+            if state == _ESTABLISHED and int(remote.rpartition(":")[2], 16) == int(port):
+                sockets.add(f"socket:[{inode}]")
+    for descriptor in Path("/proc").glob("[0-9]*/fd/*") if sockets else ():
+        with suppress(OSError):  # it has ended, or is another user's
+            if str(descriptor.readlink()) in sockets:
+                groups.add(os.getpgid(int(descriptor.parts[2])))
+    return groups
 
 
 def _located(words: Sequence[str]) -> list[str]:
