@@ -39,7 +39,7 @@ class OwnChild:
         """Return None in the child, and in the parent the vehicle that has ended it, "" if unknown.
 
         The folder of its run is then removed. Where no vehicle has, the parent ends as the child did. A vehicle
-        whose code runs for `stall_limit_s` without a pause ends it, too.
+        whose code runs for `stall_limit_s` without a pause ends it, too: after Ctrl-C as a second one would.
         """
         sys.stdout.flush()
         sys.stderr.flush()
@@ -56,11 +56,17 @@ class OwnChild:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return None
         forwarded: set[int] = set()
+        insists = False
         patience = Patience(running_node.running, stall_limit_s)
         while not (waited := os.waitpid(child, os.WNOHANG))[0]:
             told = signal.sigtimedwait(handled, LOOK_S)
             if told is None:
-                if patience.is_over(child):
+                if not patience.is_over(child):
+                    continue
+                if forwarded and not insists:
+                    insists, patience = True, Patience(running_node.running, stall_limit_s)
+                    os.kill(child, min(forwarded))  # the second one ends it at once
+                else:
                     self.ending = "stalled"
                     os.kill(child, signal.SIGKILL)
             elif told.si_signo in FORWARDED:
@@ -78,6 +84,10 @@ class OwnChild:
             shutil.rmtree(folder, ignore_errors=True)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return vehicle
+        if self.ending == "stalled":
+            sys.stderr.write(f"vnet: {vehicle} does not end, and is killed: the run has no verdict\n")
+            sys.stderr.flush()
+            return interrupts.exit_now(interrupts.INTERRUPTED)
         if ended < 0:
             if -ended != signal.SIGKILL:
                 signal.signal(-ended, signal.SIG_DFL)

@@ -112,6 +112,30 @@ def test_a_program_that_does_not_yield_ends_at_the_second(tmp_path: Path) -> Non
     assert "verdict: unknown" in shown
 
 
+ONCE = "import os, signal\n\nasync def main(node):\n    os.kill(os.getppid(), signal.SIGINT)\n    "
+"""A program that presses Ctrl-C once, and goes on."""
+HARDENED = """while True:
+        try:
+            while not os.getpid() == 0:
+                os.getpid()
+        except BaseException:
+            pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("spins", "shown", "said"), [("while True: pass", "verdict: unknown", ""), (HARDENED, "", "is killed")]
+)
+def test_a_program_that_does_not_yield_in_time_ends_as_at_the_second(
+    tmp_path: Path, spins: str, shown: str, said: str
+) -> None:
+    (tmp_path / "busy.py").write_text(f"{ONCE}{spins}\n")
+    options = ("--program", "busy:main", "--quiet", "--set", "run.stall_timeout_s=1")
+    status, output, errors = vnet(tmp_path, "simulate", BEACON, *options)
+    assert (status, shown in output, said in errors) == (130, True, True), errors
+    assert bool(output) == bool(shown)
+
+
 def test_a_process_in_the_background_goes_on_ignoring_it(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
