@@ -93,7 +93,11 @@ def test_a_module_of_the_program_is_found_before_pythons(tmp_path: Path, name: s
     assert start(tmp_path, code=f"import zenoh, {name}; print({name}.OWN)").stdout == "True\n"
 
 
-STAYS = "import sys, threading, zenoh; threading.Thread(target=threading.Event().wait).start()"
+STAYS = """import sys
+try: sys.exit(1)
+except SystemExit as error: assert error.code == 1
+import threading, zenoh
+threading.Thread(target=threading.Event().wait).start()"""
 """A program that Python alone would not end."""
 
 

@@ -74,6 +74,12 @@ def _leave(status: Any) -> None:
     os._exit(status & 0xFF if isinstance(status, int) else 1)
 
 
+def note_exits() -> None:
+    """Take note of the exception by which the main thread leaves. Before any program has looked at such a one."""
+    gc.get_referents(vars(SystemExit))[0]["code"] = _Code()
+    sys.exit = _exit
+
+
 def watch(path: str) -> None:
     """Have a failure of this process's main thread written to a file, and end the process."""
     process, threading = os.getpid(), import_module("threading")
@@ -89,6 +95,4 @@ def watch(path: str) -> None:
                 _leave(status)
         wait_for_threads()
 
-    gc.get_referents(vars(SystemExit))[0]["code"] = _Code()
-    sys.exit = _exit
     vars(threading)["_shutdown"] = end

@@ -35,7 +35,7 @@ class ZenohFinder:
                 check_version(module)
                 open_with_override(module)
                 if reports:
-                    watch(reports.pop())
+                    failure.watch(reports.pop())
 
             spec.loader.exec_module = load  # type: ignore[method-assign]
         return spec
@@ -63,9 +63,11 @@ def open_with_override(zenoh: Any) -> None:
 
 
 sys.meta_path.insert(0, ZenohFinder())
-watch = import_module("_vnet_failure").watch
+failure = import_module("_vnet_failure")
 reports = list(filter(None, [os.environ.pop("VNET_FAILURE", None)]))
 """The file for a failure of this process, and of none that it starts."""
+if reports:
+    failure.note_exits()
 # The one that this one hides runs as well.
 sys.path.remove(__file__.rpartition("/")[0])
 own = sys.modules.pop("sitecustomize")
