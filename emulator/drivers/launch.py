@@ -32,8 +32,8 @@ from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.usage import cpu_time_ns
 from emulator.records.node_logs import cut_log
 from vnet.errors import VnetError
-from vnet.runtime import die_with_parent, forking
-from vnet.runtime.die_with_parent import STARTED_BY_VNET
+from vnet.runtime import forking
+from vnet.runtime.die_with_parent import STARTED_BY_VNET, TIED
 from vnet.runtime.environment import KEPT_MEMORY, SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport.access import Access, node_user
@@ -69,8 +69,6 @@ STARVED_LOOK_S = 0.02
 CREDENTIALS = "{credentials}"
 PLACEHOLDERS = ("{endpoint}", "{run}", "{node}", CREDENTIALS)
 """Words in an agent's command that stand for what differs from one to the next."""
-TIED = (sys.executable, "-I", "-S", die_with_parent.__file__)
-"""Words before a command that is to end when this process does: of the environment they heed nothing."""
 MOST_ZYGOTES = 3
 """Attempts to fork an agent: a zygote that has ended is started again."""
 

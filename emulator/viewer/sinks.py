@@ -26,6 +26,7 @@ from urllib.parse import quote
 from emulator.records.run_folder import RECORDING, check_is_finished
 from vnet.errors import VnetError
 from vnet.extras import require
+from vnet.runtime.die_with_parent import TIED
 
 if TYPE_CHECKING:  # Rerun is slow to import, and only those who open a recording need it
     import rerun
@@ -314,10 +315,6 @@ def _looked_at(place: ServeAt, spawn: bool) -> Iterator[None]:
     )
     with _running(pages):
         yield
-
-
-TIED = [sys.executable, "-P", "-m", "vnet.runtime.die_with_parent"]
-"""Before a command: it ends with the process that starts it, however that ends."""
 
 
 def viewer_command(*arguments: str, bind: str = LOOPBACK) -> list[str]:

@@ -1,7 +1,7 @@
 """A signal for a process when the one that started it ends: a parent that is killed leaves nothing behind.
 
-`python -m vnet.runtime.die_with_parent COMMAND …` becomes COMMAND, and ends when its parent does (on Linux;
-elsewhere COMMAND just runs).
+Before a command, as `TIED` stands there, it becomes that command, and ends when its parent does (on Linux;
+elsewhere the command just runs).
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ import time
 PR_SET_PDEATHSIG = 1
 STARTED_BY_VNET = "VNET_ENDS_WITH_PARENT"
 """Variable in the environment of agents, and of hosts, that an emulator or a host has started."""
+TIED = (sys.executable, "-I", "-S", __file__)
+"""Words before a command that is to end when this process does. The environment is for the command alone."""
 POLL_S = 0.5
 """Seconds between two looks for the parent, on systems that do not tell."""
 

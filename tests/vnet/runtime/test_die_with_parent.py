@@ -12,8 +12,9 @@ pytestmark = pytest.mark.slow
 CHILD = "import os, sys, time; print(os.getpid(), flush=True); time.sleep(600)"
 PARENT = f"""
 import signal, subprocess, sys
+from vnet.runtime.die_with_parent import TIED
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
-subprocess.Popen([sys.executable, "-P", "-m", "vnet.runtime.die_with_parent", sys.executable, "-c", {CHILD!r}])
+subprocess.Popen([*TIED, sys.executable, "-c", {CHILD!r}])
 sys.stdin.read()
 """
 
