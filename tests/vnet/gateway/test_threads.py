@@ -555,3 +555,107 @@ def test_results_of_pools_and_compressed_bytes_replay(drive: Drive) -> None:
     first, again = drive(program), drive(program)
     assert log(first) == log(again)
     assert "0.5 Wed, 01 Jan 2025 00:00:00" in log(first)[4]
+
+
+def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "plugin.py").write_text("import datetime\ndef year():\n    return datetime.datetime.now().year\n")
+    (tmp_path / "script.py").write_text("import time\nyear = time.gmtime().tm_year\n")
+    run = drive(
+        """
+        import importlib.machinery, importlib.metadata, importlib.util, pkgutil, runpy, sys, time, types
+        from pathlib import Path
+        from unittest import mock
+        here = Path(__file__).parent
+        spec = importlib.util.spec_from_file_location("loaded", here / "plugin.py")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules["loaded"] = module
+        spec.loader.exec_module(module)
+        print(module.year(), importlib.util.find_spec("plugin").name, importlib.util.find_spec("none") is None)
+        print(pkgutil.resolve_name("plugin:year")(), runpy.run_path(here / "script.py")["year"])
+        loader = importlib.machinery.SourceFileLoader("again", str(here / "plugin.py"))
+        loader.exec_module(again := types.ModuleType("again"))
+        print(again.year())
+        point = importlib.metadata.EntryPoint("a", "plugin:year", "plugs")
+        print(point.load()(), point.load() is __import__("plugin").year, runpy.run_module("script")["year"])
+        with mock.patch("plugin.year", lambda: "patched"), mock.patch("time.time", lambda: "patched"):
+            print(__import__("plugin").year(), time.time())
+        """,
+        vehicles=2,
+    )
+    for node in ("v01", "v02"):
+        assert log(run, node)[:5] == ["2025 plugin True", "2025 2025", "2025", "2025 True 2025", "patched patched"]
+
+
+def test_what_is_left_is_finalized_at_the_end_of_a_program(drive: Drive) -> None:
+    run = drive(
+        """
+        import weakref
+        class Thing: pass
+        thing = Thing()
+        weakref.finalize(thing, print, "finalized")
+        try:
+            input("sure? ")
+        except EOFError:
+            print("nobody")
+        """,
+        vehicles=2,
+    )
+    for node in ("v01", "v02"):
+        assert log(run, node)[:2] == ["sure? nobody", "finalized"]
+
+
+def test_a_server_that_nobody_asks_lets_time_go_on(drive: Drive) -> None:
+    run = drive(
+        """
+        import http.server, threading, time, wsgiref.simple_server, xmlrpc.server
+        for kind in http.server.ThreadingHTTPServer, wsgiref.simple_server.WSGIServer:
+            server = kind(("127.0.0.1", 0), None)
+            thread = threading.Thread(target=server.serve_forever, daemon=True)
+            thread.start()
+            time.sleep(1.2)
+            server.shutdown()
+            thread.join()
+            print(round(time.monotonic(), 1))
+            server.server_close()
+        """,
+        duration_s=4.0,
+    )
+    assert log(run)[:2] == ["1.5", "3.0"]
+
+
+def test_other_event_loops_are_refused_or_stood_for(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "uvloop.py").write_text("raise ImportError('the loop in C')")
+    run = drive(
+        """
+        import asyncio, time
+        try:
+            import trio
+        except ImportError as error:
+            print(error)
+        import uvloop
+        uvloop.install()
+        uvloop.run(asyncio.sleep(0.5))
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            runner.run(asyncio.sleep(0.5))
+        print(time.monotonic())
+        """
+    )
+    assert log(run)[:2] == ["trio is not available on virtual time, whose event loops are those of asyncio", "1.0"]
+
+
+def test_a_module_that_is_not_the_programs_own_opens_no_session_of_zenoh_itself(drive: Drive) -> None:
+    """It would talk past the radio, and in the time of the machine."""
+    run = drive(
+        """
+        import sys, zenoh
+        outside = {}
+        exec("import zenoh", {"__builtins__": __import__("types").__builtins__}, outside)
+        try:
+            outside["zenoh"].open(zenoh.Config())
+        except zenoh.ZError as error:
+            print(error)
+        vars(__import__("os").environ)
+        print(sys.stdin.read(), sys.stdin.fileno() > 2)
+        """
+    )
+    assert log(run)[:2] == ["this module is not the program's own: its Zenoh is outside of the emulation", " True"]

@@ -22,9 +22,9 @@ import zenoh.shm
 from vnet.errors import ProgramError
 from vnet.gateway import filled_in
 from vnet.gateway.emulated import advanced, queries, sessions, values
-from vnet.gateway.emulated.modules import ENDPOINT, ProgramModules
+from vnet.gateway.emulated.modules import ENDPOINT, ProgramModules, is_program
 from vnet.gateway.emulated.process import children_outside
-from vnet.gateway.emulated.shown import Facade
+from vnet.gateway.emulated.shown import facade
 from vnet.gateway.emulated.strands import go_no_further_if_ended
 from vnet.gateway.emulated.values import Intake, Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
@@ -54,6 +54,19 @@ def _own_names(real: ModuleType) -> dict[str, Any]:
     }
 
 
+_open = zenoh.open
+
+
+def _open_outside(*args: Any, **options: Any) -> Any:
+    """Open a session of Zenoh itself, but for modules that a program has loaded past its own."""
+    if is_program():
+        raise zenoh.ZError("this module is not the program's own: its Zenoh is outside of the emulation")
+    return _open(*args, **options)
+
+
+zenoh.open = _open_outside
+
+
 def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, ModuleType]:
     """Return the package `zenoh` of a program, by the names of its modules."""
 
@@ -71,10 +84,10 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
         return sessions.Scout(vehicle, new_outlet(), handler, what)
 
     # Values that Python can construct are Zenoh's own.
-    handlers, ext = (Facade(real, **_own_names(real)) for real in (zenoh.handlers, zenoh.ext))
+    handlers, ext = (facade(real, **_own_names(real)) for real in (zenoh.handlers, zenoh.ext))
     own = _own_names(zenoh) | {name: refused(name, reason) for name, reason in REFUSED.items()}
     own["Config"] = type("Config", (values.Config,), {"environ": program.environ})
-    package = Facade(
+    package = facade(
         zenoh,
         **own,
         __path__=[],
@@ -144,4 +157,4 @@ async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
     finally:
         if not modules.has_session and not isinstance(sys.exception(), Exception):
             vehicle.node.log(f"{' '.join(words)} has opened no Zenoh session", "warning")
-        modules.modules.close()
+        modules.close()

@@ -10,8 +10,9 @@ from __future__ import annotations
 import builtins
 import datetime
 import importlib
+import importlib.machinery
+import importlib.metadata
 import importlib.util
-import io
 import os
 import random
 import select
@@ -24,7 +25,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from functools import cache, partial
-from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, NoReturn
@@ -35,7 +36,7 @@ from vnet.errors import ProgramError, shown
 from vnet.gateway import client_config, python_words, session_variables
 from vnet.gateway.emulated.loops import prepare_asyncio
 from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
-from vnet.gateway.emulated.shown import Facade, hide, import_shared, show
+from vnet.gateway.emulated.shown import facade, hide, import_shared, show
 from vnet.gateway.emulated.strands import Threads, look, set_generator_hooks, sleep
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Numbered
@@ -47,6 +48,8 @@ CLIENT_CONFIG = Path(__file__).with_name("client.json5")
 """File of a client's configuration for that endpoint, as a gateway gives one."""
 EPOCH_NS = 1_735_689_600 * NS_PER_S
 """The wall clock of programs at the start of a run: 2025-01-01T00:00:00Z."""
+SERVER_LOOK_S = 0.5
+"""Time between two looks of a server for requests, as `serve_forever` has it."""
 CORES = 4
 """Cores that a program sees: the size of a pool of threads may not depend on the machine."""
 _OWN_COPIES = (
@@ -58,34 +61,55 @@ _OWN_COPIES = (
     "email.utils",
     "fileinput",
     "gzip",
+    "http.server",
     "logging",
     "multiprocessing.dummy",
     "multiprocessing.pool",
     "multiprocessing.util",
     "optparse",
+    "pkgutil",
     "queue",
+    "runpy",
     "sched",
+    "socketserver",
     "tarfile",
     "tempfile",
     "threading",
     "timeit",
+    "unittest.mock",
     "uuid",
+    "weakref",
+    "wsgiref.simple_server",
+    "xmlrpc.server",
     "zipfile",
 )
-"""Modules and packages of the standard library of which each program has its own: they block, keep such
-objects, ask for the time, or read the words of the command."""
-_OWN_PARTS = {
-    parent: [name for name in _OWN_COPIES if name.startswith(f"{parent}.")]
-    for parent in ("email", "multiprocessing")
+"""Modules and packages of the standard library of which each program has its own: they block, keep such objects,
+ask for the time, load modules, wait for the end of the program, or read the words of the command."""
+_SHARED_PARENTS = {name.rpartition(".")[0] for name in _OWN_COPIES if "." in name}
+"""Packages that are shared but for modules of which each program has its own."""
+_ABSENT = {
+    **{name: f"No module named {name!r}" for name in ("_asyncio", "_queue")},
+    "trio": "trio is not available on virtual time, whose event loops are those of asyncio",
 }
-"""Packages that are shared but for these modules."""
-_ABSENT = ("_asyncio", "_queue")
-"""Accelerators whose Python version is taken, as they block in C."""
+"""Modules that are not there, and what is said of them. Of accelerators, which block in C, Python is taken."""
 _SHARED = ("vnet", "agents", "emulator", "greenlet")
 
 
 _shared_code: Callable[[SourceFileLoader, str], Any] = cache(SourceFileLoader.get_code)
 _present: ContextVar[ProgramModules | None] = ContextVar("vnet_zenoh_program", default=None)
+
+
+def is_program() -> bool:
+    """Return whether the present code runs for a program, whose modules are its own or not."""
+    return _present.get() is not None
+
+
+def _import_for_present(name: str, package: str | None = None) -> ModuleType:
+    program = _present.get()
+    return importlib.import_module(name, package) if program is None else program.load(name)
+
+
+vars(importlib.metadata)["import_module"] = _import_for_present  # by which an entry point is loaded
 
 
 class OwnModules(dict[str, ModuleType]):
@@ -117,6 +141,10 @@ class OwnModules(dict[str, ModuleType]):
         self._shown.clear()
 
 
+class Variables(dict[str, str]):
+    """The environment of a program: a dict that, as Python's own, has attributes."""
+
+
 class ProgramModules:
     """The modules of one program of a vehicle, as `sys.modules` has them."""
 
@@ -131,36 +159,45 @@ class ProgramModules:
         self.path: list[str] = []
         self.argv: list[str] = []
         own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)
-        self.environ = {**os.environ, **own}
+        self.environ = Variables(os.environ | own)
         if "ros2" in node.options:
             self.environ["ROS_DOMAIN_ID"] = str(node.options["ros2"]["domain"])
         has_children = "child processes are outside of the emulation: Zenoh in Python opens no session there"
         tell = cache(partial(node.log, has_children))
-        self.modules = OwnModules()
+        self.modules, self._no_keys = OwnModules(), Path(os.devnull).open()
         self._facades: dict[str, Callable[[], ModuleType]] = {
             "_thread": self.threads.module,
             "atexit": self._atexit,
             "datetime": self._datetime,
             "importlib": self._importlib,
+            "importlib.machinery": self._importlib_machinery,
+            "importlib.util": self._importlib_util,
             "os": self._os,
-            "select": lambda: Facade(select, select=_select),
-            "signal": lambda: Facade(signal, **self.process.signal_functions()),
-            "subprocess": lambda: Facade(subprocess, **subprocess_functions(self.environ, tell)),
+            "select": lambda: facade(select, select=_select),
+            "signal": lambda: facade(signal, **self.process.signal_functions()),
+            "subprocess": lambda: facade(subprocess, **subprocess_functions(self.environ, tell)),
             "sys": self._sys,
             "time": self._time,
-            **{name: partial(_facade_of, name) for name in _OWN_PARTS},
+            "uvloop": self._uvloop,
+            **{name: partial(self._package, name) for name in _SHARED_PARENTS},
         }
         self._preparations: dict[str, Callable[[Any], None]] = {
             "asyncio": lambda module: prepare_asyncio(module, node, self.threads, self.process.set_handler),
             "concurrent.futures": self._prepare_futures,
             "multiprocessing.pool": self._prepare_pools,
             "multiprocessing.util": _prepare_finalizers,
+            "socketserver": _prepare_servers,
             "queue": self._prepare_queue,
             "threading": self._prepare_threading,
             "uuid": _prepare_uuid,
         }
         own_import = _import_on(self.load("sys"), self.load)
-        self._builtins = {**vars(builtins), "__import__": own_import, "input": _no_input}
+        self._builtins = {**vars(builtins), "__import__": own_import, "input": self._no_input}
+
+    def close(self) -> None:
+        """Have none of its modules found any more."""
+        self.modules.close()
+        self._no_keys.close()
 
     # Running.
 
@@ -226,6 +263,10 @@ class ProgramModules:
             raise ProgramError(f"program.command: no module {shown(name)} in Python to run")
         return spec
 
+    def _no_input(self, prompt: object = "") -> NoReturn:
+        self._builtins["print"](prompt, end="", flush=True)
+        raise EOFError("input(): a vehicle has no keyboard")
+
     # Importing.
 
     def load(self, name: str) -> ModuleType:
@@ -244,14 +285,14 @@ class ProgramModules:
     def _load_new(self, name: str) -> ModuleType:
         top = name.partition(".")[0]
         if name in _ABSENT:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+            raise ModuleNotFoundError(_ABSENT[name], name=name)
         if name in self._facades:
             module = self.modules[name] = self._facades[name]()
-            for part in _OWN_PARTS.get(name, ()):
-                self.load(part)
             return module
         if _is_own_copy(name):
             spec = importlib.util.find_spec(name)
+            if spec is None or not _is_python(spec):  # frozen
+                spec = PathFinder.find_spec(name)
         elif top in sys.stdlib_module_names or top in _SHARED:
             spec = None
         else:
@@ -302,15 +343,55 @@ class ProgramModules:
             return self._execute(spec, module)
 
         own_import = self._builtins["__import__"]
-        return Facade(importlib, import_module=import_module, reload=reload, __import__=own_import)
+        parts = {name: partial(self.load, f"importlib.{name}") for name in ("machinery", "util")}
+        return facade(importlib, parts, import_module=import_module, reload=reload, __import__=own_import)
+
+    def _importlib_machinery(self) -> ModuleType:
+        own = self._builtins
+
+        class Loader(SourceFileLoader):
+            def exec_module(self, module: ModuleType) -> None:
+                vars(module)["__builtins__"] = own
+                super().exec_module(module)
+
+        Loader.__name__ = Loader.__qualname__ = "SourceFileLoader"
+        return facade(importlib.machinery, SourceFileLoader=Loader)
+
+    def _importlib_util(self) -> ModuleType:
+        def find_spec(name: str, package: str | None = None) -> ModuleSpec | None:
+            name = importlib.util.resolve_name(name, package)
+            top = name.partition(".")[0]
+            is_shared = top in sys.stdlib_module_names or top in _SHARED
+            return importlib.util.find_spec(name) if is_shared else self._find(name)
+
+        def module_from_spec(spec: ModuleSpec) -> ModuleType:
+            module = importlib.util.module_from_spec(spec)
+            vars(module)["__builtins__"] = self._builtins  # with which its loader executes it
+            return module
+
+        return facade(importlib.util, find_spec=find_spec, module_from_spec=module_from_spec)
+
+    def _package(self, name: str) -> ModuleType:
+        """Return a package that is shared but for some modules."""
+        own = [each for each in _OWN_COPIES if each.startswith(f"{name}.")]
+        return facade(import_shared(name), {each.rpartition(".")[2]: partial(self.load, each) for each in own})
+
+    def _uvloop(self) -> ModuleType:
+        """Return what stands for a faster loop that is in C."""
+        if self._find("uvloop") is None:
+            raise ModuleNotFoundError("No module named 'uvloop'", name="uvloop")
+        module, loops = ModuleType("uvloop"), self.load("asyncio")
+        vars(module).update(install=lambda: None, EventLoopPolicy=vars(loops)["DefaultEventLoopPolicy"])
+        vars(module).update({name: vars(loops)[name] for name in ("run", "new_event_loop")})
+        return module
 
     def _sys(self) -> ModuleType:
         own: dict[str, Any] = {"argv": self.argv, "path": self.path, "modules": self.modules}
-        own |= {"stdin": io.StringIO(), "set_asyncgen_hooks": set_generator_hooks}
-        return Facade(sys, **own, __stdout__=sys.stdout, __stderr__=sys.stderr)
+        own |= {"stdin": self._no_keys, "set_asyncgen_hooks": set_generator_hooks}
+        return facade(sys, **own, __stdout__=sys.stdout, __stderr__=sys.stderr)
 
     def _os(self) -> ModuleType:
-        return Facade(
+        return facade(
             os,
             environ=self.environ,
             getenv=self.environ.get,
@@ -352,7 +433,7 @@ class ProgramModules:
             "tzname": ("UTC", "UTC"),
         }
         # As those of `time`, they make no methods of classes that have them.
-        return Facade(time, **{name: staticmethod(each) if callable(each) else each for name, each in own.items()})
+        return facade(time, **{name: staticmethod(each) if callable(each) else each for name, each in own.items()})
 
     def _datetime(self) -> ModuleType:
         node = self.node
@@ -377,7 +458,7 @@ class ProgramModules:
 
         Moment.__name__ = Moment.__qualname__ = "datetime"
         Day.__name__ = Day.__qualname__ = "date"
-        return Facade(datetime, datetime=Moment, date=Day)
+        return facade(datetime, datetime=Moment, date=Day)
 
     def _atexit(self) -> ModuleType:
         module = ModuleType("atexit")
@@ -457,7 +538,7 @@ class ProgramModules:
             ) -> None:
                 base.__init__(self, processes, initializer, initargs)
 
-        module.Pool = vars(package)["Pool"] = Pool
+        vars(package)["Pool"] = module.Pool = Pool
 
 
 def _import_on(sys: ModuleType, load: Callable[[str], ModuleType]) -> Callable[..., ModuleType]:
@@ -481,8 +562,34 @@ def _is_own_copy(name: str) -> bool:
     return name in _OWN_COPIES or (bool(parent) and _is_own_copy(parent))
 
 
-def _facade_of(name: str) -> ModuleType:
-    return Facade(import_shared(name))
+class _Selector:
+    """Waits for requests of a server: it looks for some, and lets emulated time go on without any."""
+
+    def __init__(self) -> None:
+        self._servers: list[Any] = []
+
+    def __enter__(self) -> _Selector:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def register(self, server: Any, events: int) -> None:
+        """Wait for this one, too."""
+        self._servers.append(server)
+
+    def select(self, timeout: float | None = None) -> list[Any]:
+        """Return the servers that are asked, after `timeout` seconds without any."""
+        while not (ready := select.select(self._servers, [], [], 0)[0]):
+            sleep(SERVER_LOOK_S if timeout is None else timeout)
+            if timeout is not None:
+                break
+        return ready
+
+
+def _prepare_servers(module: Any) -> None:
+    """Have servers let emulated time go on, as nobody asks them on it; a request from elsewhere is answered."""
+    module._ServerSelector = _Selector
 
 
 def _prepare_finalizers(module: Any) -> None:
@@ -503,10 +610,6 @@ def _select(readers: Any, writers: Any, others: Any, timeout_s: float | None = N
         return select.select(readers, writers, others, timeout_s)
     sleep(timeout_s)
     return [], [], []
-
-
-def _no_input(prompt: object = "") -> NoReturn:
-    raise EOFError("input(): a vehicle has no keyboard")
 
 
 def _looking(ask: Callable[..., Any]) -> Callable[..., Any]:

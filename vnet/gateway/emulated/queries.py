@@ -173,11 +173,11 @@ class Asking:
         self.is_over = True
         if self._timer is not None:
             self._timer.cancel()
+        if error is not None:  # first, as from Zenoh's routers: only replies are held back
+            self.sink.push(error)
         if self._holds_back:
             for reply in self._replies.values():
                 self.sink.push(reply)
-        if error is not None:
-            self.sink.push(error)
         self.sink.close()
 
     def _expire(self) -> None:

@@ -8,25 +8,26 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 
-class Facade(ModuleType):
-    """Stands for a module of which some names are others."""
+def facade(real: ModuleType, parts: Mapping[str, Callable[[], Any]] = {}, /, **own: Any) -> ModuleType:
+    """Return a module in which some names are others; `parts` load modules below it that are a program's own."""
+    module = ModuleType(real.__name__, real.__doc__)
+    names = {
+        name: value
+        for name, value in vars(real).items()
+        if (not name.startswith("__") or name == "__all__") and name not in parts
+    }
 
-    def __init__(self, real: ModuleType, **own: Any) -> None:
-        super().__init__(real.__name__, real.__doc__)
-        names = {
-            name: value for name, value in vars(real).items() if not name.startswith("__") or name == "__all__"
-        }
-        vars(self).update(names, **own)
-        self.__real = real
+    def find(name: str) -> Any:
+        return parts[name]() if name in parts else getattr(real, name)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.__real, name)
+    vars(module).update(names, __getattr__=find, **own)
+    return module
 
 
 class _Proxy(ModuleType):

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
-from vnet.gateway.emulated.shown import Facade
+from vnet.gateway.emulated.shown import facade
 from vnet.runtime.asyncio_internals import note_greenlet
 from vnet.runtime.outside_loop import tell_failed_thread
 from vnet.runtime.own_asyncio import Task, present_node
@@ -492,7 +492,7 @@ class Threads:
 
     def module(self) -> ModuleType:
         """Return the module `_thread`, with what `threading` needs of it in Python 3.11 to 3.13."""
-        return Facade(
+        return facade(
             _thread,
             RLock=None,  # `threading` has one in Python
             **dict.fromkeys(["allocate_lock", "allocate", "lock", "LockType"], Lock),
