@@ -371,12 +371,16 @@ class _Branched:
     def write(self, text: str) -> int:
         """Write to the stream, and to the log of the node on whose behalf the present code runs."""
         written: int = self.stream.write(text)
+        self.keep(text)
+        return written
+
+    def keep(self, text: str) -> None:
+        """Write to the log alone."""
         node = present_node()
         if node is not None:
             for is_its_own, logs in tuple(_simulations):
                 if is_its_own(node):
                     logs.add(node.id, text)
-        return written
 
     def writelines(self, lines: Iterable[str]) -> None:
         """Write each of these texts."""
@@ -398,9 +402,11 @@ class _BranchedBytes(io.BufferedIOBase):
         return True
 
     def write(self, data: Any) -> int:
-        """Write bytes as text."""
+        """Write bytes; the log has them as text."""
         content = bytes(data)
-        self._text.write(content.decode(errors="replace"))
+        self.flush()  # what was written as text before
+        self._text.stream.buffer.write(content)
+        self._text.keep(content.decode(errors="replace"))
         return len(content)
 
     def flush(self) -> None:

@@ -199,7 +199,6 @@ async def says_what_utf_8_does_not_have(node: Node) -> None:
     node.log("\udcff")
     node.event("\udcff", **{"\udcff": "\udcff"})
     node.report(note="\udcff")
-    logger.error("\udcff")
     task = asyncio.create_task(fails("\udcff"))
     await asyncio.wait([task])
     await fails("\udcff")
@@ -216,5 +215,5 @@ def test_lone_surrogates_are_escaped(run: Callable[[Scenario], Emulation]) -> No
     emulation = run(scenario_of([], f"{__name__}:says_what_utf_8_does_not_have", vehicles=1))
     told = [event.details for event in emulation.folder.events if event.node == "v01"]
     texts = [str(value) for details in told for value in (*details, *details.values())]
-    assert sum("\\udcff" in text for text in texts) >= 8
+    assert sum("\\udcff" in text for text in texts) >= 6
     assert "\udcff" not in "".join(texts) + log_of(emulation)

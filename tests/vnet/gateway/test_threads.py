@@ -562,7 +562,7 @@ def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Dri
     (tmp_path / "script.py").write_text("import time\nyear = time.gmtime().tm_year\n")
     run = drive(
         """
-        import importlib.machinery, importlib.metadata, importlib.util, pkgutil, runpy, sys, time, types
+        import importlib.machinery, importlib.metadata, importlib.util, pkgutil, pydoc, runpy, sys, time, types
         from pathlib import Path
         from unittest import mock
         here = Path(__file__).parent
@@ -571,19 +571,30 @@ def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Dri
         sys.modules["loaded"] = module
         spec.loader.exec_module(module)
         print(module.year(), importlib.util.find_spec("plugin").name, importlib.util.find_spec("none") is None)
-        print(pkgutil.resolve_name("plugin:year")(), runpy.run_path(here / "script.py")["year"])
+        print(pkgutil.resolve_name("plugin:year")(), pydoc.locate("plugin.year")(), runpy.run_path(here / "script.py")["year"])
         loader = importlib.machinery.SourceFileLoader("again", str(here / "plugin.py"))
         loader.exec_module(again := types.ModuleType("again"))
         print(again.year())
         point = importlib.metadata.EntryPoint("a", "plugin:year", "plugs")
         print(point.load()(), point.load() is __import__("plugin").year, runpy.run_module("script")["year"])
+        try:
+            import plugin.none
+        except ModuleNotFoundError as error:
+            print(error)
         with mock.patch("plugin.year", lambda: "patched"), mock.patch("time.time", lambda: "patched"):
             print(__import__("plugin").year(), time.time())
         """,
         vehicles=2,
     )
     for node in ("v01", "v02"):
-        assert log(run, node)[:5] == ["2025 plugin True", "2025 2025", "2025", "2025 True 2025", "patched patched"]
+        assert log(run, node)[:6] == [
+            "2025 plugin True",
+            "2025 2025 2025",
+            "2025",
+            "2025 True 2025",
+            "No module named 'plugin.none'; 'plugin' is not a package",
+            "patched patched",
+        ]
 
 
 def test_what_is_left_is_finalized_at_the_end_of_a_program(drive: Drive) -> None:

@@ -68,6 +68,7 @@ _OWN_COPIES = (
     "multiprocessing.util",
     "optparse",
     "pkgutil",
+    "pydoc",
     "queue",
     "runpy",
     "sched",
@@ -124,7 +125,9 @@ class OwnModules(dict[str, ModuleType]):
         parent, _, child = name.rpartition(".")
         if parent in self:  # at once: Python would find those that are being loaded in its own `sys.modules`
             setattr(self[parent], child, module)
-        if not _is_own_copy(name) and name not in self._shown and show(name, _present_module):
+        is_common = name.partition(".")[0] in sys.stdlib_module_names or sys.modules.get(name) is module
+        if not is_common and name not in self._shown:
+            show(name, _present_module)
             self._shown.add(name)
 
     def take_back(self, name: str) -> None:
@@ -164,7 +167,7 @@ class ProgramModules:
             self.environ["ROS_DOMAIN_ID"] = str(node.options["ros2"]["domain"])
         has_children = "child processes are outside of the emulation: Zenoh in Python opens no session there"
         tell = cache(partial(node.log, has_children))
-        self.modules, self._no_keys = OwnModules(), Path(os.devnull).open()
+        self.modules, self._no_keys = OwnModules(), Path(os.devnull).open()  # noqa: SIM115
         self._facades: dict[str, Callable[[], ModuleType]] = {
             "_thread": self.threads.module,
             "atexit": self._atexit,
@@ -305,8 +308,11 @@ class ProgramModules:
         return self._execute(spec)
 
     def _find(self, name: str) -> ModuleSpec | None:
-        parent = name.rpartition(".")[0]
-        path = list(self.load(parent).__path__) if parent else self.path
+        path: Sequence[str] = self.path
+        if parent := name.rpartition(".")[0]:
+            if (places := getattr(self.load(parent), "__path__", None)) is None:
+                raise ModuleNotFoundError(f"No module named {name!r}; {parent!r} is not a package", name=name)
+            path = list(places)
         return next(filter(None, (finder.find_spec(name, path) for finder in sys.meta_path)), None)
 
     def _is_compiled(self, top: str) -> bool:

@@ -57,17 +57,13 @@ class _Entry:
 _shown: dict[str, _Entry] = {}
 
 
-def show(name: str, present: Callable[[str], ModuleType | None]) -> bool:
-    """Have a module of a program found by its name, until `hide`; a shared module of that name goes before."""
+def show(name: str, present: Callable[[str], ModuleType | None]) -> None:
+    """Have a module of a program found by its name, where its code runs, until `hide`."""
     entry = _shown.get(name)
     if entry is None:
-        real = sys.modules.get(name)
-        if name != "__main__" and real is not None:
-            return False
-        entry = _shown[name] = _Entry(_Proxy(name), real, present)
+        entry = _shown[name] = _Entry(_Proxy(name), sys.modules.get(name), present)
         sys.modules[name] = entry.proxy
     entry.programs += 1
-    return True
 
 
 def hide(name: str) -> None:
@@ -88,11 +84,15 @@ def import_shared(name: str) -> ModuleType:
     """Import a module that all programs share; it finds shared modules alone while it is loaded."""
     if name in sys.modules and name not in _shown:
         return importlib.import_module(name)
-    for each, entry in _shown.items():
-        if sys.modules.get(each) is entry.proxy and entry.real is None:
+    hidden = [(each, entry) for each, entry in _shown.items() if sys.modules.get(each) is entry.proxy]
+    for each, entry in hidden:
+        if entry.real is None:
             del sys.modules[each]
+        else:
+            sys.modules[each] = entry.real
     try:
         return importlib.import_module(name)
     finally:
-        for each, entry in _shown.items():
-            sys.modules.setdefault(each, entry.proxy)
+        for each, entry in hidden:
+            if sys.modules.get(each) in (None, entry.real):
+                sys.modules[each] = entry.proxy
