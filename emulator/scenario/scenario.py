@@ -533,6 +533,7 @@ class Scenario(Section):
             "command": self.program.commands_of(node),
             "query_s": sessions.query_s,
             "liveliness_s": sessions.liveliness_s,
+            "queue_frames": self.radio.queue_frames,
         }
         if self.radio.ros2 is not None:
             own["ros2"] = self.radio.ros2.model_dump(mode="json", exclude={"graph"})

@@ -6,8 +6,9 @@ payload asks for. Both sides of the wall read them: gateways and emulated sessio
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from itertools import count
 from typing import Annotated, Any, Literal
@@ -191,10 +192,20 @@ class TooLargeError(Exception):
 
 
 class Fragments:
-    """Cuts the messages of one incarnation of a sender into payloads of at most `max_payload` bytes."""
+    """Cuts the messages of one incarnation of a sender into payloads of at most `max_payload` bytes.
 
-    def __init__(self, max_payload: int, incarnation: int = 0) -> None:
-        self._max_payload = max_payload
+    `warn` is told once that a message has more frames than the radio's queue, `queue_frames`, takes.
+    """
+
+    def __init__(
+        self,
+        max_payload: int,
+        incarnation: int = 0,
+        queue_frames: float = math.inf,
+        warn: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        self._max_payload, self._queue_frames = max_payload, queue_frames
+        self._warn: Callable[[str], object] | None = warn
         # Receivers may still have parts of the last incarnation, which must complete no message of this one.
         self._numbers = count(incarnation * MOST_MESSAGES)
 
@@ -210,6 +221,11 @@ class Fragments:
                 f"a message of {len(content)} bytes needs more than {MOST_FRAGMENTS} frames of "
                 f"radio.max_payload_bytes = {self._max_payload}"
             )
+        if parts > self._queue_frames and self._warn is not None:
+            self._warn(
+                f"a message of {parts} frames, which cannot arrive: radio.queue_frames = {self._queue_frames}"
+            )
+            self._warn = None
         pieces = (content[start : start + size] for start in range(0, len(content), size))
         return (_encode(Fragment(number, index, parts, piece)) for index, piece in enumerate(pieces))
 

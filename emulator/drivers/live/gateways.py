@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -87,8 +88,6 @@ class _Vehicle:
     receipts: wire.Receipts = field(default_factory=wire.Receipts)
     unicasts: int = 0
     is_due: bool = False
-    has_warned: bool = False
-    """True once it was told that a message has more frames than the radio's queue."""
 
     @property
     def nonce(self) -> bytes:
@@ -346,7 +345,8 @@ class Gateways:
             return
         match message:
             case wire.Welcome():
-                vehicle.fragments = Fragments(message.max_payload, message.incarnation)
+                most, warn = self._emulation.scenario.radio.queue_frames, partial(self._note, vehicle, "warning")
+                vehicle.fragments = Fragments(message.max_payload, message.incarnation, most, warn)
                 vehicle.acknowledges = message.acknowledges
                 self._start_commands(node, vehicle)
                 self._look_at_sessions(vehicle)
@@ -477,18 +477,12 @@ class Gateways:
             return
         if isinstance(message, CrossingReply) and vehicle.acknowledges:
             to = message.to
-        frames, most = vehicle.outbox.frames, self._emulation.scenario.radio.queue_frames
-        before = len(frames)
         try:
             for payload in vehicle.fragments.of(message):
-                frames.append(SentFrame(node, payload, to=to, number=vehicle.unicasts))
+                vehicle.outbox.frames.append(SentFrame(node, payload, to=to, number=vehicle.unicasts))
                 vehicle.unicasts += to is not None
         except TooLargeError as error:
             self._note(vehicle, "error", str(error))
-        if (number := len(frames) - before) > most and not vehicle.has_warned:
-            vehicle.has_warned = True
-            text = f"a message of {number} frames, which cannot arrive: radio.queue_frames = {most}"
-            self._note(vehicle, "warning", text)
 
     def _enqueue_early(self, vehicle: _Vehicle) -> None:
         early, vehicle.early = vehicle.early, {}

@@ -112,3 +112,11 @@ def test_unfinished_messages_do_not_fill_the_memory() -> None:
 def test_what_needs_too_many_frames_is_refused_by_its_size() -> None:
     with pytest.raises(TooLargeError, match=r"321 bytes .*radio.max_payload_bytes = 20"):
         Fragments(20).of(CrossingQuery(0, "key", bytes(300), None, None))
+
+
+def test_a_message_of_more_frames_than_the_queue_takes_is_told_once() -> None:
+    told: list[str] = []
+    fragments = Fragments(100, queue_frames=4, warn=told.append)
+    for size in (200, 400, 400):
+        list(fragments.of(CrossingQuery(0, "key", bytes(size), None, None)))
+    assert told == ["a message of 6 frames, which cannot arrive: radio.queue_frames = 4"]

@@ -430,3 +430,13 @@ def test_frames_that_a_fault_has_changed_are_dropped(drive: Drive) -> None:
     run = drive(ALL_KINDS, vehicles=2, fault=[fault])
     assert (events(run, "exception"), events(run, "crashed")) == ([], [])
     assert any("is no sample" in event["text"] for event in events(run, "log"))
+
+
+def test_a_sample_that_cannot_arrive_is_told(drive: Drive) -> None:
+    program = """
+        import time, zenoh
+        with zenoh.open(zenoh.Config()) as session:
+            session.put("image", bytes(90_000))
+            time.sleep(1)
+        """
+    assert "which cannot arrive: radio.queue_frames = 64" in log(drive(program))[0]

@@ -571,7 +571,8 @@ def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Dri
         sys.modules["loaded"] = module
         spec.loader.exec_module(module)
         print(module.year(), importlib.util.find_spec("plugin").name, importlib.util.find_spec("none") is None)
-        print(pkgutil.resolve_name("plugin:year")(), pydoc.locate("plugin.year")(), runpy.run_path(here / "script.py")["year"])
+        script = runpy.run_path(here / "script.py")
+        print(pkgutil.resolve_name("plugin:year")(), pydoc.locate("plugin.year")(), script["year"])
         loader = importlib.machinery.SourceFileLoader("again", str(here / "plugin.py"))
         loader.exec_module(again := types.ModuleType("again"))
         print(again.year())

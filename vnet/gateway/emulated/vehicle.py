@@ -10,8 +10,9 @@ import asyncio
 from collections import defaultdict
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import count
+from math import inf
 from typing import Any
 
 import msgspec
@@ -65,7 +66,8 @@ class Vehicle(RadioSide[Asking]):
         self.zid = ZenohId.of(node.id, node.incarnation, "router")
         self._liveliness_s = liveliness_s
         self._loop = asyncio.get_running_loop()
-        self._fragments = Fragments(node.radio.max_payload, node.incarnation)
+        most, warn = node.options.get("queue_frames", inf), partial(node.log, level="warning")
+        self._fragments = Fragments(node.radio.max_payload, node.incarnation, most, warn)
         self.due = DueCallbacks()
         self._entities: defaultdict[str, list[Entity]] = defaultdict(list)
         """Declarations of its sessions by kind."""
