@@ -10,13 +10,12 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from emulator.api import run, simulate
+    from emulator.api import Run, run, simulate
     from emulator.cells.sweep import sweep
     from emulator.checks.own import Result
     from emulator.learning.environment import environment, radio_for
     from emulator.learning.episode import Moment
     from emulator.radio.own_rules import Answer, RadioFrame
-    from emulator.report.notebook import Run
     from emulator.world.own_sensors import SensedTruth
 
 __all__ = [
@@ -38,7 +37,7 @@ _PUBLIC = {
     "Moment": "emulator.learning.episode",
     "RadioFrame": "emulator.radio.own_rules",
     "Result": "emulator.checks.own",
-    "Run": "emulator.report.notebook",
+    "Run": "emulator.api",
     "SensedTruth": "emulator.world.own_sensors",
     "environment": "emulator.learning.environment",
     "radio_for": "emulator.learning.environment",

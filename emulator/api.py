@@ -11,6 +11,7 @@ import contextvars
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,15 @@ from emulator.cells.worker import (
 )
 from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.drivers.simulate import ProcessCount
-from emulator.report.notebook import Run
+from emulator.records.run import Run
 from emulator.scenario.loading import Source, hinting, scenario_of
 from emulator.scenario.scenario import Scenario
 from vnet.runtime.programs import Program, given_programs
+
+__all__ = ["Run", "run", "simulate"]
+
+HEIGHT_PX = 640
+"""Height of a run's report in a notebook."""
 
 
 @hinting
@@ -172,3 +178,22 @@ def _why_not_warranted(function: Program) -> str:
     if is_fit():
         return why
     return f"{why}, and this process has not PYTHONHASHSEED=0 and the arithmetic of other processors"
+
+
+def framed_report(run: Run) -> str:
+    """Return the report as a notebook shows it, in a frame that reaches nothing of the notebook.
+
+    Raises VnetError if the folder is not a run's any more.
+    """
+    from emulator.report.source import Source  # slow to import, and only notebooks need it
+    from emulator.report.write import report_page
+
+    page = escape(report_page(Source(run.folder)))
+    # Scripts run, but in an origin of their own: they see neither the notebook nor its cookies.
+    return (
+        f'<iframe title="vnet report" sandbox="allow-scripts" style="width:100%;height:{HEIGHT_PX}px;border:0" '
+        f'srcdoc="{page}"></iframe>'
+    )
+
+
+Run.html = framed_report

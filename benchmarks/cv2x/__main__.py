@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cv2x import closed_forms, dot11p, speed
+from benchmarks.cv2x import closed_forms, dot11p
 from benchmarks.cv2x.highway import (
     Curves,
     Measured,
@@ -23,6 +23,7 @@ from benchmarks.cv2x.highway import (
     drive,
     mode4_radio,
     published,
+    real_time_factor,
     together,
 )
 from emulator.scenario.scenario import Radio
@@ -126,9 +127,7 @@ def _speed(options: argparse.Namespace) -> float:
     """Print the table of real-time factors."""
     print("| vehicles on 2 km | 802.11p | mode 4 | mode 2 |", "|---|---|---|---|", sep="\n")
     for vehicles in (100, 200, 400):
-        factors = [
-            speed.real_time_factor(vehicles, mac) for mac in ({}, {"kind": "lte-mode4"}, {"kind": "nr-mode2"})
-        ]
+        factors = [real_time_factor(vehicles, mac) for mac in ({}, {"kind": "lte-mode4"}, {"kind": "nr-mode2"})]
         print(f"| {vehicles} | {' | '.join(f'{factor:.2f}' for factor in factors)} |", flush=True)
     return 0.0
 

@@ -32,8 +32,8 @@ from emulator.cells.worker import Place, Worker, WorkerDiedError, call_fitly, mo
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session, over_zenoh
-from emulator.records.atomic import atomically, disk_errors, write_atomically
 from emulator.records.code_digest import digests_of
+from emulator.records.disk import atomically, disk_errors, write_atomically
 from emulator.records.events import Level
 from emulator.records.run_folder import is_run_folder
 from emulator.scenario.loading import dump_scenario

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from emulator.cells.cells import Cell, has_result, read_result, run_cells
 from emulator.cells.worker import checked_function, entry_of, require_importable, with_folder_of
-from emulator.records.atomic import atomically, write_atomically
+from emulator.records.disk import atomically, write_atomically
 from emulator.records.run_folder import RUNS
 from emulator.report.index import SWEEP_PAGE, SWEEP_TABLE, write_index
 from emulator.report.sweep_page import PROGRAM, sweep_page

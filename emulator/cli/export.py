@@ -20,7 +20,7 @@ from emulator.cli.options import LATEST, RunArgument
 from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv, write_links
-from emulator.records.atomic import atomically, disk_errors
+from emulator.records.disk import atomically, disk_errors
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, UnicastFigures, radio_metrics, unicast_figures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.terminal.console import one_line_errors

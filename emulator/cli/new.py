@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.records.atomic import check_is_free
+from emulator.records.disk import check_is_free
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError, did_you_mean, printable
 

@@ -30,7 +30,7 @@ from typing import Protocol
 
 from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.usage import cpu_time_ns
-from emulator.records.node_logs import cut_log
+from emulator.records.disk import cut_log
 from vnet.errors import VnetError
 from vnet.runtime import forking
 from vnet.runtime.die_with_parent import STARTED_BY_VNET, TIED

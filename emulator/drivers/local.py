@@ -37,8 +37,8 @@ from emulator.drivers.launch import Exit
 from emulator.drivers.processes import Heard, Processes
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.usage import first_over
+from emulator.records.disk import NodeLogs
 from emulator.records.events import EventKind
-from emulator.records.node_logs import NodeLogs
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.node import Node

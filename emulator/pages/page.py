@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from emulator.pages.palette import PAGE, PALETTE
 from emulator.pages.text import as_text, cell
-from emulator.records.atomic import write_atomically
+from emulator.records.disk import write_atomically
 from emulator.records.verdicts import Verdict
 
 SIGNS = {Verdict.VALID: "✓", Verdict.INVALID: "✗", Verdict.UNKNOWN: "?"}

@@ -23,8 +23,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.records.atomic import atomically, check_is_free, disk_errors
 from emulator.records.code_digest import code_digests, rule_digests
+from emulator.records.disk import atomically, check_is_free, disk_errors
 from emulator.records.events import Event, EventKind
 from emulator.scenario.loading import dump_scenario, input_digests
 from emulator.scenario.scenario import Scenario

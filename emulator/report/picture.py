@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from emulator.pages.canvas import INK, PAPER, QUIET, WIDTH_PX, styled
 from emulator.pages.text import as_text
-from emulator.records.atomic import atomically
+from emulator.records.disk import atomically
 from emulator.records.events import SAID, SAMPLES, Event
 from emulator.records.run_folder import check_is_run
 from emulator.report.figures import figures_of

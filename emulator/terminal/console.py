@@ -276,7 +276,7 @@ class ResultOnly(StandardOutput):
     def keep_in(self, logs: Path) -> None:
         """Move what was printed so far into the folder, and keep there what follows."""
         _flush()
-        from emulator.records.atomic import disk_errors  # slow to import, and `--help` does without
+        from emulator.records.disk import disk_errors  # slow to import, and `--help` does without
         from emulator.records.run_folder import PROGRAMS_LOG
 
         path = logs / PROGRAMS_LOG

@@ -38,7 +38,7 @@ from rich.text import Text
 
 from emulator.checks.own import is_broken
 from emulator.pages.page import put_page, render, table
-from emulator.records.atomic import check_is_free, write_atomically
+from emulator.records.disk import check_is_free, write_atomically
 from emulator.records.distributions import lowest_share
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun

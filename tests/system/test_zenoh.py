@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import zenoh
 
-from emulator.records.node_logs import LARGEST_LOG_BYTES, log_is_full
+from emulator.records.disk import LARGEST_LOG_BYTES, log_is_full
 from tests.support.paths import ROOT
 from tests.system.conftest import Finished, Vnet
 from vnet.transport.authority import issue_certificates

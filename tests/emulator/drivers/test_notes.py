@@ -10,7 +10,7 @@ import pytest
 
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import MOST_NOTES, Emulation
-from emulator.records.node_logs import NodeLogs, cut_log
+from emulator.records.disk import NodeLogs, cut_log
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import STATES
 from emulator.report.source import Source
@@ -114,7 +114,7 @@ def test_a_flood_is_cut_and_counted() -> None:
 
 
 def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.records.node_logs.LARGEST_LOG_BYTES", 20)
+    monkeypatch.setattr("emulator.records.disk.LARGEST_LOG_BYTES", 20)
     logs = NodeLogs(tmp_path)
     for number in range(5):
         logs.write("v01", f"line {number:03}")
@@ -124,7 +124,7 @@ def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.Monk
 
 
 def test_a_log_of_a_process_is_cut_while_it_has_it_open(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.records.node_logs.LARGEST_LOG_BYTES", 20)
+    monkeypatch.setattr("emulator.records.disk.LARGEST_LOG_BYTES", 20)
     path, words = tmp_path / "v01.log", "(the log is full: further lines are left out after 20 bytes)\n"
     with path.open("a", buffering=1) as log:
         log.write("line 000\nline 001\n")

@@ -14,8 +14,8 @@ import pytest
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.local import output_kept
 from emulator.drivers.session import Session
-from emulator.records import node_logs
-from emulator.records.node_logs import NodeLogs
+from emulator.records import disk
+from emulator.records.disk import NodeLogs
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, run_forked, run_together, scenario_of
@@ -142,8 +142,8 @@ async def never_ends_a_line(node: Node) -> None:
 
 
 def test_a_flood_is_bounded(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(node_logs, "LARGEST_LOG_BYTES", 5000)
-    monkeypatch.setattr(node_logs, "LONGEST_HELD", 1000)
+    monkeypatch.setattr(disk, "LARGEST_LOG_BYTES", 5000)
+    monkeypatch.setattr(disk, "LONGEST_HELD", 1000)
     emulation = run_together(scenario_of([], f"{__name__}:never_ends_a_line", vehicles=2))
     log = log_of(emulation, "v01")
     assert log == "x" * 5000 + "(the log is full: further lines are left out after 5,000 bytes)\n"

@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.records.atomic import atomically, write_atomically
+from emulator.records.disk import atomically, write_atomically
 from vnet.errors import VnetError
 
 
