@@ -13,6 +13,7 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
+from itertools import filterfalse
 from types import MappingProxyType
 
 import numpy as np
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from agents.cooperative.cmm.consensus import Share, tracked_mean
 from agents.cooperative.cmm.information import Five, Information, plain_moments
+from agents.cooperative.cmm.kalman_bound import common_step
 from agents.cooperative.cmm.lane_memory import LaneExchange, all_information_of, is_of_lane, kind_of_increment
 from agents.cooperative.cmm.own_vehicle import OwnVehicle, own_vehicle
 from agents.cooperative.cmm.plausibility import (
@@ -68,6 +70,11 @@ LOST_NEIGHBOURS = 3
 PASSED_SHARE = 0.8
 """Share of an increment that is passed on which is added: what priors hold by longer ways is not in their lists,
 and with the whole the vehicles are too sure (ANEES 1.25 on N1 in place of 1.16; the error grows by 1 %)."""
+REMEMBERED_PERIODS = 8
+"""Periods for which a vehicle on a map remembers increments, so that it uses none twice. If c moves in so many by
+less than its deviation, it also passes on what others have passed on: else that comes too late."""
+LEAST_SHARE = 3e-4
+"""Share of what a vehicle on a map knows of c below which it does not pass an increment on."""
 COUNTED_SHARE = 0.5
 """An increment of which less than this share is used is counted among what is rejected."""
 
@@ -147,7 +154,11 @@ class InformationEstimator:
         self._increment: Five = _NOTHING
         self._largest_increment = 0.0
         self._code = int(self.name, 16)
-        self._passing = Passing(passed_record(self._code, self._increment))
+        periods = 1 if self._lanes else REMEMBERED_PERIODS
+        self._passing = Passing(passed_record(self._code, self._increment), periods)
+        config = options.filter_config()
+        step = common_step(config.common_sigma_m, config.common_tau_s, config.common_walk_m, self.period_s)
+        self._moves_m2 = REMEMBERED_PERIODS * step[1]
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
     @property
@@ -230,9 +241,9 @@ class InformationEstimator:
         limited, increments = self._limited(heard, priors)
         self._weighed = list(frames)
         weights = self._weights = self._weigh(heard, means_m, own[2] + own[4], leaning)
-        passed = self._passed_on(heard, weights[1:])
+        passed, onward = self._passed_on(heard, weights[1:])
         self.imported = len(frames) + len(passed)
-        self._passing.use([passed_record(self._code, self._increment), *heard.records])
+        self._pass_on(heard, onward, own[2] + own[4])
         self._absorb(weights, limited, increments, passed)
         self.fused_m = self.own.estimate_m
 
@@ -403,12 +414,35 @@ class InformationEstimator:
 
     # What is passed on.
 
-    def _passed_on(self, heard: HeardFrames, weights: Sequence[float]) -> list[Five]:
-        """Return the increments of the last period from out of range, less what the pooled priors hold."""
+    def _pass_on(self, heard: HeardFrames, onward: list[bytes], variance_m2: float) -> None:
+        """Take what the next frame passes on: the increments heard, and `onward`, which others have passed on.
+
+        `variance_m2` is the trace of the vehicle's own covariance of c.
+        """
+        used = [passed_record(self._code, self._increment), *heard.records]
+        if self._lanes:
+            self._passing.use(used, used)
+            return
+        least = LEAST_SHARE * (self._prior[0] + self._prior[2])
+        told = zip(heard.records, heard.increments, strict=True)
+        further = map(passed_increment.cached, onward if variance_m2 > 2 * self._moves_m2 else [])
+        self._passing.use(
+            used,
+            [used[0], *[record for record, (a, _, d, _, _) in told if a + d >= least]],
+            [record for record, (_, (a, _, d, _, _)) in zip(onward, further, strict=False) if a + d >= least],
+        )
+
+    def _passed_on(self, heard: HeardFrames, weights: Sequence[float]) -> tuple[list[Five], list[bytes]]:
+        """Return the increments of earlier periods from out of range, less what the pooled priors hold.
+
+        The second value are the records of those that are used: what can go further.
+        """
         shares, forged = self._passing.shares(heard.passed, weights, self._options.defence)
         self._reject("forged", forged)
-        origins, increments, has_joined = [], [], self._lanes is not None and self._lanes.has_joined
-        for share, (code, increment) in zip(shares.values(), map(passed_increment.cached, shares), strict=True):
+        records, origins, increments = [], [], []
+        has_joined = self._lanes is not None and self._lanes.has_joined
+        for record, share in shares.items():
+            code, increment = passed_increment.cached(record)
             if share >= 1:
                 continue
             a, b, d, x, y = increment
@@ -419,17 +453,19 @@ class InformationEstimator:
             else:
                 factor = PASSED_SHARE * (1 - share)
                 increment = factor * a, factor * b, factor * d, factor * x, factor * y
+            records.append(record)
             origins.append(code)
             increments.append(increment)
         if not origins or not self._options.defence:
-            return increments
+            return increments, records
         x, y, p, q, r = self.own.plain_moments
         used = self._shares_used(origins, increments, ((x, y), (p, q, r)), True)
+        increments = scaled_down(increments, self._largest_increment)
         if min(used) < 1:
             self._reject("passed", sum(share < COUNTED_SHARE for share in used))
-            cut = zip(scaled_down(increments, self._largest_increment), used, strict=True)
-            return [scaled_by(increment, share) for increment, share in cut]
-        return scaled_down(increments, self._largest_increment)
+            increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]
+            records = [record for record, share in zip(records, used, strict=True) if share >= COUNTED_SHARE]
+        return increments, records
 
     # What goes out.
 
@@ -466,21 +502,41 @@ Records = Sequence[bytes]
 
 
 class Passing:
-    """The increments that a vehicle has used in the latest period, its own first, as records of `PASSED`."""
+    """The increments that a vehicle has used, as records of `PASSED`, and which of them it passes on.
 
-    def __init__(self, own: bytes) -> None:
-        self._used = [own]
+    A vehicle remembers them for `periods` at least, and twice as many at most.
+    """
 
-    def use(self, records: list[bytes]) -> None:
-        """Replace the increments used; the vehicle's own is the first of `records`."""
-        self._used = records
+    def __init__(self, own: bytes, periods: int = 1) -> None:
+        self._heard = self._told = [own]
+        self._onward: Sequence[bytes] = ()
+        self._listed: Sequence[bytes] = ()
+        # Those of the latest period, most of what is heard of; of some periods; and of as many before.
+        self._known: tuple[set[bytes], ...] = {own}, set(), set()
+        self._periods, self._since = periods, 1
+
+    def use(self, heard: list[bytes], told: list[bytes], onward: Sequence[bytes] = ()) -> None:
+        """Take the increments of a period: those heard, and the ones that are `told`, the vehicle's own first.
+
+        `onward` are those that others have passed on and that go further.
+        """
+        self._heard, self._told, self._onward = heard, told, onward
+        latest = {*heard, *self._listed}
+        _, recent, before = self._known
+        if self._periods > 1:
+            if self._since == self._periods:
+                recent, before, self._since = set(), recent, 0
+            self._since += 1
+            recent |= latest
+        self._known = latest, recent, before
 
     def to_send(self, limit: int, period: int) -> NDArray[np.void]:
-        """Return at most `limit` of the records, the first and of the others in turns."""
-        used, others = self._used, len(self._used) - 1
-        if limit <= others:
-            used = [used[0], *[used[1 + (turn + period * limit) % others] for turn in range(limit - 1)]][:limit]
-        return np.frombuffer(b"".join(used), dtype=PASSED)
+        """Return at most `limit` records: the vehicle's own, then those heard, then others, each in turns."""
+        own, *others = self._told
+        sent = [own][:limit]
+        for group in others, self._onward:
+            sent += _in_turns(group, limit - len(sent), period * limit)
+        return np.frombuffer(b"".join(sent), dtype=PASSED)
 
     def shares(
         self, listed: Sequence[Records], weights: Sequence[float], defence: bool
@@ -490,34 +546,45 @@ class Passing:
         That is the sum of the `weights` of the senders that list it. With `defence` what forged frames list is not
         counted; the second value is their number.
         """
-        shares = _shares(frozenset(self._used), listed, weights)
-        records = [*shares, *self._used]
-        if len({record[:NAME_BYTES] for record in records}) == len(records):
+        latest, *earlier = self._known
+        unknown: list[Records] = [list(filterfalse(latest.__contains__, records)) for records in listed]
+        shares = _shares(unknown, weights)
+        if self._periods > 1:
+            for old in [record for record in shares if any(record in known for known in earlier)]:
+                del shares[old]
+            self._listed = list(shares)
+        heard, new = {record[:NAME_BYTES] for record in self._heard}, {record[:NAME_BYTES] for record in shares}
+        # Of who is not heard a vehicle that remembers gets increments of several periods.
+        if heard.isdisjoint(new) and (self._periods > 1 or len(new) == len(shares)):
             return shares, 0
-        forged = _forged(self._used, listed) if defence else set()
-        new, listed = _one_an_origin(self._used, listed, forged)
-        return {
-            record: share for record, share in _shares(frozenset(), listed, weights).items() if record in new
-        }, len(forged)
+        unknown = [[record for record in records if record in shares] for records in unknown]
+        forged = _forged(heard, listed, unknown) if defence else set()
+        kept, unknown = _one_an_origin(self._heard, unknown, forged)
+        return {record: share for record, share in _shares(unknown, weights).items() if record in kept}, len(forged)
 
 
-def _shares(known: Set[bytes], listed: Sequence[Records], weights: Sequence[float]) -> dict[bytes, float]:
-    """Return the sum of the weights of the frames that list a record, for those that are not known."""
+def _in_turns(records: Sequence[bytes], count: int, first: int) -> Sequence[bytes]:
+    """Return all records, or `count` of them from number `first` on, round and round."""
+    if len(records) <= count:
+        return records
+    return [records[(first + turn) % len(records)] for turn in range(count)]
+
+
+def _shares(listed: Sequence[Records], weights: Sequence[float]) -> dict[bytes, float]:
+    """Return the sum of the weights of the frames that list a record."""
     shares: dict[bytes, float] = {}
     for weight, records in zip(weights, listed, strict=True):
         for record in records:
-            if record not in known:
-                shares[record] = shares.get(record, 0.0) + weight
+            shares[record] = shares.get(record, 0.0) + weight
     return shares
 
 
-def _forged(used: Sequence[bytes], listed: Sequence[Records]) -> set[int]:
-    """Return the indices of the frames that forge: most that is known first-hand of what they list differs."""
-    own = {record[:NAME_BYTES]: record for record in used}
+def _forged(heard: Set[bytes], listed: Sequence[Records], unknown: Sequence[Records]) -> set[int]:
+    """Return the indices of the frames that forge: most that they list of origins that are `heard` is `unknown`."""
     forged = set()
-    for index, records in enumerate(listed):
-        known = [record == own[name] for record in records if (name := record[:NAME_BYTES]) in own]
-        if known.count(False) > MAX_FORGED_SHARE * len(known):
+    for index, (all_records, records) in enumerate(zip(listed, unknown, strict=True)):
+        known, false = (sum(r[:NAME_BYTES] in heard for r in some) for some in (all_records, records))
+        if false > MAX_FORGED_SHARE * known:
             forged.add(index)
     return forged
 

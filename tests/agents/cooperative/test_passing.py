@@ -17,7 +17,7 @@ OWN, FIRST, SECOND, FAR, FURTHER = (_record(code) for code in (1, 2, 3, 300, 70_
 
 def _passing() -> Passing:
     passing = Passing(OWN)
-    passing.use([OWN, FIRST, SECOND])
+    passing.use([OWN, FIRST, SECOND], [OWN, FIRST, SECOND])
     return passing
 
 
@@ -50,6 +50,51 @@ def test_a_frame_that_differs_in_one_of_two_is_not_forged() -> None:
 
 def test_others_are_sent_in_turns() -> None:
     passing = Passing(OWN)
-    passing.use([OWN, FIRST, SECOND, _record(4)])
+    passing.use([OWN, FIRST, SECOND, _record(4)], [OWN, FIRST, SECOND, _record(4)])
     assert [passing.to_send(2, period)["name"].tolist() for period in range(3)] == [[1, 2], [1, 4], [1, 3]]
     assert [len(passing.to_send(limit, 7)) for limit in (0, 1, 3, 4, 9)] == [0, 1, 3, 4, 4]
+
+
+def _codes(passing: Passing, limit: int, period: int = 0) -> list[int]:
+    return [int(code) for code in passing.to_send(limit, period)["name"]]
+
+
+def test_what_others_passed_on_is_used_once_as_long_as_a_vehicle_remembers_it() -> None:
+    passing, listed = Passing(OWN, 3), [(FIRST, FAR)]
+    passing.use([OWN, FIRST], [OWN, FIRST])
+    assert passing.shares(listed, [0.5], True) == ({FAR: 0.5}, 0)
+    passing.use([OWN, SECOND], [OWN, SECOND], [FAR])
+    assert _codes(passing, 9) == [1, 3, 300]
+    for _ in range(3):
+        assert passing.shares(listed, [0.5], True) == ({}, 0)
+        passing.use([OWN], [OWN])
+        assert _codes(passing, 9) == [1]
+    for _ in range(3):
+        passing.use([OWN], [OWN])
+    assert FAR in passing.shares(listed, [0.5], True)[0], "it has forgotten"
+
+
+def test_what_was_heard_is_sent_before_what_others_have_passed_on() -> None:
+    """An increment that says too little for that is known as well."""
+    passing = Passing(OWN, 3)
+    passing.use([OWN, FIRST, _record(4), SECOND], [OWN, FIRST, SECOND], [FAR, FURTHER])
+    assert _codes(passing, 9) == [1, 2, 3, 300, 70_000]
+    assert _codes(passing, 4) == [1, 2, 3, 300]
+    assert [_codes(passing, 2, period) for period in range(2)] == [[1, 2], [1, 2]]
+    assert passing.shares([(_record(4), OWN)], [0.5], True) == ({}, 0)
+
+
+def test_an_older_increment_of_who_is_heard_is_no_forgery_if_it_is_known() -> None:
+    passing, false = Passing(OWN, 3), _record(2, 9.0)
+    passing.use([OWN, FIRST], [OWN, FIRST])
+    passing.use([OWN, _record(2, 2.0)], [OWN, _record(2, 2.0)])
+    assert passing.shares([(FIRST, false, FAR)], [0.5], True) == ({FAR: 0.5}, 0)
+    assert passing.shares([(false, FAR)], [0.5], True) == ({}, 1)
+
+
+def test_a_known_increment_does_not_hide_a_new_one_of_the_same_origin() -> None:
+    passing, newer = Passing(OWN, 3), _record(300, 2.0)
+    passing.use([OWN, FIRST], [OWN, FIRST], [FAR])
+    assert passing.shares([(FAR,)], [0.5], True) == ({FAR: 0.5}, 0)
+    passing.use([OWN, FIRST], [OWN, FIRST], [FAR])
+    assert passing.shares([(FAR,), (newer, _record(2, 3.0))], [0.25, 0.5], False) == ({newer: 0.5}, 0)
