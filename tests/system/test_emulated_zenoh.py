@@ -289,3 +289,36 @@ with zenoh.open(zenoh.Config.from_env()) as session:
     assert len(emulated) == 3 * 15 * 2
     assert real.items() <= emulated.items(), "what is put before a run in real time begins is no frame"
     assert set(real.values()) == {"delivered", "lost"}
+
+
+HOLDER = """
+import sys, time, zenoh
+
+def main():
+    session = zenoh.open(zenoh.Config())
+    subscriber = session.liveliness().declare_subscriber("alive/*", print)
+    token = session.liveliness().declare_token(f"alive/{sys.argv[1]}")
+    while True:
+        time.sleep(0.1)
+
+main()
+"""
+
+
+def test_what_a_killed_program_holds_ends_without_a_word(vnet: Vnet, tmp_path: Path) -> None:
+    (tmp_path / "holder.py").write_text(HOLDER)
+    (tmp_path / "holder.toml").write_text(
+        """
+run = { name = "holder", duration_s = 2.0, settle_s = 0.5 }
+network.vehicles = 2
+radio.range_m = 100000.0
+program = { kind = "zenoh", command = ["python", "HOLDER", "{id}"] }
+[[fault]]
+kind = "kill"
+at_s = 0.5
+duration_s = 0.5
+nodes = ["v02"]
+""".replace("HOLDER", str(tmp_path / "holder.py"))
+    )
+    done = vnet("simulate", str(tmp_path / "holder.toml"), "--quiet")
+    assert (done.status, "Exception ignored" in done.stdout + done.stderr) == (0, False)

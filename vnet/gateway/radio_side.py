@@ -102,6 +102,10 @@ class RadioSide(ABC, Generic[Q]):
         """Forget the tokens of vehicles that have not told of any lately."""
         self._retell({one: told for one, told in self._told.items() if time_ns - told[0] < self._tokens_ns})
 
+    def wait_anew(self, time_ns: int) -> None:
+        """Count the time without word of tokens from now on, as after a pause, in which nothing arrives."""
+        self._told = {one: (time_ns, keys) for one, (_, keys) in self._told.items()}
+
     @property
     def heard_tokens(self) -> dict[str, None]:
         """The tokens of other vehicles, in the order in which their vehicles were first heard."""

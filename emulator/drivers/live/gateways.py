@@ -224,6 +224,8 @@ class Gateways:
         if (vehicle := self._vehicles.get(name)) is not None:
             for process in vehicle.commands:
                 self._launcher.signal_group(process, number)
+            if vehicle.is_paused:
+                vehicle.gateway.wait_anew(self._now_ns())
             vehicle.is_paused = number == signal.SIGSTOP
             self._flush_soon(vehicle)
 
@@ -420,8 +422,10 @@ class Gateways:
         vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end
 
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
+        if vehicle.is_paused:
+            return
         vehicle.gateway.forget_tokens(self._now_ns())
-        if (tokens := vehicle.gateway.tokens()) is not None and not vehicle.is_paused:
+        if (tokens := vehicle.gateway.tokens()) is not None:
             self._transmit(vehicle, tokens, time.monotonic_ns())
 
     def _is_there(self, vehicle: _Vehicle) -> bool:

@@ -432,6 +432,7 @@ def test_frames_that_a_fault_has_changed_are_dropped(drive: Drive) -> None:
     assert any("is no sample" in event["text"] for event in events(run, "log"))
 
 
+@pytest.mark.slow
 def test_a_sample_that_cannot_arrive_is_told(drive: Drive) -> None:
     program = """
         import time, zenoh

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from functools import partial, partialmethod
 from itertools import count
@@ -82,6 +83,11 @@ class Ending(Numbered):
         for end in ends or ():
             end()
 
+    def discard(self) -> None:
+        """End it as the program discards it; what a killed one leaves is collected outside of any loop."""
+        if asyncio._get_running_loop() is not None:
+            self.end()
+
 
 class Declared(Ending):
     """An entity that a session has declared."""
@@ -150,7 +156,7 @@ class Listening(Declared):
 
     def __del__(self) -> None:
         if not self._is_background:
-            self.end()
+            self.discard()
 
 
 class Subscriber(Listening):
@@ -208,7 +214,7 @@ class LivelinessToken(Declared):
         self._ends = {session.declare(Entity("token", session, session.new_id(), key_of(key))): None}
 
     def __del__(self) -> None:
-        self.end()
+        self.discard()
 
 
 class CancellationToken:

@@ -1,6 +1,7 @@
 """Messages of gateways to a run, in the place of agents, without Zenoh."""
 
 import asyncio
+import signal
 from typing import Any
 
 import pytest
@@ -12,9 +13,11 @@ from emulator.drivers.live.supervisor import ChangeSignal
 from emulator.scenario.scenario import Scenario
 from tests.emulator.drivers.live.fakes import FakeLauncher, on_a_loop
 from tests.support.multi_loop_driver import emulation_of
-from vnet.gateway.frames import CrossingSample, Message, Reassembly
+from vnet.gateway.frames import CrossingSample, CrossingTokens, Message, Reassembly
+from vnet.gateway.radio_side import RadioSide
 from vnet.transport import wire
 from vnet.transport.access import Access
+from vnet.units import NS_PER_S
 
 SAMPLE = CrossingSample("pose", b"here", "zenoh/bytes", False, None, "DATA", "DROP", False, None, None)
 WELCOME = wire.Welcome("v01", b"1", 0, "realtime", "", {}, [], 1, 1, 1000, 1.0, 0, "")
@@ -131,4 +134,25 @@ async def test_a_vehicle_that_ends_before_its_turn_sends_what_it_has_put(monkeyp
     _, node, (frames, _) = await rig.told.get()
     assert (node, list(frames.traffic.frames)) == ("v03", [])
     assert [each.text for each in frames.traffic.notes] == ["1 frame not sent: the vehicle has ended"]
+    await rig.gateways.close()
+
+
+@on_a_loop
+async def test_tokens_are_not_forgotten_by_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What tells of them is held back meanwhile."""
+    rig, now_ns = Rig(monkeypatch, 2, {}), [0]
+    told: list[bool] = []
+    monkeypatch.setattr(rig.gateways, "_now_ns", lambda: now_ns[0])
+    await rig.welcome("v01")
+    gateway, vehicle = rig.routers["v01"], rig.gateways._vehicles["v01"]
+    monkeypatch.setattr(gateway, "_show_token", lambda key, is_there: told.append(is_there))
+    RadioSide.hear_tokens(gateway, "v02", CrossingTokens(("alive/v02",)), 0)
+    for number, seconds in (signal.SIGSTOP, 10), (signal.SIGCONT, 12):
+        rig.gateways.signal("v01", number)
+        now_ns[0] = seconds * NS_PER_S
+        rig.gateways._renew_tokens(vehicle)
+    assert told == [True]
+    now_ns[0] = 16 * NS_PER_S
+    rig.gateways._renew_tokens(vehicle)
+    assert told == [True, False]
     await rig.gateways.close()
