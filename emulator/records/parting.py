@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile, zip_longest
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from emulator.radio.outcomes import Outcome
 from emulator.records.events import SAMPLES, Event
 from emulator.records.recorded_run import OpenedRun
 from emulator.records.reported import reported_columns
@@ -124,16 +125,58 @@ Row = dict[str, Any]
 
 
 def first_frame(first: OpenedRun, second: OpenedRun) -> Parting | None:
-    """Return the first frame in which two runs differ."""
-    frames = [_distinct(run.trace.select(FRAME)) for run in (first, second)]
+    """Return the first frame in which two runs differ.
+
+    A frame that all its receivers heard otherwise than it was sent is compared by receptions alone.
+    """
+    whole, changed = zip(*(_frames(run.trace) for run in (first, second)), strict=True)
+    unknown = set().union(*(of_one - _names(frames) for of_one, frames in zip(changed, whole, strict=True)))
+    frames = [
+        each
+        if not unknown
+        else each.filter(pa.array([name not in unknown for name in _name_list(each)], pa.bool_()))
+        for each in whole
+    ]
     return _first_row("frame", frames, [each["sent_ns"] for each in frames], _frame)
+
+
+def _frames(trace: pa.Table) -> tuple[pa.Table, set[tuple[str, int]]]:
+    """Return the frames as they were sent, and the names of those that somebody heard otherwise, by a fault."""
+    by_fault = pc.not_equal(pc.fill_null(trace["cause"].cast(pa.string()), ""), "")
+    changed = pc.and_(pc.equal(trace["outcome"].cast(pa.string()), Outcome.delivered.name), by_fault)
+    return _distinct(trace.filter(pc.invert(changed)).select(FRAME)), _names(trace.filter(changed))
+
+
+def _name_list(table: pa.Table) -> list[tuple[str, int]]:
+    """Return sender and number of each row's frame."""
+    return list(zip(table["sender"].to_pylist(), table["seq"].to_pylist(), strict=True))
+
+
+def _names(table: pa.Table) -> set[tuple[str, int]]:
+    return set(_name_list(table))
 
 
 def _first_reception(first: OpenedRun, second: OpenedRun) -> Parting | None:
     """Return the first reception in which two runs differ."""
     traces = [run.trace.select(RECEPTION) for run in (first, second)]
     known_ns = [pc.coalesce(trace["arrival_ns"], trace["sent_ns"]) for trace in traces]
-    return _first_row("reception", traces, known_ns, _reception)
+    parting = _first_row("reception", traces, known_ns, _reception)
+    if parting is None:
+        return None
+    ours, theirs = parting.first, parting.second
+    return replace(
+        parting,
+        first=ours or _elsewhen(traces[0], parting.node, theirs),
+        second=theirs or _elsewhen(traces[1], parting.node, ours),
+    )
+
+
+def _elsewhen(trace: pa.Table, node: str, reception: str) -> str:
+    """Return what became of a reception in a run that has it at another instant; "" if it has not got it."""
+    name = reception.partition(": ")[0]
+    rows = trace.filter(pc.equal(trace["receiver"].cast(pa.string()), node)).to_pylist()
+    entries = (entry for entry in map(_reception, rows) if entry[2].startswith(f"{name}: "))
+    return next((f"{text}, at {time_ns / NS_PER_S:.6f} s" for time_ns, _, text in entries), "")
 
 
 def _distinct(table: pa.Table) -> pa.Table:
