@@ -105,6 +105,18 @@ def _agent_environment(scenario: Scenario) -> Mapping[str, str]:
     return LOCKSTEP_ENVIRONMENT if scenario.run.pacing == "lockstep" else AGENT_ENVIRONMENT
 
 
+async def _to_its_end(work: Coroutine[Any, Any, None]) -> bool:
+    """Await something to its end, whatever cancels the present task meanwhile; return whether anything has."""
+    task, cancelled = asyncio.ensure_future(work), False
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError:
+            cancelled = True
+    task.result()
+    return cancelled
+
+
 class LiveSession:
     """One live run's course: join, drive, shut down."""
 
@@ -181,7 +193,7 @@ class LiveSession:
         finally:
             wall_s = time.monotonic() - started_s
             self._measure_cpu()
-            await self._shut_down(completed)
+            interrupted |= await _to_its_end(self._shut_down(completed))
             in_all_ns = self._cpu.cpu_ns if self._fleet is None else self._cpu.cpu_ns + self._fleet.cpu_ns
             self._emulation.costs.take_processes(in_all_ns)
             self._memory.write(folder, self._time_ns())

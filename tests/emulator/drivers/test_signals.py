@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from emulator.drivers.live.session import _to_its_end
 from emulator.drivers.signals import ENDING, cancelled_by_signals, gets_signals, signals_handled, signals_ignored
 
 
@@ -90,3 +91,32 @@ def test_on_another_thread_nothing_is_set(before: object) -> None:
     thread.start()
     thread.join()
     assert seen == [False, False, before]
+
+
+def test_a_run_that_is_over_ends_its_programs_whatever_interrupts_it() -> None:
+    async def interrupted(signals: int) -> bool:
+        go_on, ended = asyncio.Event(), []
+
+        async def shut_down() -> None:
+            await go_on.wait()
+            ended.append(True)
+
+        task = asyncio.create_task(_to_its_end(shut_down()))
+        for _ in range(signals):
+            await asyncio.sleep(0)
+            task.cancel()
+        await asyncio.sleep(0)
+        go_on.set()
+        was_interrupted = await task
+        assert ended == [True]
+        return was_interrupted
+
+    assert [asyncio.run(interrupted(signals)) for signals in range(3)] == [False, True, True]
+
+
+def test_what_fails_as_programs_end_is_told() -> None:
+    async def shut_down() -> None:
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        asyncio.run(_to_its_end(shut_down()))
