@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from functools import partial
@@ -145,6 +146,10 @@ def export(
             "--every", min=0, max=86_400, help="Of links: seconds for each loss; 0: each frame. Default: 1."
         ),
     ] = None,
+    definitions: Annotated[
+        Path | None,
+        typer.Option(help="Of mcap: folder with PACKAGE/msg/TYPE.msg of own types of ROS 2."),
+    ] = None,
 ) -> None:
     """Write a run in a format that other tools read."""
     with one_line_errors():
@@ -153,6 +158,8 @@ def export(
             raise VnetError(f"--every {every_s:g}: of links, and not of {chosen.value}")
         if payloads is not None and chosen is not Format.PCAPNG:
             raise VnetError(f"--payloads {payloads.value}: of pcapng, and not of {chosen.value}")
+        if definitions is not None and chosen is not Format.MCAP:
+            raise VnetError(f"--definitions {definitions}: of mcap, and not of {chosen.value}")
         recorded = RecordedRun.open(run)
         match chosen:
             case Format.PCAPNG:
@@ -161,7 +168,8 @@ def export(
                 print(f"{_write(path, recorded, writer):,} packets in {path}")
             case Format.MCAP:
                 path = out or run / "run.mcap"
-                print(f"{_write(path, recorded, write_mcap):,} messages in {path}")
+                writer = partial(write_mcap, definitions=definitions, tell=partial(print, file=sys.stderr))
+                print(f"{_write(path, recorded, writer):,} messages in {path}")
             case Format.LINKS:
                 path = out or run / "links.csv"
                 links = partial(write_links, every_s=1.0 if every_s is None else every_s)

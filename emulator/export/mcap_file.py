@@ -13,8 +13,8 @@ import heapq
 import json
 import math
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
-from functools import cache
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import msgspec
@@ -24,6 +24,7 @@ import pyarrow as pa
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.records.tables import PAYLOADS
+from vnet.errors import VnetError
 from vnet.extras import is_installed, require
 from vnet.gateway.frames import CrossingSample, Reassembly
 from vnet.gateway.ros2 import TopicKey, parse_topic
@@ -87,11 +88,21 @@ _STATE_COLUMNS = ("position_m", "heading_rad", "fix_m")
 """Columns of `states.parquet` in `/states`, beside those that programs report."""
 
 
-def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
-    """Write a run; return the number of messages. Raise VnetError if the package mcap is missing."""
+def write_mcap(
+    recorded: OpenedRun,
+    file: BinaryIO,
+    definitions: Path | None = None,
+    tell: Callable[[str], object] = lambda text: None,
+) -> int:
+    """Write a run; return the number of messages. Raise VnetError if the package mcap is missing.
+
+    `definitions` is a folder with PACKAGE/msg/TYPE.msg of types of ROS 2 that rosbags has not. `tell` is told of
+    each type without a definition.
+    """
     require("MCAP", "mcap")
     from mcap.writer import Writer
 
+    store = _typestore(definitions)
     writer = Writer(file)
     writer.start(profile="", library="vnet")
     channels: dict[Channel, int] = {}
@@ -103,7 +114,9 @@ def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
     for time_ns, channel, message in heapq.merge(*_streams(recorded), key=lambda one: one[0]):
         if isinstance(channel, tuple) and channel not in channels:
             vehicle, sent = channel
-            text = _definition(sent.type, sent.type_hash)
+            text = _definition(store, sent.type, sent.type_hash)
+            if text is None:
+                tell(f"{sent.type} of {vehicle}{sent.topic} has no definition with its hash, and so no schema")
             schema_id = 0 if text is None else writer.register_schema(sent.type, "ros2msg", text)
             told = {"node": vehicle, "type": sent.type, "type_hash": sent.type_hash}
             channels[channel] = writer.register_channel(f"/{vehicle}{sent.topic}", "cdr", schema_id, told)
@@ -140,18 +153,38 @@ def _ros2(recorded: RecordedRun) -> Iterator[Message]:
                 yield row["time_ns"], (row["sender"], topic), message.payload
 
 
-@cache
-def _definition(ros_type: str, type_hash: str) -> bytes | None:
-    """Return the definition of a type, with those it uses; None unless rosbags has one with this hash."""
+def _typestore(definitions: Path | None) -> Any:
+    """Return the types that rosbags has, and those of a folder; None without rosbags."""
     if not is_installed("rosbags"):
+        if definitions is not None:
+            require("definitions of ROS 2", "rosbags")
         return None
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
+    files = [] if definitions is None else sorted(definitions.glob("**/msg/*.msg"))
+    if definitions is not None and not files:
+        raise VnetError(f"{definitions}: has no PACKAGE/msg/TYPE.msg")
+    for path in files:
+        name = f"{path.absolute().parts[-3]}/msg/{path.stem}"
+        try:
+            store.register(get_types_from_msg(path.read_text(), name))
+        except (OSError, UnicodeDecodeError, TypesysError) as error:
+            raise VnetError(f"{path}: is no definition of {name}: {' '.join(str(error).split())}") from None
+    return store
+
+
+def _definition(store: Any, ros_type: str, type_hash: str) -> bytes | None:
+    """Return the definition of a type, with those it uses; None unless there is one with this hash."""
     has_hash = type_hash.startswith("RIHS01_")
-    if ros_type not in store.fielddefs or (has_hash and store.hash_rihs01(ros_type) != type_hash):
+    if store is None or ros_type not in store.fielddefs:
         return None
-    return store.generate_msgdef(ros_type, ros_version=2)[0].encode()
+    try:
+        if has_hash and store.hash_rihs01(ros_type) != type_hash:
+            return None
+        return bytes(store.generate_msgdef(ros_type, ros_version=2)[0].encode())
+    except KeyError:  # of a type that it uses, and that is not there
+        return None
 
 
 def _periods(recorded: RecordedRun) -> Iterator[Message]:

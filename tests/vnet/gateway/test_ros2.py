@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from pamoja import ros2 as pamoja
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh_ros2_sdk import attachment as sdk_attachment
 from zenoh_ros2_sdk import entity as sdk_entity
 from zenoh_ros2_sdk import keyexpr as sdk_keys
@@ -24,6 +24,7 @@ from emulator.records.samples import key_figures
 from tests.support.paths import ROOT
 from tests.system.ros2_nodes import FIRST_OF_PAMOJA
 from tests.vnet.gateway.conftest import Drive, log
+from vnet.errors import VnetError
 from vnet.gateway.ros2 import (
     ATTACHMENT,
     CLOCK_TYPE,
@@ -297,6 +298,36 @@ def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(d
             )
     known = ("std_msgs/msg/String", "ros2msg", "string data\n")
     assert schemas == {"/v01/chatter": known, "/v01/old": known, "/v01/odd": None}
+
+
+def test_mcap_has_schemas_of_own_types_whose_definitions_are_given(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "fleet/msg").mkdir(parents=True)
+    (tmp_path / "fleet/msg/Status.msg").write_text("string name\nfleet/Speed speed\n")
+    own = get_typestore(Stores.LATEST)
+    own.register(get_types_from_msg("float64 m_s\n", "fleet/msg/Speed"))
+    own.register(get_types_from_msg("string name\nfleet/Speed speed\n", "fleet/msg/Status"))
+    program = f"""
+        import zenoh
+        key = "0/status/fleet::msg::dds_::Status_/{own.hash_rihs01("fleet/msg/Status")}"
+        zenoh.open(zenoh.Config()).put(key, b"content")
+    """
+    run = RecordedRun.open(drive(program, radio={"profile": "ros2"}, run={"keep_payloads": True}).folder)
+    told: list[str] = []
+    write_mcap(run, io.BytesIO(), tell=told.append)
+    write_mcap(run, io.BytesIO(), tmp_path / "fleet", told.append)  # which lacks a type that it uses
+    assert [text.partition(" has no")[0] for text in told] == ["fleet/msg/Status of v01/status"] * 2
+    (tmp_path / "fleet/msg/Speed.msg").write_text("float64 m_s\n")
+    write_mcap(run, file := io.BytesIO(), tmp_path, told.append)
+    file.seek(0)
+    schemas = {channel.topic: schema for schema, channel, _ in make_reader(file).iter_messages()}
+    assert (found := schemas["/v01/status"]) is not None and found.name == "fleet/msg/Status" and len(told) == 2
+    (tmp_path / "fleet/msg/Speed.msg").write_text("float64/// m_s\n")
+    for folder, text in (
+        (tmp_path / "none", "has no PACKAGE/msg"),
+        (tmp_path, "is no definition of fleet/msg/Speed"),
+    ):
+        with pytest.raises(VnetError, match=text):
+            write_mcap(run, io.BytesIO(), folder)
 
 
 def test_figures_are_by_topic_and_type_with_the_nodes_that_send(drive: Drive) -> None:

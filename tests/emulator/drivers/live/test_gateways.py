@@ -139,7 +139,7 @@ async def test_a_vehicle_that_ends_before_its_turn_sends_what_it_has_put(monkeyp
 
 @on_a_loop
 async def test_tokens_are_not_forgotten_by_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What tells of them is held back meanwhile."""
+    """Frames that tell of them are held back meanwhile."""
     rig, now_ns = Rig(monkeypatch, 2, {}), [0]
     told: list[bool] = []
     monkeypatch.setattr(rig.gateways, "_now_ns", lambda: now_ns[0])
