@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from emulator.records.tape import TAPE_FILE, described, read_tape
 from tests.vnet.gateway.conftest import Drive, events, log
 
 pytestmark = pytest.mark.slow
@@ -671,3 +672,19 @@ def test_a_module_that_is_not_the_programs_own_opens_no_session_of_zenoh_itself(
         """
     )
     assert log(run)[:2] == ["this module is not the program's own: its Zenoh is outside of the emulation", " True"]
+
+
+def test_orders_name_threads_as_the_program_does(drive: Drive) -> None:
+    program = """
+        import threading, time
+        def work():
+            time.sleep(0.1)
+            print(threading.current_thread().name)
+        for name in ("teller", "measurer"):
+            threading.Thread(target=work, name=name).start()
+        """
+    labels = set()
+    for seed in range(6):
+        run = drive(program, run={"order": "shuffle", "seed": seed})
+        labels |= {described(each).split(": ")[1].split(" before")[0] for each in read_tape(run.folder / TAPE_FILE)}
+    assert "timer of measurer" in labels

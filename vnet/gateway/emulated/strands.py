@@ -453,7 +453,11 @@ class Threads:
         number, context = (self.new_number(), None) if like is None else (like.number, like.gr_context)
         strand = Strand(partial(self._run, function), number, self.folder, context)
         self._alive += 1
-        Task(run_strand(strand), loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
+        running: Any = run_strand(strand)
+        inner = getattr(function, "func", function)
+        named = getattr(getattr(inner, "__self__", None), "name", None)
+        running.__qualname__ = str(named or getattr(inner, "__qualname__", "a thread"))  # as orders name its timers
+        Task(running, loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
         return strand
 
     def _run(self, function: Callable[[], Any]) -> None:
