@@ -48,6 +48,7 @@ from emulator.world.neighbours import Links
 from emulator.world.own_sensors import SensorFailure
 from emulator.world.truth import FaultyGnss, clock_of
 from emulator.world.world import Instant, World, components
+from vnet.errors import ScenarioError
 from vnet.node import Action
 from vnet.radio import SentFrame
 from vnet.reports import Report
@@ -702,6 +703,8 @@ class Emulation:
 
         It acts after `now_ns` at the earliest. Raises ScenarioError if it does not fit.
         """
+        if why := self.scenario.refusal_of(fault):
+            raise ScenarioError(f"{fault.kind} {why}")
         at_s = max(fault.at_s, (now_ns + 1) / NS_PER_S)
         planned = self.faults.add(fault.model_copy(update={"at_s": at_s}))
         self._change_plan()

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from emulator.scenario.faults import AnyFault
+from emulator.scenario.faults import AnyFault, Fault
 from emulator.scenario.network import LIBSUMO, OSM_ENDINGS, Driven, Map, Network, Ranging, control_step_ns
 from emulator.scenario.program import PYTHON_NAME, Backbone, Entry, Program, RoadsideUnit, Ros2Topics, with_names
 from emulator.scenario.radio import (
@@ -443,6 +443,9 @@ class Scenario(Section):
         for unit in self.roadside:
             if unit.entry is not None:
                 raise ValueError(f'roadside.entry = {shown(unit.entry)} goes with program.kind = "vnet"')
+        for number, fault in enumerate(self.fault):
+            if why := self.refusal_of(fault):
+                raise ValueError(f'fault.{number}.kind = "{fault.kind}" {why}')
         if self.run.pacing == "lockstep":
             if not self.program.commands:
                 raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
@@ -453,20 +456,21 @@ class Scenario(Section):
                         "python -m MODULE … or python -c CODE …, perhaps with "
                         f'{" ".join(sorted(PYTHON_FLAGS))}; any other needs run.pacing = "realtime"'
                     )
-            if any(fault.kind == "router_restart" for fault in self.fault):
-                raise ValueError('router_restart needs run.pacing = "realtime": in lockstep there is no router')
             if self.radio.ros2 is not None and self.radio.ros2.graph == "always":
                 raise ValueError('radio.ros2.graph = "always" needs run.pacing = "realtime"')
             return self
         if self.run.nodes_per_process != 1:
             raise ValueError('run.nodes_per_process goes with program.kind = "vnet": Zenoh programs have their own')
-        for number, fault in enumerate(self.fault):
-            if fault.kind in ("skew", "drift"):
-                raise ValueError(
-                    f'fault.{number}.kind = "{fault.kind}" needs run.pacing = "lockstep": in real time nothing '
-                    "changes the clock of a Zenoh program"
-                )
         return self
+
+    def refusal_of(self, fault: Fault) -> str | None:
+        """Return why a fault of this kind cannot act on the run's programs, None if it can."""
+        pacing, is_zenoh = self.run.pacing, self.program.kind == "zenoh"
+        if is_zenoh and pacing == "realtime" and fault.kind in ("skew", "drift"):
+            return 'needs run.pacing = "lockstep": in real time nothing changes the clock of a Zenoh program'
+        if is_zenoh and pacing == "lockstep" and fault.kind == "router_restart":
+            return 'needs run.pacing = "realtime": in lockstep a Zenoh program has no router'
+        return None
 
     @model_validator(mode="after")
     def _slack_divides_the_period(self) -> Scenario:

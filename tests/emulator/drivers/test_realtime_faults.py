@@ -10,6 +10,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, scenario_of
+from vnet.errors import ScenarioError
 from vnet.radio import SentFrame
 from vnet.transport import wire
 from vnet.transport.wire import MessageRef, SentMessage, arrived_in_full
@@ -171,6 +172,16 @@ def test_what_an_operator_does_late_makes_no_fault_miss_its_end() -> None:
     realtime.take_actions()
     realtime.due(1002 * MS)
     assert [a.paused for a in realtime.take_actions()] == [set()]
+
+
+def test_a_fault_that_programs_cannot_have_is_refused_as_it_is_injected() -> None:
+    """Else nothing would come of it, and the scenario that the run leaves could not be read."""
+    scenario = Scenario.model_validate({"run": {"pacing": "realtime"}, "program": {"kind": "zenoh"}})
+    emulation = emulation_of(scenario)
+    for text in fault("skew", 1.0, 0.2, offset_ms=5.0), fault("drift", 1.0, 0.2, rate_ppm=5.0):
+        with pytest.raises(ScenarioError, match="in real time nothing changes the clock"):
+            emulation.inject(parse_fault(text), 0)
+    assert emulation.scenario.fault == ()
 
 
 def test_healing_ends_a_fault_at_once_and_again_changes_nothing() -> None:

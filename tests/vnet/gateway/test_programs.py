@@ -685,7 +685,7 @@ def test_the_end_of_a_run_is_no_failure_of_a_thread(drive: Drive) -> None:
         (
             ["/elsewhere/.venv/bin/python3.12", "a.py"],
             [{"kind": "router_restart", "at_s": 1.0, "down_s": 0.5}],
-            "router_restart needs",
+            'router_restart" needs',
         ),
     ],
 )
