@@ -163,6 +163,7 @@ _LEFT = {_S.DOWN: _S.OUTSIDE, _S.ENDED: _S.ENDED_OUTSIDE}
 """State of a node after its vehicle has left, by its state before. Its program is stopped first."""
 _STARTED = {_S.NEW: _S.ENTERING, _S.OUTSIDE: _S.ENTERING, _S.DOWN: _S.RESTARTING}
 """State of a node after it is started, by its state before."""
+_STARTING = (_S.ENTERING, _S.RESTARTING)
 _OUTSIDE = {_S.NEW, _S.OUTSIDE, _S.ENTERING, _S.ENDED_OUTSIDE}
 
 
@@ -212,21 +213,21 @@ class Presence:
 
     def come_up(self, nodes: Iterable[str]) -> dict[str, bool]:
         """Those of the nodes that were started are up; returns them, and whether their vehicles enter with that."""
-        entered = {
-            node: self._states[node] is _S.ENTERING
-            for node in nodes
-            if self._states[node] in (_S.ENTERING, _S.RESTARTING)
-        }
+        entered = {node: self._states[node] is _S.ENTERING for node in nodes if self._states[node] in _STARTING}
         for node in entered:
             self._put(node, _S.UP)
         return entered
 
     def end(self, node: str) -> bool:
-        """A program has ended by itself; returns False if it was not up, and so had ended before."""
-        if not self.up[node]:
+        """A program has ended by itself; returns False if it had before, or was stopped."""
+        if self._states[node] not in (_S.UP, *_STARTING):
             return False
         self._put(node, _S.ENDED)
         return True
+
+    def starting(self) -> list[str]:
+        """Return the nodes whose programs were started and are not up."""
+        return [node for node, state in self._states.items() if state in _STARTING]
 
     def has_ended(self, node: str) -> bool:
         """Return whether a program has ended by itself: it is not started again."""
@@ -468,6 +469,8 @@ class Emulation:
         self.presence = Presence(world.node_ids, self._absent(0))
         self.up, self.incarnation = self.presence.up, self.presence.incarnation
         self._acting: set[str] = set()
+        self._started_ns: dict[str, int] = {}
+        """Instants at which programs were started again, or for the first time as their vehicles entered."""
         self._acted_ns = -1
         self._next_change_ns = self._find_next_change_ns()
         self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns, scenario.program)
@@ -615,6 +618,13 @@ class Emulation:
         """Take a node down whose process has ended without being told to."""
         self._program_over(time_ns, node, EventKind.died, details)
 
+    def give_up_starts(self, time_ns: int) -> None:
+        """Take nodes for dead that were started longer ago than `run.join_timeout_s`, and are not up."""
+        patience_s = self.scenario.run.join_timeout_s
+        for node in self.presence.starting():
+            if time_ns - self._started_ns[node] >= patience_s * NS_PER_S:
+                self.died(time_ns, node, how=f"not up again within run.join_timeout_s = {patience_s:g}")
+
     def _program_over(self, time_ns: int, node: str, kind: EventKind, details: dict[str, Any]) -> None:
         if self.presence.end(node):
             self.folder.event(time_ns, kind, node, **details)
@@ -660,6 +670,7 @@ class Emulation:
         # In real time SIGTERM ends a Zenoh program without its `finally` blocks; virtual time does the same.
         goes_hard = self.scenario.program.kind == "zenoh" and not self.scenario.has_gateways
         changes = self.presence.change(self._nodes_under(active, lambda fault: fault.ends), absent)
+        self._started_ns |= dict.fromkeys(changes.started, time_ns)
         for node in changes.stopped:
             self.engine.set_up(self.number[node], False)
             self.driving.release(time_ns, node)

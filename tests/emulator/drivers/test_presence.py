@@ -80,6 +80,8 @@ def test_a_program_that_is_down_does_not_end() -> None:
     presence.change({"v01"}, set())
     assert not presence.end("v01")
     assert presence.change(set(), set()).started == ["v01"]
+    assert presence.starting() == ["v01"] and presence.end("v01"), "but one that was started again may"
+    assert presence.has_ended("v01") and presence.come_up(["v01"]) == {}
 
 
 nodes = st.sets(st.sampled_from(IDS))
@@ -114,9 +116,9 @@ def test_in_any_course_of_events_what_is_said_is_what_is_so(
             came = presence.come_up(some)
             assert came.keys() <= some and all(presence.up[node] for node in came)
         else:
-            up = {node for node in IDS if presence.up[node]}
-            assert {node for node in some if presence.end(node)} == some & up
-            assert all(presence.has_ended(node) for node in ended | (some & up))
+            alive = {node for node in IDS if presence.up[node]} | {*presence.starting()}
+            assert {node for node in some if presence.end(node)} == some & alive
+            assert all(presence.has_ended(node) for node in ended | (some & alive))
         for node in IDS:
             assert presence.up[node] == (presence.state(node) is NodeState.UP)
             assert presence.is_outside(node) == (presence.state(node) in OUTSIDE)

@@ -174,6 +174,25 @@ def test_what_an_operator_does_late_makes_no_fault_miss_its_end() -> None:
     assert [a.paused for a in realtime.take_actions()] == [set()]
 
 
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_program_that_does_not_come_up_again_has_died(is_told: bool) -> None:
+    """Its process may end before it has said a word, or never say one."""
+    run = {"pacing": "realtime", "join_timeout_s": 0.5}
+    emulation = emulation_of(scenario_of([fault("kill", 0.5, 0.5)], "agents.beacon:main", run=run))
+    realtime = RealTime(emulation, [[node] for node in IDS])
+    realtime.start(0)
+    for time_ms in (500, 1000):
+        realtime.due(time_ms * MS)
+        realtime.take_actions()
+    if is_told:
+        realtime.died(1200 * MS, "v02", how="exit status 9")
+    realtime.finish()
+    (death,) = [event for event in emulation.folder.events if event.kind == "died"]
+    assert death.node == "v02" and death.details["how"] == (
+        "exit status 9" if is_told else "not up again within run.join_timeout_s = 0.5"
+    )
+
+
 def test_a_fault_that_programs_cannot_have_is_refused_as_it_is_injected() -> None:
     """Else nothing would come of it, and the scenario that the run leaves could not be read."""
     scenario = Scenario.model_validate({"run": {"pacing": "realtime"}, "program": {"kind": "zenoh"}})
