@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from contextlib import ExitStack, closing, suppress
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -155,6 +156,10 @@ def test_a_client_says_how_long_it_has_waited_for_a_router() -> None:
         pass
 
 
+MOST_LOOKS = 20_000
+"""Looks at the segments: for a second at least."""
+
+
 def segments() -> set[Path]:
     """The segments of shared memory that this process has open."""
     found = set()
@@ -177,4 +182,5 @@ def test_a_local_router_keeps_no_shared_memory_of_its_programs() -> None:
                 assert list(client.info.routers_zid()) == [router.zid()]
         del client, router
         gc.collect()
-    assert segments() == before
+    looks = takewhile(lambda _: segments() != before, range(MOST_LOOKS))  # Zenoh's threads end after `close`
+    assert len(list(looks)) < MOST_LOOKS
