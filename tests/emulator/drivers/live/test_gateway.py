@@ -455,7 +455,7 @@ def test_an_encrypted_private_key_is_named_and_no_password_is_asked_for(tmp_path
         (":secret", "line 1 is no user:password"),
         ("\n# users\ncar:secret", "line 2 is no user:password"),
         ("car:", "line 1 is no user:password"),
-        ("caf\xe9:secret", "cannot be read"),
+        ("tea\xe9:secret", "cannot be read"),
     ],
 )
 def test_a_file_that_has_not_user_and_password_in_each_line_is_named(
