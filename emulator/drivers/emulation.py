@@ -623,7 +623,7 @@ class Emulation:
         patience_s = self.scenario.run.join_timeout_s
         for node in self.presence.starting():
             if time_ns - self._started_ns[node] >= patience_s * NS_PER_S:
-                self.died(time_ns, node, how=f"not up again within run.join_timeout_s = {patience_s:g}")
+                self.died(time_ns, node, how=f"not up within run.join_timeout_s = {patience_s:g}")
 
     def _program_over(self, time_ns: int, node: str, kind: EventKind, details: dict[str, Any]) -> None:
         if self.presence.end(node):

@@ -71,5 +71,6 @@ def write_report(path: str, error: BaseException, status: object, place: str) ->
         "place": own_line(error) or place,
         "details": "".join(traceback.format_exception(type(error), error, error.__traceback__)),
     }
+    content = {name: text.encode(errors="backslashreplace").decode() for name, text in report.items()}
     with suppress(OSError):
-        Path(path).write_text(json.dumps(report))
+        Path(path).write_text(json.dumps(content))

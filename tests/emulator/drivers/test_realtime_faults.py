@@ -189,7 +189,7 @@ def test_a_program_that_does_not_come_up_again_has_died(is_told: bool) -> None:
     realtime.finish()
     (death,) = [event for event in emulation.folder.events if event.kind == "died"]
     assert death.node == "v02" and death.details["how"] == (
-        "exit status 9" if is_told else "not up again within run.join_timeout_s = 0.5"
+        "exit status 9" if is_told else "not up within run.join_timeout_s = 0.5"
     )
 
 

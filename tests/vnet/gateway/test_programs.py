@@ -502,7 +502,9 @@ def test_input_and_output_are_not_closed_by_a_program(drive: Drive) -> None:
     run = drive(
         """
         import os, sys, time
-        ends = [lambda: os.close(1), lambda: os.dup2(os.dup(0), 2), lambda: os.closerange(0, 9), sys.stdout.close]
+        os.dup2(os.dup(0), 99, False)
+        ends = [lambda: os.close(1), lambda: os.dup2(os.dup(0), fd2=2), lambda: os.closerange(0, 9)]
+        sys.stdout.close()
         for end in ends:
             try:
                 end()
@@ -514,7 +516,7 @@ def test_input_and_output_are_not_closed_by_a_program(drive: Drive) -> None:
             print(error)
         """,
     )
-    assert ["virtual time" in line for line in log(run)[:3]] == [True] * 3
+    assert ["virtual time" in line for line in log(run)[:3]] == [True] * 3, log(run)
     assert log(run)[3] == "Invalid value NaN (not a number)"
 
 

@@ -7,9 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from vnet.gateway import FAILURE, STARTUP
+from vnet.runtime.error_text import write_report
 from vnet.transport.authority import issue_certificates
 
 pytestmark = pytest.mark.slow
@@ -133,3 +135,10 @@ def test_no_other_end_is_a_failure_of_the_main_thread(
     monkeypatch.setenv(FAILURE, str(tmp_path / "failure"))
     assert start(code=f"import sys, threading, zenoh\n{ends}").returncode == 0
     assert not (tmp_path / "failure").exists()
+
+
+def test_a_failure_is_told_whatever_letters_it_has(tmp_path: Path) -> None:
+    """Names of files that are no UTF-8 have lone surrogates."""
+    write_report(str(tmp_path / "failure"), OSError("\udcff"), "\udcff", "a.py:1")
+    told = msgspec.json.decode((tmp_path / "failure").read_bytes(), type=dict[str, str])
+    assert told["error"] == "OSError: \\udcff" and "\\udcff" in told["details"]

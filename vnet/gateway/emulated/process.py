@@ -57,8 +57,8 @@ class OwnProcess:
             "_exit": self._exit,
             "abort": lambda: self._exit(-signal.SIGABRT),
             **{name: _refuse for name in vars(os) if name.startswith(("exec", "fork", "closerange"))},
-            "close": _but_of_all(os.close),
-            "dup2": _but_of_all(os.dup2),
+            "close": _close,
+            "dup2": _dup2,
         }
 
     def signal_functions(self) -> dict[str, Any]:
@@ -216,15 +216,20 @@ def _refuse(*args: object, **options: object) -> NoReturn:
     raise OSError(errno.ENOSYS, "not available on virtual time: the process has other vehicles, too")
 
 
-def _but_of_all(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that ends its last descriptor, but for input and output, which all vehicles have."""
+def _close(fd: int) -> None:
+    _refuse_to_end(fd)
+    os.close(fd)
 
-    def end(*descriptors: int, **options: Any) -> Any:
-        if descriptors[-1] in range(3):
-            _refuse()
-        return function(*descriptors, **options)
 
-    return end
+def _dup2(fd: int, fd2: int, inheritable: bool = True) -> int:
+    _refuse_to_end(fd2)
+    return os.dup2(fd, fd2, inheritable)
+
+
+def _refuse_to_end(fd: int) -> None:
+    """Raise OSError for input and output, which all vehicles have."""
+    if fd in range(3):
+        _refuse()
 
 
 _programs, _path_before = 0, ""
