@@ -45,6 +45,19 @@ SeedsOption = Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 … 
 DurationOption = Annotated[
     float, typer.Option(min=2, max=DAY_S, metavar="SECONDS", help="Emulated length of each run.")
 ]
+# How the map of recorded trips lies.
+MapSigmaOption = Annotated[
+    float, typer.Option(min=0, metavar="METRES", help="How far true lanes stray from the map's.")
+]
+MapAsideOption = Annotated[
+    float, typer.Option(metavar="METRES", help="How far right of the map's lanes vehicles drive.")
+]
+MapDatumOption = Annotated[
+    str | None, typer.Option(metavar="EAST,NORTH", help="How far the map is moved, in metres: vnet map datum.")
+]
+MapDatumSigmaOption = Annotated[
+    float, typer.Option(min=0, metavar="METRES", help="How far the whole map may still be shifted.")
+]
 
 
 @app.command()
@@ -187,18 +200,10 @@ def city(
         Path | None, typer.Option(metavar="FILE", help="How vehicles drive; through a generated city otherwise.")
     ] = None,
     roads: Annotated[Path | None, typer.Option("--map", metavar="FILE", help="The roads they drive on.")] = None,
-    map_sigma: Annotated[
-        float, typer.Option(min=0, metavar="METRES", help="How far true lanes stray from the map's.")
-    ] = 0.0,
-    map_aside: Annotated[
-        float, typer.Option(metavar="METRES", help="How far right of the map's lanes vehicles drive.")
-    ] = 0.0,
-    map_datum: Annotated[
-        str | None, typer.Option(metavar="EAST,NORTH", help="How far the map is moved, in metres: vnet map datum.")
-    ] = None,
-    map_datum_sigma: Annotated[
-        float, typer.Option(min=0, metavar="METRES", help="How far the whole map may still be shifted.")
-    ] = 0.0,
+    map_sigma: MapSigmaOption = 0.0,
+    map_aside: MapAsideOption = 0.0,
+    map_datum: MapDatumOption = None,
+    map_datum_sigma: MapDatumSigmaOption = 0.0,
     refuse_impossible: Annotated[
         bool, typer.Option("--refuse-impossible", metavar="", help="Refuse trips that no vehicle can drive.")
     ] = False,
@@ -213,9 +218,7 @@ def city(
 
     with one_line_errors():
         folder = _folder(out, "city")
-        section: dict[str, Any] = {"sigma_m": map_sigma, "aside_m": map_aside, "datum_sigma_m": map_datum_sigma}
-        if map_datum is not None:
-            section["datum_m"] = pair("--map-datum", map_datum)
+        section = _map_section(map_sigma, map_aside, map_datum, map_datum_sigma)
         place = study.place(trips, roads, section, "refuse" if refuse_impossible else "leave_out")
         for note in study.notes(place, duration):
             tell(note)
@@ -233,9 +236,10 @@ def city(
 def roads(
     trips: Annotated[Path | None, typer.Option(metavar="FILE", help="Recorded trips beside the cities.")] = None,
     roads: Annotated[Path | None, typer.Option("--map", metavar="FILE", help="The roads of the trips.")] = None,
-    map_sigma: Annotated[float, typer.Option(min=0, metavar="METRES", help="As of city, for the trips.")] = 0.0,
-    map_aside: Annotated[float, typer.Option(metavar="METRES", help="As of city, for the trips.")] = 0.0,
-    map_datum: Annotated[str | None, typer.Option(metavar="EAST,NORTH", help="As of city, for the trips.")] = None,
+    map_sigma: MapSigmaOption = 0.0,
+    map_aside: MapAsideOption = 0.0,
+    map_datum: MapDatumOption = None,
+    map_datum_sigma: MapDatumSigmaOption = 0.0,
     rate: Annotated[float, typer.Option(min=0.1, max=100, metavar="HZ", help="Fixes a second.")] = 10.0,
     seeds: SeedsOption = 3,
     duration: DurationOption = 300.0,
@@ -250,9 +254,7 @@ def roads(
         folder = _folder(out, "roads")
         places = study.cities(study.CITIES)
         if trips is not None or roads is not None:
-            section: dict[str, Any] = {"sigma_m": map_sigma, "aside_m": map_aside}
-            if map_datum is not None:
-                section["datum_m"] = pair("--map-datum", map_datum)
+            section = _map_section(map_sigma, map_aside, map_datum, map_datum_sigma)
             places["trips"] = driving.place(trips, roads, section)
         cells = study.roads_cells(places, range(1, seeds + 1), duration, rate)
         results = _run(cells, folder, "roads", only)
@@ -321,6 +323,12 @@ def capacity(
         path = run_capacity(seconds, range(1, seeds + 1), _folder(out, "capacity"))
         Console().print(Markdown(path.read_text()))
         print(path)
+
+
+def _map_section(sigma_m: float, aside_m: float, datum: str | None, datum_sigma_m: float) -> dict[str, Any]:
+    """Return the keys of `[map]` that the options of recorded trips set."""
+    section: dict[str, Any] = {"sigma_m": sigma_m, "aside_m": aside_m, "datum_sigma_m": datum_sigma_m}
+    return section if datum is None else section | {"datum_m": pair("--map-datum", datum)}
 
 
 def _folder(out: Path | None, name: str) -> Path:

@@ -18,6 +18,7 @@ from agents.cooperative.cmm.own_vehicle import OwnVehicle, own_vehicle
 from agents.cooperative.cmm.own_vehicle_on_map import OwnVehicleOnMap
 from agents.cooperative.cmm.rbpf import Observation
 from agents.cooperative.options import Options
+from agents.cooperative.program import map_shift_m2
 from emulator.cells.cells import Cell
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.scenario import Scenario
@@ -41,13 +42,14 @@ class OneFilter:
 
     def __init__(self, world: World, options: Options) -> None:
         self._world, self._options = world, options
+        self._shift_m2 = map_shift_m2(world.lane_map)
         self._own: dict[int, OwnVehicle | OwnVehicleOnMap] = {}
         self._rng = np.random.default_rng(0)
         self._noise_m2 = world.fix(0, int(np.flatnonzero(world.present(0))[0])).covariance_m2
         self._belief: Information | None = None
 
     def step(self, dt_s: float, instant: Instant) -> tuple[Array, Array, Array]:
-        """Take the fixes of an instant; return c (2,), its covariance (2, 2), and positions (N, 2)."""
+        """Take the fixes of an instant; return c (2,), its stated covariance (2, 2), and positions (N, 2)."""
         present = np.flatnonzero(np.isfinite(instant.fix_m[:, 0])).tolist()
         for gone in set(self._own) - set(present):
             del self._own[gone]
@@ -68,7 +70,8 @@ class OneFilter:
             found = own.position_m()
             position_m[number] = instant.fix_m[number] - own.estimate_m if found is None else found[0]
         self._belief = pooled
-        return *pooled.moments(), position_m
+        common_m, covariance_m2 = pooled.moments()
+        return common_m, covariance_m2 + self._shift_m2, position_m
 
     def _fix(self, instant: Instant, number: int) -> Observation:
         heading_rad = float(instant.fix_heading_rad[number])

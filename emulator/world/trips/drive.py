@@ -1,7 +1,7 @@
 """Trips of a scenario, from files (which are written as well), SUMO, a city, or a function of the user's own.
 
 Tables (CSV, Parquet) have the columns id, time_s and x_m, y_m or lat_deg, lon_deg; `heading_rad` and `speed_mps`
-are optional, and others are ignored. Files are read in batches.
+are optional, and not known of a vehicle with a NaN there; others are ignored. Files are read in batches.
 
 In SUMO's floating car data (`--fcd-output`) an element `timestep` with `time` holds elements `vehicle` with `id`,
 `x`, `y`, `angle` (degrees clockwise from north) and `speed`. Positions are metres of SUMO's network, or degrees

@@ -131,7 +131,8 @@ class Samples:
         """
         self.taken += len(line)
         for name, values in columns.items():
-            wrong = np.flatnonzero(~(np.abs(values) <= _BOUND[name]))  # NaN is in no range
+            is_wrong = ~(np.abs(values) <= _BOUND[name])  # NaN is in no range
+            wrong = np.flatnonzero(is_wrong & ~np.isnan(values) if name in OPTIONAL else is_wrong)
             if len(wrong):
                 needed = f"a finite number is needed, within ±{_BOUND[name]:g}"
                 raise self._problem(line[wrong[0]], f"{name} = {values[wrong[0]]:g}: {needed}")
@@ -222,7 +223,8 @@ class Samples:
         names = self._node_ids()
         trips = []
         for rows in np.split(order, np.flatnonzero(np.diff(code)) + 1):
-            known = {name: columns[name][rows] for name in OPTIONAL if name in columns}
+            optional = {name: columns[name][rows] for name in OPTIONAL if name in columns}
+            known = {name: values for name, values in optional.items() if not np.isnan(values).any()}
             name = names[int(columns["code"][rows[0]])]
             trips.append(Trip(name, columns["time_s"][rows], position_m[rows], **known))
         return trips

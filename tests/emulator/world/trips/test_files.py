@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from emulator.scenario.scenario import Scenario
 from emulator.world.trips import motion as samples_module
-from emulator.world.trips.drive import READERS
-from emulator.world.trips.motion import Samples, Trip
+from emulator.world.trips.drive import READERS, write_trips
+from emulator.world.trips.motion import Motion, Samples, Trip
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError
 
@@ -87,6 +87,17 @@ def test_parquet_says_what_csv_says_and_ids_may_be_numbers(tmp_path: Path) -> No
     for name in ("7", "8"):
         assert np.array_equal(trips[name].position_m, same[name].position_m)
         assert np.array_equal(trips[name].time_s, same[name].time_s)
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_what_is_written_is_read_again_though_a_vehicle_never_moves(tmp_path: Path, name: str) -> None:
+    position_m = np.array([[[0.0, 0.0], [9.0, 9.0]], [[3.0, 4.0], [9.0, 9.0]]])
+    heading_rad = np.array([[0.5, math.nan], [0.5, math.nan]])
+    write_trips(Motion(("a", "b"), position_m, heading_rad), tmp_path / name, 2.0)
+    trips = read(tmp_path / name)
+    assert trips["a"].position_m.tolist() == [[0, 0], [3, 4]] and trips["a"].time_s.tolist() == [0, 0.5]
+    assert trips["a"].heading_rad is not None and trips["a"].heading_rad.tolist() == [0.5, 0.5]
+    assert trips["b"].position_m.tolist() == [[9, 9], [9, 9]] and trips["b"].heading_rad is None
 
 
 def test_the_same_sample_twice_counts_once(tmp_path: Path) -> None:
