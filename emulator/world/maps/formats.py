@@ -4,10 +4,12 @@ GeoJSON (RFC 7946, always WGS-84) has maps as lines, read and written. Propertie
 `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`; or, without `class`, OpenStreetMap's `highway`
 and its other tags. Features that are not lines are skipped and counted.
 
-A NumPy archive (NPZ) has nodes and directed edges, read and written. `edges` (E, 2) are node numbers from 0. Nodes
-are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m` and `node_y_m` (N,), whose projection `frame_proj` and
-`frame_offset_m` may state. Optional for each edge (E,): `edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A
-road with lanes in both directions is two edges.
+A NumPy archive (NPZ) has nodes, and directed edges or roads. Nodes are `node_lon_deg` and `node_lat_deg` (N,), or
+`node_x_m` and `node_y_m` (N,), whose projection `frame_proj` and `frame_offset_m` may state. `edges` (E, 2) are
+node numbers from 0. Optional for each edge (E,): `edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road
+with lanes in both directions is two edges. Roads, which are written, are the arrays of `Roads`: `road_node`,
+`road_first`, `road_forward`, `road_backward`, `road_lane_width_m`, `road_one_way`; optional are `road_class` and
+`road_name`.
 
 SUMO's networks (.net.xml) have the lanes that passenger cars may use, each as a road of its own; other files have
 polygons. They are read by expat as a stream, within bounds. SUMO's own reader (sumolib) cannot name lines in its
@@ -66,6 +68,10 @@ LARGEST_ARRAY_BYTES = 16 * MAX_POINTS
 """Largest array that is read: two 8-byte numbers a point."""
 _NODES = ("node_lon_deg", "node_lat_deg", "node_x_m", "node_y_m")
 _EDGES = ("edges", "edge_class", "edge_lanes", "edge_lane_width_m")
+_ROADS = (
+    *("road_node", "road_first", "road_name", "road_class", "road_forward", "road_backward"),
+    *("road_lane_width_m", "road_one_way"),
+)
 _FRAME = ("frame_proj", "frame_offset_m")
 
 Arrays = dict[str, NDArray[np.generic]]
@@ -227,16 +233,49 @@ def write_geojson(roads: Roads, path: Path) -> None:
 def read_graph(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
     """Read roads; without `origin_deg` the origin is their centre, or the file's own if it is in metres.
 
-    Edges with the same attributes that meet at a node without other edges become one road. Raise ScenarioError,
-    naming the array and the entry, for a bad file.
+    Edges between the same nodes become one road, and so do those with the same attributes that meet at a node
+    without other edges. Raise ScenarioError, naming the array and the entry, for a bad file.
     """
-    arrays = read_arrays(path, (*_NODES, *_EDGES, *_FRAME), LARGEST_ARRAY_BYTES)
-    if "node_lon_deg" in arrays:
+    arrays = read_arrays(path, (*_NODES, *_EDGES, *_ROADS, *_FRAME), LARGEST_ARRAY_BYTES)
+    frame: CoordinateFrame | None
+    if in_degrees := "node_lon_deg" in arrays:
         frame, node_m = project(path, *_degrees(path, arrays), origin_deg, "node {}".format)
-        return _Merger(path, node_m, _edges(path, arrays, len(node_m)), frame).roads()
-    node_m = _metres(path, arrays)
-    edges = _edges(path, arrays, len(node_m))
-    return _Merger(path, node_m, edges, _frame(path, arrays)).roads().around(path, origin_deg)
+    else:
+        frame, node_m = _frame(path, arrays), _metres(path, arrays)
+    if "road_node" in arrays:
+        roads = _roads(path, arrays, node_m, frame)
+    else:
+        roads = _Merger(path, node_m, _edges(path, arrays, len(node_m)), frame).roads()
+    return roads if in_degrees else roads.around(path, origin_deg)
+
+
+def _roads(path: Path, arrays: Arrays, node_m: Array, frame: CoordinateFrame | None) -> Roads:
+    node = _whole(path, arrays, "road_node", None, 0, len(node_m) - 1)
+    first = _whole(path, arrays, "road_first", None, 0, len(node))
+    if first[:1].tolist() != [0] or first[-1] != len(node) or (np.diff(first) < 2).any():
+        raise ScenarioError(f"{path}: road_first: 0 to {len(node)} in steps of 2 or more are needed")
+    count = len(first) - 1
+    forward, backward = (
+        _whole(path, arrays, name, count, 0, MAX_LANES) for name in ("road_forward", "road_backward")
+    )
+    if not (forward + backward).all():
+        raise ScenarioError(f"{path}: road_forward[{int(np.argmin(forward + backward))}]: a road without lanes")
+    check_extent(path, node_m, count, "node {}".format)
+    numbered = np.char.add("road ", np.arange(count).astype(str))
+    return Roads(
+        node_m=node_m,
+        node=node,
+        first=first,
+        name=tuple(
+            _texts(path, arrays, "road_name", count).tolist() if "road_name" in arrays else numbered.tolist()
+        ),
+        kind=_kinds(path, arrays, "road_class", count),
+        forward=forward,
+        backward=backward,
+        lane_width_m=_within(path, arrays, "road_lane_width_m", count, MIN_LANE_WIDTH_M, MAX_LANE_WIDTH_M),
+        one_way=_whole(path, arrays, "road_one_way", count, 0, 1).astype(np.bool_),
+        frame=frame,
+    )
 
 
 def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) -> Array:
@@ -305,12 +344,12 @@ def _edges(path: Path, arrays: Arrays, nodes: int) -> _Edges:
         at = int(np.argmax(missing.any(axis=1)))
         which = ends[at][missing[at]][0]
         raise ScenarioError(f"{path}: edges[{at}]: node {which} does not exist; nodes are 0 to {nodes - 1}")
-    kind = _kinds(path, arrays, len(ends))
+    kind = _kinds(path, arrays, "edge_class", len(ends))
     lanes, width_m = LANES[kind], LANE_WIDTH_M[kind]
     if "edge_class" not in arrays:
         lanes = np.ones(len(ends), dtype=np.intp)
     if "edge_lanes" in arrays:
-        lanes = _within(path, arrays, "edge_lanes", len(ends), 1, MAX_LANES).astype(np.intp)
+        lanes = _whole(path, arrays, "edge_lanes", len(ends), 1, MAX_LANES)
     if "edge_lane_width_m" in arrays:
         width_m = _within(path, arrays, "edge_lane_width_m", len(ends), MIN_LANE_WIDTH_M, MAX_LANE_WIDTH_M)
     return _Edges(ends.astype(np.intp), kind, lanes, width_m)
@@ -325,20 +364,32 @@ def _within(path: Path, arrays: Arrays, name: str, count: int | None, least: flo
     return numbers
 
 
-def _kinds(path: Path, arrays: Arrays, count: int) -> Ints:
-    if "edge_class" not in arrays:
-        return np.full(count, UNKNOWN)
-    names = arrays["edge_class"]
-    if names.shape != (count,) or names.dtype.kind != "U":
+def _whole(path: Path, arrays: Arrays, name: str, count: int | None, least: int, most: int) -> Ints:
+    numbers = _within(path, arrays, name, count, least, most)
+    if (odd := numbers != np.rint(numbers)).any():
+        at = int(np.argmax(odd))
+        raise ScenarioError(f"{path}: {name}[{at}] = {numbers[at]:g}: a whole number is needed")
+    return numbers.astype(np.intp)
+
+
+def _texts(path: Path, arrays: Arrays, name: str, count: int) -> NDArray[Any]:
+    texts = arrays[name]
+    if texts.shape != (count,) or texts.dtype.kind != "U":
         raise ScenarioError(
-            f"{path}: edge_class: texts of shape ({count},) are needed, not {names.dtype} {names.shape}"
+            f"{path}: {name}: texts of shape ({count},) are needed, not {texts.dtype} {texts.shape}"
         )
-    distinct, which = np.unique(names, return_inverse=True)
-    for at, name in enumerate(distinct.tolist()):
-        if name not in NUMBER:
-            edge = int(np.argmax(which == at))
-            raise ScenarioError(f"{path}: edge_class[{edge}] = {shown(name)}: allowed are {', '.join(NAMES)}")
-    return np.array([NUMBER[name] for name in distinct.tolist()], dtype=np.intp)[which]
+    return texts
+
+
+def _kinds(path: Path, arrays: Arrays, name: str, count: int) -> Ints:
+    if name not in arrays:
+        return np.full(count, UNKNOWN)
+    distinct, which = np.unique(_texts(path, arrays, name, count), return_inverse=True)
+    for at, kind in enumerate(distinct.tolist()):
+        if kind not in NUMBER:
+            row = int(np.argmax(which == at))
+            raise ScenarioError(f"{path}: {name}[{row}] = {shown(kind)}: allowed are {', '.join(NAMES)}")
+    return np.array([NUMBER[kind] for kind in distinct.tolist()], dtype=np.intp)[which]
 
 
 class _Merger:
@@ -445,20 +496,20 @@ class _Merger:
 
 def write_graph(roads: Roads, path: Path) -> None:
     """Write an NPZ in metres, as `read_graph` reads it. Raise OSError if it cannot be written."""
-    start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
-    road = roads.road_of[roads.segment]
-    ahead, back = roads.forward[road] > 0, roads.backward[road] > 0
-    edge_road = np.concatenate([road[ahead], road[back]])
-    arrays = {
+    arrays: dict[str, Any] = {
         "node_x_m": roads.node_m[:, 0],
         "node_y_m": roads.node_m[:, 1],
-        "edges": np.concatenate([np.column_stack([start, end])[ahead], np.column_stack([end, start])[back]]).astype(
-            np.int32
-        ),
-        "edge_class": np.array(NAMES)[roads.kind[edge_road]],
-        "edge_lanes": np.concatenate([roads.forward[road[ahead]], roads.backward[road[back]]]).astype(np.uint8),
-        "edge_lane_width_m": roads.lane_width_m[edge_road],
+        "road_node": roads.node.astype(np.int32),
+        "road_first": roads.first.astype(np.int32),
+        "road_class": np.array(NAMES)[roads.kind],
+        "road_forward": roads.forward.astype(np.uint8),
+        "road_backward": roads.backward.astype(np.uint8),
+        "road_lane_width_m": roads.lane_width_m,
+        "road_one_way": roads.one_way.astype(np.uint8),
     }
+    names = np.array(roads.name)
+    if names.nbytes <= LARGEST_ARRAY_BYTES:
+        arrays["road_name"] = names
     if roads.frame is not None:
         arrays["frame_proj"] = np.array(roads.frame.proj)
         arrays["frame_offset_m"] = np.array(roads.frame.offset_m)

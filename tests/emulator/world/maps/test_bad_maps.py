@@ -5,6 +5,7 @@ import zipfile
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,7 +134,39 @@ def test_an_origin_for_a_network_that_does_not_say_where_it_is(tmp_path: Path) -
     assert said == "states no projection of its metres; leave out the origin"
 
 
-# Nodes and edges.
+# Nodes, and edges or roads.
+
+
+@pytest.mark.parametrize(
+    ("array", "values", "said"),
+    [
+        ("road_node", [0, 1, 9, 2], "road_node[2] = 9: 0 to 3 allowed"),
+        ("road_node", [0, 1.5, 1, 2], "road_node[1] = 1.5: a whole number is needed"),
+        ("road_first", [0, 1, 4], "road_first: 0 to 4 in steps of 2 or more are needed"),
+        ("road_first", [], "road_first: 0 to 4 in steps of 2 or more are needed"),
+        ("road_first", [0, 2], "road_first: 0 to 4 in steps of 2 or more are needed"),
+        ("road_backward", [0, 0], "road_forward[1]: a road without lanes"),
+        ("road_class", ["primary", "path"], "road_class[1] = 'path': allowed are "),
+        ("road_name", [1, 2], "road_name: texts of shape (2,) are needed"),
+        ("road_one_way", None, "no array 'road_one_way'"),
+    ],
+)
+def test_roads_that_cannot_be(tmp_path: Path, array: str, values: list[object] | None, said: str) -> None:
+    arrays: dict[str, Any] = {
+        "node_x_m": [0.0, 100.0, 100.0, 50.0],
+        "node_y_m": [0.0, 0.0, 90.0, 50.0],
+        "road_node": [0, 1, 1, 2],
+        "road_first": [0, 2, 4],
+        "road_forward": [1, 0],
+        "road_backward": [0, 1],
+        "road_lane_width_m": [3.5, 3.5],
+        "road_one_way": [0, 1],
+    }
+    np.savez(tmp_path / "town.npz", **arrays)
+    assert read_roads(tmp_path / "town.npz").name == ("road 0", "road 1")
+    changed = {name: rows for name, rows in {**arrays, array: values}.items() if rows is not None}
+    np.savez(tmp_path / "town.npz", **changed)
+    assert refusal(tmp_path / "town.npz").startswith(said)
 
 
 def claims_much(file: zipfile.ZipFile) -> None:
