@@ -267,21 +267,23 @@ class Sidelink(Mac):
         if grant is not None and grant.length < length:
             station.booked.discard(grant.slot)
             flow.grant = grant = None
-        if self._is_dynamic:
-            self._send_alone(flow, sent, slot, length)
+        if self._is_dynamic or self._is_one_shot(flow, frame):
+            if grant is not None:
+                grant.skips += 1
+            self._send_alone(flow, sent, slot)
         elif grant is None:
             flow.queue.append((slot, sent))
-            self._reserve(flow, slot)
-        elif self._is_one_shot(flow, frame):
-            grant.skips += 1
-            self._send_alone(flow, sent, slot, length)
+            self._reserve(flow)
         else:
             late = max(0, -(-(slot + self._mac.t1_slots - grant.slot) // grant.period))
-            turn = grant.slot + grant.period * max(late, len(flow.queue) + grant.skips)
-            if turn > slot + self._t2_slots:
-                self._send_alone(flow, sent, slot, length)
+            if self._is_late(grant, max(late, len(flow.queue) + grant.skips), slot):
+                self._send_alone(flow, sent, slot)
             else:
                 flow.queue.append((slot, sent))
+
+    def _is_late(self, grant: _Grant, turn: int, ready: int) -> bool:
+        """Return true if a frame that was ready in a slot would wait beyond its selection window for its turn."""
+        return grant.slot + grant.period * turn > ready + self._t2_slots
 
     def _is_one_shot(self, flow: _Flow, frame: Frame) -> bool:
         """Return true if it is time to send one frame elsewhere, which a persistent collision cannot reach."""
@@ -304,13 +306,13 @@ class Sidelink(Mac):
             period_ms = min(self._mac.periods_ms, key=lambda each: (abs(each - mean_ms), each))
         return period_ms * NS_PER_MS // self._slot_ns
 
-    def _reserve(self, flow: _Flow, slot: int) -> None:
-        """Select a resource in `slot` for the frames that wait, and for those to come."""
-        frame = flow.queue[0][1].frame
+    def _reserve(self, flow: _Flow) -> None:
+        """Select a resource for the frames that wait, and for those to come."""
+        slot, ready, frame = self._now_ns // self._slot_ns, flow.queue[0][0], flow.queue[0][1].frame
         length = self._link.length(max(sent.frame.size_bytes for _, sent in flow.queue))
         period = self._period(flow, frame)
         counter = self._counter(frame, period)
-        last = slot + max(self._mac.t1_slots, min(self._t2_slots, period))
+        last = max(slot + self._mac.t1_slots, min(ready + self._t2_slots, slot + period))
         wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, period, 10 * counter)
         found = self._candidates(flow.station, frame, wanted)
         if not found.mask.any():
@@ -319,8 +321,15 @@ class Sidelink(Mac):
                 self._leave(flow.queue.popleft()[1], Outcome.no_grant, self._now_ns)
             return
         first, subchannel, repeat = self._choose(found, frame, _CHOICE)
-        flow.grant = _Grant(first, subchannel, length, period, counter, repeat)
+        flow.grant = grant = _Grant(first, subchannel, length, period, counter, repeat)
         self._book(self._use_of(flow, last), checks=True)
+        waiting = [*flow.queue]
+        flow.queue.clear()
+        for ready, sent in waiting:
+            if flow.queue and self._is_late(grant, len(flow.queue), ready):
+                self._send_alone(flow, sent, ready)
+            else:
+                flow.queue.append((ready, sent))
 
     def _counter(self, frame: Frame, period: int) -> int:
         least, most = self._mac.counters(period * self._slot_ns // NS_PER_MS)
@@ -341,11 +350,13 @@ class Sidelink(Mac):
             last=last,
         )
 
-    def _send_alone(self, flow: _Flow, sent: Transmission, slot: int, length: int) -> None:
-        """Select a resource for one frame."""
+    def _send_alone(self, flow: _Flow, sent: Transmission, ready: int) -> None:
+        """Select a resource for one frame that was ready in a slot."""
         flow.station.frames -= 1
-        last = slot + self._t2_slots
-        wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, 0, 1)
+        length = self._link.length(sent.frame.size_bytes)
+        first = self._now_ns // self._slot_ns + self._mac.t1_slots
+        last = max(first, ready + self._t2_slots)
+        wanted = Wanted(flow.station.node, first, last, length, 0, 1)
         found = self._candidates(flow.station, sent.frame, wanted)
         if not found.mask.any():
             self._leave(sent, Outcome.no_grant, self._now_ns)
@@ -472,7 +483,7 @@ class Sidelink(Mac):
             return
         flow.grant, booking.period = None, 0
         if flow.queue:
-            self._reserve(flow, self._now_ns // self._slot_ns)
+            self._reserve(flow)
 
     def _give_up(self, booking: _Booking) -> None:
         """Drop a frame that may not be sent."""

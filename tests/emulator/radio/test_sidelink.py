@@ -1,7 +1,7 @@
 """Sidelinks: laws of the MAC, outcomes in their order, and exact probabilities of small grids."""
 
 from collections import Counter
-from itertools import pairwise, product
+from itertools import groupby, pairwise, product
 from math import sqrt
 from typing import Any
 
@@ -253,11 +253,40 @@ def test_a_frame_that_would_wait_longer_than_t2_has_a_resource_of_its_own(radio:
 
 
 @pytest.mark.slow
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from([0, 2, 30, 150]), st.sampled_from([50, 300, 500])), min_size=2, max_size=40),
+    st.sampled_from([LTE, NR]),
+    st.sampled_from([20, 100]),
+    st.sampled_from([0, 20, 100, 1000]),
+)
+def test_no_frame_waits_beyond_its_window_whatever_the_others_size(
+    frames: list[tuple[int, int]], radio: dict[str, Any], t2_ms: int, period_ms: int
+) -> None:
+    subject, time_ms = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, t2_ms=t2_ms)), 0
+    for gap_ms, size in frames:
+        time_ms += gap_ms
+        subject.advance(time_ms * MS)
+        subject.transmit(time_ms * MS, 0, [SentFrame("", bytes(size), period_ms=period_ms)])
+    subject.drain()
+    for row in subject.trace.to_table().to_pylist():
+        assert row["outcome"] in ("delivered", "queue_full", "no_grant")
+        if row["left_ns"] is not None:
+            assert row["left_ns"] - row["sent_ns"] <= (t2_ms + 2) * MS
+
+
+@pytest.mark.slow
 def test_one_shots_leave_the_reservation_now_and_then() -> None:
     rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True, keep_probability=0.8)), 1, 20.0)
     phases = Counter(row["on_air_ns"] % (100 * MS) for row in rows)
     elsewhere = sum(1 for count in phases.values() if count <= 2)
     assert 200 / 6 - 10 <= elsewhere <= 200 / 2
+    rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True)), 1, 60.0)
+    phase = [row["on_air_ns"] % (100 * MS) for row in rows]
+    is_shot = (at not in (before, after) for before, at, after in zip(phase, phase[1:], phase[2:], strict=False))
+    assert max(len(list(run)) for is_one, run in groupby(is_shot) if not is_one) == 5, (
+        "the sixth is one at the latest"
+    )
 
 
 # Outcomes.
