@@ -60,6 +60,8 @@ LARGEST_GEOJSON_BYTES = 512 * 2**20
 """Largest file that is read."""
 _WGS84_NAMES = ("CRS84", "EPSG::4326", "EPSG:4326")
 """Parts of the names of WGS-84 as a coordinate reference system."""
+_DIRECTIONS = {"yes": 1, "true": 1, "1": 1, "no": 0, "false": 0, "0": 0, "-1": -1, "reverse": -1}
+"""Values of `oneway`: along the line, in both directions, and against it."""
 _SAME_DIGITS = 7
 """Decimals of a degree to which equal points agree (1 cm)."""
 _DIGITS = 9
@@ -169,7 +171,10 @@ def _own_street(where: str, properties: dict[str, Any]) -> Street:
     kind = NUMBER.get(name) if isinstance(name, str) else None
     if kind is None:
         raise ScenarioError(f"{where}: class = {shown(name)}: allowed are {', '.join(NAMES)}")
-    one_way = properties.get("oneway") in (True, 1, "yes", "true", "1")
+    stated = properties.get("oneway") or "no"
+    if (direction := _DIRECTIONS.get(str(stated).lower())) is None:
+        raise ScenarioError(f"{where}: oneway = {shown(stated)}: allowed are {', '.join(_DIRECTIONS)}")
+    one_way = direction != 0
     usual = CLASSES[NAMES[kind]].lanes
     lanes = [
         _number(where, properties, "lanes_forward", usual, 0, MAX_LANES),
@@ -177,9 +182,13 @@ def _own_street(where: str, properties: dict[str, Any]) -> Street:
     ]
     if not any(lanes) or any(count % 1 for count in lanes):
         raise ScenarioError(f"{where}: lanes_forward, lanes_backward = {lanes}: integers, not both 0, are needed")
+    if one_way and lanes[1]:
+        raise ScenarioError(
+            f"{where}: oneway = {shown(stated)} with lanes_backward = {lanes[1]}: one of them is wrong"
+        )
     usual_m = float(LANE_WIDTH_M[kind])
     width_m = _number(where, properties, "lane_width_m", usual_m, MIN_LANE_WIDTH_M, MAX_LANE_WIDTH_M)
-    return Street(kind, (int(lanes[0]), int(lanes[1])), float(width_m), False)
+    return Street(kind, (int(lanes[0]), int(lanes[1])), float(width_m), direction < 0)
 
 
 def _number(where: str, properties: dict[str, Any], key: str, usual: float, least: float, most: float) -> float:
