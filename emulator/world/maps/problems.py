@@ -7,8 +7,8 @@ heading, with normal n and n·p = offset, leaves the residual r = n·q − offse
     r = aside + n·datum + e
 
 is fitted by least squares with weights that fall to 0 at 4.7 deviations (Tukey's biweight): a vehicle on a
-road that the map does not have says nothing. Residuals are alike within some 500 m, so that standard errors count
-squares of that side.
+road that the map does not have says nothing. Residuals are alike within some 500 m, and where one person drives:
+the standard error is the larger of what squares of that side tell and what a fit without each vehicle in turn does.
 """
 
 from __future__ import annotations
@@ -112,27 +112,47 @@ def calibrate(found: Residuals) -> Calibration:
         raise ScenarioError(
             f"vehicles drive on its lanes in {places} squares of {PLACE_M:g} m: at least {MIN_PLACES} are needed"
         )
+    fit = _fit(found)
+    # Sums over each square are independent; residuals in it are not (White 1980, by clusters).
+    score = np.zeros((places, 3))
+    np.add.at(score, index.ravel(), fit.weighted * fit.off_m[:, None])
+    variance_m2 = np.diag(fit.inverse @ score.T @ score @ fit.inverse)[1:]
+    vehicles = np.unique(found.vehicle)
+    if len(vehicles) > 1:  # the jackknife
+        without = [_fit(found.of(np.arange(vehicles[-1] + 1) != vehicle)).found_m[1:] for vehicle in vehicles]
+        variance_m2 = np.maximum(variance_m2, (len(vehicles) - 1) * np.var(without, axis=0))
+    return Calibration(
+        datum_m=fit.found_m[1:],
+        error_m=np.sqrt(variance_m2),
+        aside_m=float(fit.found_m[0]),
+        sigma_m=fit.scale_m,
+        places=places,
+        samples=len(found.metres),
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A fit: its coefficients (3,), weighted regressors (n, 3), what is left (n,), and the inverse normal matrix."""
+
+    found_m: Array
+    weighted: Array
+    off_m: Array
+    inverse: Array
+    scale_m: float
+
+
+def _fit(found: Residuals) -> _Fit:
     regressors = np.column_stack([np.ones(len(found.metres)), found.normal])
     weight = np.ones(len(found.metres))
     for _ in range(ROUNDS):
         weighted = regressors * weight[:, None]
         inverse = np.linalg.pinv(weighted.T @ regressors)
-        fit = inverse @ weighted.T @ found.metres
-        off_m = found.metres - regressors @ fit
+        found_m = inverse @ weighted.T @ found.metres
+        off_m = found.metres - regressors @ found_m
         scale_m = NORMAL_MAD * float(np.median(np.abs(off_m))) + 1e-9
         weight = np.maximum(0.0, 1 - (off_m / (BIWEIGHT * scale_m)) ** 2) ** 2
-    # Sums over each square are independent; residuals in it are not (White 1980, by clusters).
-    score = np.zeros((places, 3))
-    np.add.at(score, index.ravel(), weighted * off_m[:, None])
-    covariance = inverse @ score.T @ score @ inverse
-    return Calibration(
-        datum_m=fit[1:],
-        error_m=np.sqrt(np.diag(covariance)[1:]),
-        aside_m=float(fit[0]),
-        sigma_m=scale_m,
-        places=places,
-        samples=len(found.metres),
-    )
+    return _Fit(found_m, weighted, off_m, np.asarray(inverse), scale_m)
 
 
 def moved(lanes: RoadMap, east_north_m: tuple[float, float] | Array) -> RoadMap:

@@ -42,6 +42,18 @@ def test_a_third_of_the_vehicles_on_roads_of_their_own_do_not_count(drive: tuple
 
 
 @pytest.mark.slow
+def test_whoever_strays_all_along_makes_the_shift_less_sure(drive: tuple[RoadMap, Motion]) -> None:
+    lanes, motion = drive
+    rng, squares = np.random.default_rng(1), []
+    for _ in range(5):
+        off_m = rng.normal(0, 1.0, (len(motion.node_ids), 2))
+        strayed = Motion(motion.node_ids, motion.position_m + off_m, motion.heading_rad)
+        found = calibrate(residuals(lanes, strayed))
+        squares.append((found.datum_m / found.error_m) ** 2)
+    assert 0.3 < np.mean(squares) < 4
+
+
+@pytest.mark.slow
 def test_too_few_places_are_refused(drive: tuple[RoadMap, Motion]) -> None:
     lanes, motion = drive
     found = residuals(lanes, motion)
