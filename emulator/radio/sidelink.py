@@ -70,8 +70,8 @@ DECISION, READY, CHECK = range(3)
 class _Grant:
     """A reservation: `length` subchannels every `period` slots, next in `slot`, for `counter` more frames.
 
-    `repeat` is the resource of the second transmission: slots after the first, and subchannel. Of the next
-    reservations `skips` are left alone, because their frames were sent elsewhere.
+    `repeat` is the resource of the second transmission: slots after the first, and subchannel. `unused` are the
+    reservations in succession that no frame has used.
     """
 
     slot: int
@@ -81,7 +81,6 @@ class _Grant:
     counter: int
     repeat: tuple[int, int] | None
     unused: int = 0
-    skips: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -110,11 +109,12 @@ class _Station:
 class _Flow:
     """Frames of one period of a sender: those that wait with the slots in which they became ready, and their grant.
 
-    `sent_ns` are the last times at which frames came.
+    None waits for the reservation of a frame that was sent elsewhere. `sent_ns` are the last times at which frames
+    came.
     """
 
     station: _Station
-    queue: deque[tuple[int, Transmission]] = field(default_factory=deque)
+    queue: deque[tuple[int, Transmission | None]] = field(default_factory=deque)
     grant: _Grant | None = None
     sent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS + 1))
     until_shot: int = 0
@@ -267,19 +267,21 @@ class Sidelink(Mac):
         if grant is not None and grant.length < length:
             station.booked.discard(grant.slot)
             flow.grant = grant = None
-        if self._is_dynamic or self._is_one_shot(flow, frame):
-            if grant is not None:
-                grant.skips += 1
+        if self._is_dynamic:
             self._send_alone(flow, sent, slot)
-        elif grant is None:
+            return
+        is_alone = self._is_one_shot(flow, frame)
+        if grant is not None:
+            late = max(0, -(-(slot + self._mac.t1_slots - grant.slot) // grant.period))
+            if self._is_late(grant, max(late, len(flow.queue)), slot):
+                is_alone = True
+            else:
+                flow.queue.append((slot, None if is_alone else sent))
+        elif not is_alone:
             flow.queue.append((slot, sent))
             self._reserve(flow)
-        else:
-            late = max(0, -(-(slot + self._mac.t1_slots - grant.slot) // grant.period))
-            if self._is_late(grant, max(late, len(flow.queue) + grant.skips), slot):
-                self._send_alone(flow, sent, slot)
-            else:
-                flow.queue.append((slot, sent))
+        if is_alone:
+            self._send_alone(flow, sent, slot)
 
     def _is_late(self, grant: _Grant, turn: int, ready: int) -> bool:
         """Return true if a frame that was ready in a slot would wait beyond its selection window for its turn."""
@@ -308,23 +310,26 @@ class Sidelink(Mac):
 
     def _reserve(self, flow: _Flow) -> None:
         """Select a resource for the frames that wait, and for those to come."""
-        slot, ready, frame = self._now_ns // self._slot_ns, flow.queue[0][0], flow.queue[0][1].frame
-        length = self._link.length(max(sent.frame.size_bytes for _, sent in flow.queue))
+        waiting = [(ready, sent) for ready, sent in flow.queue if sent is not None]
+        flow.queue.clear()
+        if not waiting:
+            return
+        slot, (ready, first_sent) = self._now_ns // self._slot_ns, waiting[0]
+        frame = first_sent.frame
+        length = self._link.length(max(sent.frame.size_bytes for _, sent in waiting))
         period = self._period(flow, frame)
         counter = self._counter(frame, period)
         last = max(slot + self._mac.t1_slots, min(ready + self._t2_slots, slot + period))
         wanted = Wanted(flow.station.node, slot + self._mac.t1_slots, last, length, period, 10 * counter)
         found = self._candidates(flow.station, frame, wanted)
         if not found.mask.any():
-            flow.station.frames -= len(flow.queue)
-            while flow.queue:
-                self._leave(flow.queue.popleft()[1], Outcome.no_grant, self._now_ns)
+            flow.station.frames -= len(waiting)
+            for _, sent in waiting:
+                self._leave(sent, Outcome.no_grant, self._now_ns)
             return
         first, subchannel, repeat = self._choose(found, frame, _CHOICE)
         flow.grant = grant = _Grant(first, subchannel, length, period, counter, repeat)
         self._book(self._use_of(flow, last), checks=True)
-        waiting = [*flow.queue]
-        flow.queue.clear()
         for ready, sent in waiting:
             if flow.queue and self._is_late(grant, len(flow.queue), ready):
                 self._send_alone(flow, sent, ready)
@@ -420,6 +425,7 @@ class Sidelink(Mac):
         if grant is not None and (flow.grant is not grant or not flow.queue):
             return
         sent = booking.sent or flow.queue[0][1]
+        assert sent is not None, "the first use of a grant is that of the frame it was selected for"
         times = 10 * grant.counter if grant is not None else 1
         wanted = Wanted(station.node, booking.slot, booking.last, booking.length, booking.period, times)
         station.booked -= booking.slots
@@ -462,12 +468,14 @@ class Sidelink(Mac):
         flow, grant = booking.flow, booking.grant
         if grant is None or flow.grant is not grant or grant.slot != booking.slot:
             return
-        latest = booking.slot - self._mac.t1_slots
-        if grant.skips:
-            grant.skips, grant.unused = grant.skips - 1, 0
+        is_due = bool(flow.queue) and flow.queue[0][0] <= booking.slot - self._mac.t1_slots
+        if is_due and flow.queue[0][1] is None:
+            flow.queue.popleft()
+            grant.unused = 0
             grant.counter -= 1
-        elif is_free and flow.queue and flow.queue[0][0] <= latest:
+        elif is_due and is_free:
             booking.sent = flow.queue.popleft()[1]
+            assert booking.sent is not None
             flow.station.frames -= 1
             grant.unused = 0
             grant.counter -= 1
@@ -482,8 +490,7 @@ class Sidelink(Mac):
             self._book(self._use_of(flow))
             return
         flow.grant, booking.period = None, 0
-        if flow.queue:
-            self._reserve(flow)
+        self._reserve(flow)
 
     def _give_up(self, booking: _Booking) -> None:
         """Drop a frame that may not be sent."""

@@ -133,7 +133,7 @@ def calibrate(found: Residuals) -> Calibration:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fit: its coefficients (3,), weighted regressors (n, 3), what is left (n,), and the inverse normal matrix."""
+    """A fit: coefficients (3,), weighted regressors (n, 3), residuals (n,), and inverse normal matrix (3, 3)."""
 
     found_m: Array
     weighted: Array

@@ -289,6 +289,17 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
     )
 
 
+@pytest.mark.slow
+def test_one_shots_leave_no_frame_behind() -> None:
+    subject = engine(line(0, 50), **with_mac(LTE, one_shot=True))
+    for n in range(500):
+        subject.transmit(n * 20 * MS, 0, [b"x"])
+        subject.advance(n * 20 * MS)
+    subject.drain()
+    rows = subject.trace.to_table().to_pylist()
+    assert max(row["on_air_ns"] - row["sent_ns"] for row in rows) <= 102 * MS
+
+
 # Outcomes.
 
 
