@@ -1,17 +1,21 @@
 """Processes of vnet without the second that each takes to import vnet: forks of one process.
 
 `Command([*VNET, …], …)` and `run([*VNET, …], …)` are `subprocess.Popen` and `subprocess.run` of the command, those
-of `[*MODULE, NAME, …]` of a module of this repository. Workers of cells, repetitions of runs, and checks of
-programs that it starts are forked as well; those of this process, once it has called `fork_processes`.
+of `[*AGENT, …]` of an agent, those of `[*MODULE, NAME, …]` of a module of this repository; in a network namespace
+after `ip netns exec NAMESPACE`. Workers of cells, repetitions of runs, and checks of programs that it starts are
+forked as well; those of this process, once it has called `fork_processes`. What a process is to do first is a
+function of a module that it can import.
 tests/emulator/cli, tests/system/test_wheel.py and tests/emulator/cells/test_worker.py start processes as users do.
 """
 
 import atexit
 import contextlib
+import ctypes
 import functools
 import gc
 import json
 import os
+import pkgutil
 import runpy
 import select
 import signal
@@ -29,6 +33,7 @@ from vnet.runtime.outside_loop import end_forked
 
 PYTHON = [sys.executable, "-P", "-m"]
 VNET = [*PYTHON, "emulator"]
+AGENT = [*PYTHON, "agents.cli"]
 MODULE = [*PYTHON, "runpy"]
 WORKER = "emulator.cells.worker"
 CHECK = "agents.program_check"
@@ -40,14 +45,17 @@ class Command(subprocess.Popen[str]):
     """A command that is forked. Its status comes over a socket: the process that waits for it is its parent."""
 
     def _execute_child(self, args: Sequence[str], *more: Any) -> None:
-        first = len(PYTHON)
-        known = list(args[:first]) == PYTHON and args[first] in (VNET[first], MODULE[first], WORKER, CHECK)
-        assert known and more[1] is None, "no other command, and no `preexec_fn`"
-        sys.audit("subprocess.Popen", args[0], args, more[4], more[5])
-        passed, cwd, environment, pipes = more[3], more[4], more[5], more[9:15]
+        first, words, namespace = len(PYTHON), list(args), ""
+        sys.audit("subprocess.Popen", words[0], words, more[4], more[5])
+        if words[:3] == ["ip", "netns", "exec"]:
+            namespace, words = words[3], words[4:]
+        known = (VNET[first], AGENT[first], MODULE[first], WORKER, CHECK)
+        assert words[:first] == PYTHON and words[first] in known, "no other command"
+        before, passed, cwd, environment, pipes = more[1], more[3], more[4], more[5], more[9:15]
         standard = [here if pipe < 0 else pipe for here, pipe in enumerate((pipes[0], pipes[3], pipes[5]))]
-        request = {"words": list(args[first:]), "cwd": str(cwd or Path.cwd()), "has_session": more[-2]}
-        request |= {"passed": list(passed), "has_group": more[-1] == 0}
+        request = {"words": words[first:], "cwd": str(cwd or Path.cwd()), "has_session": more[-2]}
+        request |= {"passed": list(passed), "has_group": more[-1] == 0, "namespace": namespace}
+        request["before"] = f"{before.__module__}:{before.__qualname__}" if before else ""
         request["environment"] = dict(os.environ if environment is None else environment)
         data = json.dumps(request).encode()
         assert len(data) < _LENGTH
@@ -196,6 +204,11 @@ def _become(request: dict[str, Any], descriptors: list[int], address: bytes) -> 
     os.environ.update(request["environment"], PYTHONHASHSEED="0")
     path = request["environment"].get("PYTHONPATH", "")
     sys.path[:] = [*filter(None, path.split(os.pathsep)), *sys.path[1:]]  # the first was for this module
+    if request["namespace"]:
+        with Path("/run/netns", request["namespace"]).open() as namespace:
+            assert ctypes.CDLL(None).setns(namespace.fileno(), 0) == 0
+    if request["before"]:
+        pkgutil.resolve_name(request["before"])()
     passed = dict(zip(map(str, request["passed"]), map(str, descriptors[3:]), strict=True))
     module, *words = request["words"]
     sys.argv = ["vnet", *(passed.get(word, word) for word in words)]
@@ -210,6 +223,8 @@ def _be(module: str) -> int:
         emulator.cells.worker._serve(int(sys.argv[1]))
     elif module == CHECK:
         return agents.program_check.main(sys.argv[1:])
+    elif module == AGENT[-1]:
+        agents.cli.main()
     elif module == "runpy":
         del sys.argv[0]
         runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
@@ -224,6 +239,8 @@ if __name__ == "__main__":
     import pyarrow
     import pytest  # noqa: F401  # what pages run as well
 
+    import agents.cli
+    import agents.host
     import agents.program_check
     import emulator.cells.sweep
     import emulator.cli

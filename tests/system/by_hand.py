@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.forked_commands import VNET, Command
+from tests.support.forked_commands import AGENT, VNET, Command
 from tests.support.paths import ROOT
-from tests.system.conftest import AGENT, TIMEOUT_S, Finished
+from tests.system.conftest import TIMEOUT_S, Finished
 
 SCENARIO = "scenarios/beacon.toml"
 OPTIONS = ["--duration", "2", "--set", "network.vehicles=4"]
@@ -27,7 +27,7 @@ def start_agents(stack: ExitStack, endpoint: str, access: Path) -> None:
     for node in NODES:
         command = [*AGENT, "--connect", endpoint, "--run", "beacon", "--node", node]
         command += ["--credentials", str(access / "credentials" / f"{node}.json")]
-        stack.enter_context(subprocess.Popen(command, cwd=ROOT))
+        stack.enter_context(Command(command, cwd=ROOT))
 
 
 def finish(emulator: subprocess.Popen[str], folder: Path) -> Finished:

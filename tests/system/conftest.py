@@ -22,7 +22,6 @@ from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
 from tests.support.processes import wait_until
 
-AGENT = [sys.executable, "-P", "-m", "agents.cli"]
 TIMEOUT_S = processes.TIMEOUT_S
 
 

@@ -6,7 +6,6 @@ import os
 import select
 import shlex
 import signal
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import pytest
 
 from tests.docs.markdown import blocks
 from tests.docs.pages import shows
-from tests.support.forked_commands import VNET
+from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.system.conftest import TIMEOUT_S
 
@@ -42,9 +41,8 @@ def converse(folder: Path, steps: Sequence[tuple[str, str | signal.Signals]], *a
     }
     written, seen = "", 0
     waiting = list(steps)
-    with subprocess.Popen(
-        [*VNET, *arguments], cwd=folder, stdin=slave, stdout=slave, stderr=slave, env=environment
-    ) as process:
+    words = [*VNET, *arguments]
+    with Command(words, cwd=folder, stdin=slave, stdout=slave, stderr=slave, env=environment) as process:
         os.close(slave)
         while part := _read(master, written):
             written += part.decode().replace("\r\n", "\n")
@@ -93,7 +91,7 @@ def test_a_vehicle_in_a_process_of_its_own_is_debugged(folder: Path) -> None:
     status, written = converse(folder, steps, "run", *options, "--debug", "v02", "--out", "debugged")
     assert status == 0, written
     (folder / "prog.py").write_text(PROGRAM.replace("breakpoint()", "pass"))
-    subprocess.run([*VNET, "simulate", *options, "--out", "plain"], cwd=folder, capture_output=True, check=True)
+    run([*VNET, "simulate", *options, "--out", "plain"], cwd=folder, capture_output=True)
     assert trace_of(folder / "debugged") == trace_of(folder / "plain")
     assert "breakpoint() is passed over" in (folder / "debugged" / "logs" / "v01.log").read_text()
 

@@ -7,14 +7,15 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import pytest
 
+from tests.support.forked_commands import AGENT, Command
 from tests.support.paths import ROOT
 from tests.support.processes import wait_until
 from tests.system.by_hand import NODES, finish, start_emulator
-from tests.system.conftest import AGENT, TIMEOUT_S, Finished, Vnet, heard_by, run_until
+from tests.system.conftest import TIMEOUT_S, Finished, Vnet, heard_by, run_until
 
 FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py"]
 WRONG = [sys.executable, "-P", "-m", "tests.system.wrong_agent"]
@@ -29,10 +30,10 @@ def tests_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def start(
     stack: ExitStack, command: list[str], node: str, endpoint: str, folder: Path, log: IO[str] | None = None
-) -> subprocess.Popen[bytes]:
+) -> subprocess.Popen[Any]:
     credentials = str(folder / "access" / "credentials" / f"{node}.json")
     words = [*command, "--connect", endpoint, "--run", "beacon", "--node", node, "--credentials", credentials]
-    agent = subprocess.Popen(words, cwd=ROOT, stdout=log)
+    agent = (Command if command == AGENT else subprocess.Popen)(words, cwd=ROOT, stdout=log)
     stack.callback(agent.wait)
     stack.callback(agent.kill)
     return agent

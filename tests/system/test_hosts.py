@@ -15,7 +15,7 @@ import pytest
 import tomli_w
 import zenoh
 
-from tests.support.forked_commands import VNET, run
+from tests.support.forked_commands import VNET, Command, run
 from tests.support.namespaces import NetworkHost, network, why_impossible
 from tests.support.paths import ROOT
 from tests.system.by_hand import line_of
@@ -83,9 +83,8 @@ def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str,
     assert run(command, cwd=ROOT, capture_output=True, timeout=TIMEOUT_S).returncode == 0
     with ExitStack() as stack:
         words = [*VNET, "emulator", scenario, "--access", str(access), "--listen", endpoint, "--out", str(folder)]
-        emulator = subprocess.Popen(
-            hosts[0].command(*words, *options), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        emulator = Command(hosts[0].command(*words, *options), cwd=ROOT, **pipes)
         stack.enter_context(emulator)
         stack.callback(emulator.kill)
         line_of(emulator, "waiting for 3 hosts")
@@ -93,7 +92,7 @@ def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str,
             words = [*VNET, "host", "--connect", endpoint, "--run", Path(scenario).stem]
             words += ["--credentials", str(access / "credentials" / f"host-{name}.json")]
             here = {**os.environ, "TMPDIR": str(tmp_path)}  # a host that is killed leaves its logs behind
-            process = stack.enter_context(subprocess.Popen(host.command(*words), cwd=ROOT, env=here))
+            process = stack.enter_context(Command(host.command(*words), cwd=ROOT, env=here))
             stack.callback(process.kill)
         stdout, stderr = emulator.communicate(timeout=TIMEOUT_S)
     return Finished(emulator.returncode, stdout, stderr, folder)

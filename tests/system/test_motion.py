@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import tomli_w
 
-from tests.support.forked_commands import VNET, Command
+from tests.support.forked_commands import AGENT, VNET, Command
 from tests.support.motion import Stay, along, still, write_trips
 from tests.support.paths import ROOT
 from tests.system.by_hand import line_of
-from tests.system.conftest import AGENT, TIMEOUT_S, Finished, Vnet, running_agents
+from tests.system.conftest import TIMEOUT_S, Finished, Vnet, running_agents
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
 VEHICLES: dict[str, list[Stay]] = {
@@ -80,7 +80,7 @@ def test_agents_started_by_hand_wait_until_they_enter(vnet: Vnet, scenario: str,
             credentials = folder / "access" / "credentials" / f"{node}.json"
             agent = [*AGENT, "--connect", found[1], "--run", "driving", "--node", node]
             agent += ["--credentials", str(credentials)]
-            agents[node] = stack.enter_context(subprocess.Popen(agent, cwd=ROOT))
+            agents[node] = stack.enter_context(Command(agent, cwd=ROOT))
         stdout, stderr = emulator.communicate(timeout=TIMEOUT_S)
         by_hand = Finished(emulator.returncode, stdout, stderr, folder)
         assert {node: agent.wait(TIMEOUT_S) for node, agent in agents.items()} == dict.fromkeys(VEHICLES, 0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.forked_commands import VNET, run
+from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.processes import wait_until
 from tests.system.by_hand import line_of
@@ -159,9 +159,8 @@ def test_no_folder_is_left_of_the_first_attempt(tmp_path: Path) -> None:
 
 
 def test_a_closed_standard_output_does_not_lose_the_verdict(tmp_path: Path) -> None:
-    with subprocess.Popen(
-        command(tmp_path, FAULT), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    ) as process:
+    words = command(tmp_path, FAULT)
+    with Command(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         assert process.stdout is not None
         process.stdout.close()
         process.wait(TIMEOUT_S)
@@ -180,7 +179,7 @@ def test_one_interrupt_ends_the_run_once(tmp_path: Path, to_all: bool) -> None:
     end = "pathlib.Path('reached').touch()\n            while not pathlib.Path('go').exists(): pass"
     end += "\n            pathlib.Path('went').touch()"
     arguments = [*command(tmp_path, end), "--duration", "600"]
-    process = subprocess.Popen(
+    process = Command(
         arguments, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
@@ -238,9 +237,7 @@ AT_TERMINAL = (
 def test_a_signal_that_ends_the_command_ends_its_child(tmp_path: Path, number: signal.Signals) -> None:
     """And is not taken for the vehicle's death."""
     pid_file = tmp_path / "pid"
-    process = subprocess.Popen(
-        command(tmp_path, ENDLESS), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    process = Command(command(tmp_path, ENDLESS), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         wait_until(pid_file.exists, process)
         assert int(pid_file.read_text()) != process.pid

@@ -1,10 +1,9 @@
 """Shipped scenarios on a machine made small and slow: the same verdict or unknown, never invalid."""
 
 import os
-import subprocess
 from pathlib import Path
 
-from tests.support.forked_commands import VNET
+from tests.support.forked_commands import VNET, run
 from tests.support.paths import ROOT
 from tests.system.conftest import PATIENT, TIMEOUT_S, Finished, Vnet
 
@@ -20,9 +19,7 @@ def make_slow() -> None:
 
 def run_slowly(folder: Path, *words: str) -> Finished:
     command = [*VNET, "run", *words, "--out", str(folder), "--no-report", *PATIENT]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, preexec_fn=make_slow
-    )
+    done = run(command, cwd=ROOT, capture_output=True, timeout=TIMEOUT_S, preexec_fn=make_slow)
     return Finished(done.returncode, done.stdout, done.stderr, folder)
 
 
