@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 from zlib import crc32
 
@@ -96,9 +97,9 @@ def digest(trace_sha256: str, states: pa.Table) -> str:
     return f"{trace_sha256[:16]} {crc32(repr(states.to_pydict()).encode()):08x}"
 
 
-def live(seed: int) -> Iterator[tuple[str, str]]:
+def live(seed: int, layouts: Mapping[str, list[str]]) -> Iterator[tuple[str, str]]:
     """Yield the layouts with a process for some vehicles, and the run's digest, or why there is none."""
-    for name, (command, *options) in LIVE.items():
+    for name, (command, *options) in layouts.items():
         if settings_of(seed)["fault"] and name.startswith("nodes"):
             continue  # faults of one vehicle in a process of several are refused
         with TemporaryDirectory() as folder:
@@ -113,11 +114,13 @@ def live(seed: int) -> Iterator[tuple[str, str]]:
                 yield name, f"status {done.returncode}: {done.stderr[-300:]}"
 
 
-def differences(seeds: Iterable[int], all_layouts: bool = False, workers: int = 1) -> Iterator[str]:
+def differences(
+    seeds: Iterable[int], layouts: Mapping[str, list[str]] = MappingProxyType({}), workers: int = 1
+) -> Iterator[str]:
     """Yield the layouts in which programs sent or reported something else than in the first, with their seeds."""
     programs = [RandomProgram(seed) for seed in seeds]
     for program, traces in each_done(programs, simulated, most=workers):
-        found: Mapping[str, str] = traces | dict(live(program.seed)) if all_layouts else traces
+        found: Mapping[str, str] = traces | dict(live(program.seed, layouts))
         expected = found["simulated"]
         yield from (f"seed {program.seed}, {name}: {found[name]}" for name in found if found[name] != expected)
 
@@ -131,9 +134,9 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=1, help="programs that are simulated at a time")
     options = parser.parse_args()
     found = 0
-    for count, all_layouts in ((options.live, True), (options.simulated, False)):
+    for count, layouts in ((options.live, LIVE), (options.simulated, {})):
         seeds = range(options.first, options.first + count)
-        for difference in differences(seeds, all_layouts, options.workers):
+        for difference in differences(seeds, layouts, options.workers):
             print(difference, flush=True)
             found += 1
     print(f"{options.live} programs in all layouts, {options.simulated} in the simulated: {found} differences")

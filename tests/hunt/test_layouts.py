@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.hunt.layouts import differences
+from tests.hunt.layouts import LIVE, differences
 
 
 @pytest.mark.slow
@@ -11,5 +11,5 @@ def test_random_programs_give_one_trace_in_simulated_layouts() -> None:
 
 
 @pytest.mark.slow
-def test_a_random_program_gives_one_trace_in_all_layouts() -> None:
-    assert [*differences([3], all_layouts=True)] == []
+def test_a_random_program_gives_one_trace_in_all_layouts_of_one_machine() -> None:
+    assert [*differences([3], {name: options for name, options in LIVE.items() if "hosts" not in name})] == []

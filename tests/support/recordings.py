@@ -1,10 +1,10 @@
 """Reading recordings back, for tests."""
 
 import subprocess
-import sys
 import warnings
 from collections import defaultdict
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,13 @@ def read_back(path: Path) -> dict[str, Entity]:
     return dict(entities)
 
 
+RERUN = Path(str(resources.files("rerun_cli"))) / "rerun"
+"""The program itself: half a second before it, `python -m rerun` has imported Rerun."""
+
+
 def rrd(*arguments: str) -> subprocess.CompletedProcess[str]:
     """`rerun rrd …`."""
-    command = [sys.executable, "-P", "-m", "rerun", "rrd", *arguments]
-    return subprocess.run(command, capture_output=True, text=True)
+    return subprocess.run([RERUN, "rrd", *arguments], capture_output=True, text=True)
 
 
 def listening_addresses(pid: int) -> set[str]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shlex
 import shutil
 import subprocess
@@ -9,6 +10,11 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from emulator.checks.judge import check_run
+from tests.support import forked_commands
+from tests.support.forked_commands import run
+from tests.system.conftest import in_this_process
 
 pytestmark = pytest.mark.slow
 
@@ -48,8 +54,8 @@ def test_on_a_full_disk_what_fits_is_kept_and_the_run_is_unknown(tmp_path: Path)
     verdict = json.loads((tmp_path / "kept" / "run" / "verdict.json").read_text())
     (files,) = [check for check in verdict["checks"] if check["name"] == "files"]
     assert files["verdict"] == verdict["verdict"] == "unknown" and "states.parquet" in files["text"]
-    again = shell(f"{VNET} check kept/run", tmp_path)
-    assert again.returncode == 2 and "not kept" in again.stderr and is_one_line_each(again.stderr)
+    status, _, error = in_this_process(["check", str(tmp_path / "kept" / "run")])
+    assert status == 2 and "not kept" in error and is_one_line_each(error)
 
 
 def test_a_disk_that_holds_no_verdict_is_told_in_one_line(tmp_path: Path) -> None:
@@ -62,14 +68,6 @@ def test_a_read_only_disk_is_told_in_one_line(tmp_path: Path) -> None:
     done = on_disk("ro", f"{VNET} simulate beacon --duration 1 --out disk/run {OPTIONS}", tmp_path)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == "vnet: disk/run: cannot write: Read-only file system"
-
-
-def test_a_limit_of_the_size_of_files_loses_those_above_it_alone(tmp_path: Path) -> None:
-    done = shell(f"ulimit -f 20; {VNET} simulate twelve --duration 5 --out run {FEW} {OPTIONS}", tmp_path)
-    assert done.returncode == 3, done.stderr
-    assert is_one_line_each(done.stderr) and "File too large" in done.stderr
-    names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert {"metrics.parquet", "verdict.json", "manifest.json", "world.npz"} <= names
 
 
 @pytest.mark.parametrize(("command", "kilobytes"), [("run", 1 << 20), ("simulate", 1 << 18), ("check", 1 << 18)])
@@ -97,14 +95,26 @@ def test_memory_that_is_gone_in_the_midst_is_told_in_one_line(tmp_path: Path) ->
     assert is_one_line_each(done.stderr) and "not enough memory: " in done.stderr
 
 
+def sixty_four_descriptors() -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+
+
 def test_sixty_four_descriptors_are_few_for_a_live_run_and_enough_for_a_simulated_one(tmp_path: Path) -> None:
-    done = shell(f"ulimit -n 64; {VNET} run quickstart --duration 1 --out live {OPTIONS}", tmp_path)
-    assert done.returncode == 2
-    assert is_one_line_each(done.stderr) and "Too many open files" in done.stderr
-    done = shell(f"ulimit -n 64; {VNET} simulate quickstart --duration 1 --out run {FEW} {OPTIONS}", tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    live, simulated = (
+        run(
+            [*forked_commands.VNET, command, "quickstart", "--duration", "1", "--out", command, *OPTIONS.split()],
+            cwd=tmp_path,
+            capture_output=True,
+            preexec_fn=sixty_four_descriptors,
+        )
+        for command in ("run", "simulate")
+    )
+    assert live.returncode == 2
+    assert is_one_line_each(live.stderr) and "Too many open files" in live.stderr
+    assert (simulated.returncode, simulated.stderr) == (0, "")
 
 
 def test_closed_descriptors_are_nobodys_files(tmp_path: Path) -> None:
-    for command in ("simulate beacon --duration 1 --out run", "check run"):
-        assert shell(f"{VNET} {command} 0<&- 1>&- 2>&-", tmp_path).returncode == 0
+    command = f"{VNET} simulate beacon --duration 1 --out run {OPTIONS} 0<&- 1>&- 2>&-"
+    assert shell(command, tmp_path).returncode == 0
+    assert check_run(tmp_path / "run").exit_status == 0
