@@ -294,15 +294,17 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
 def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a judged run as one flat row.
 
-    `failed`: the names of invalid checks; `frames_OUTCOME`: receptions by outcome; `packet_delivery_ratio`; all of
-    vnet's figures by name; of each value that programs report the mean over all reports by its name, and as
-    `last.NAME` the mean over the vehicles of their last one; of own checks each number by `own:NAME.FIGURE`. Texts
-    and rows are left out.
+    `failed`: the names of invalid checks; `failure`: what the first of them saw; `frames_OUTCOME`: receptions by
+    outcome; `packet_delivery_ratio`; all of vnet's figures by name; of each value that programs report the mean
+    over all reports by its name, and as `last.NAME` the mean over the vehicles of their last one; of own checks
+    each number by `own:NAME.FIGURE`. Texts and rows are left out.
     """
     frames = verdict["frames_by_outcome"]
+    invalid = [check for check in verdict["checks"] if check["verdict"] == "invalid"]
     row = {
         "verdict": verdict["verdict"],
-        "failed": ", ".join(check["name"] for check in verdict["checks"] if check["verdict"] == "invalid"),
+        "failed": ", ".join(check["name"] for check in invalid),
+        "failure": invalid[0]["text"] if invalid else "",
         "vehicles": verdict["vehicles"],
         "emulated_s": verdict["emulated_s"],
         "packet_delivery_ratio": verdict["packet_delivery_ratio"],

@@ -107,7 +107,12 @@ def sweep(
         table = write_sweep(plan, folder)
         verdicts = table["verdict"].to_pylist()
         counts = ", ".join(f"{verdicts.count(name)} {name}" for name in sorted(set(verdicts)))
-        SafeConsole().print(f"{len(table)} runs: {counts}", highlight=False)
+        lines = [f"{len(table)} runs: {counts}"]
+        if "invalid" in verdicts:
+            (row,) = table.slice(verdicts.index("invalid"), 1).to_pylist()
+            where = ", ".join(f"{key} {row[key]}" for key in (*plan.varied, "seed"))
+            lines.append(f"first invalid: {where}: {row['failed'].partition(', ')[0]}: {row['failure']}")
+        SafeConsole().print("\n".join(lines), highlight=False, soft_wrap=True)
         print(folder / SWEEP_TABLE)
         print(folder / SWEEP_PAGE)
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 import xml.parsers.expat
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,12 +115,22 @@ class Collection(msgspec.Struct):
 def read_geojson(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
     """Read roads; the origin is their centre unless given. Raise ScenarioError, naming the feature, for a bad file.
 
-    Points that are equal to seven decimals are the same, so that lines that meet are joined roads.
+    Points that are equal to seven decimals are the same, so that lines that meet are joined roads. A line with
+    `class` is called by its `name`, if no other is.
     """
-    builder = RoadsBuilder(path)
-    for number, feature in enumerate(read_collection(path).features):
-        _add_feature(path, builder, number, feature)
+    builder, features = RoadsBuilder(path), read_collection(path).features
+    named = Counter(map(_own_name, features))
+    for number, feature in enumerate(features):
+        name = _own_name(feature)
+        _add_feature(path, builder, number, feature, name if name and named[name] == 1 else f"feature {number}")
     return builder.build_from_degrees(origin_deg)
+
+
+def _own_name(feature: Feature) -> str:
+    """Return the name of a road that is written as `write_geojson` does; in other files streets have names."""
+    properties = feature.properties or {}
+    name = properties.get("name")
+    return name if "class" in properties and isinstance(name, str) else ""
 
 
 def read_collection(path: Path) -> Collection:
@@ -146,7 +157,7 @@ def check_on_earth(where: str, degrees: Array) -> None:
         raise ScenarioError(f"{where}: {quantity} = {degrees[at, axis]:g}: not within ±{most}; is it WGS-84?")
 
 
-def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: Feature) -> None:
+def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: Feature, name: str) -> None:
     where = f"{path}: feature {number}"
     geometry, properties = feature.geometry, feature.properties or {}
     if geometry is None or geometry.type not in ("LineString", "MultiLineString"):
@@ -160,7 +171,6 @@ def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: Featur
         builder.note("ways not for cars")
         return
     lines = [geometry.coordinates] if geometry.type == "LineString" else geometry.coordinates
-    name = f"feature {number}"
     for line in lines:
         points = _points(where, line)
         builder.add(name, points[::-1] if found.reversed else points, found.kind, found.lanes, found.lane_width_m)

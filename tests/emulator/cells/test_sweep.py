@@ -101,8 +101,13 @@ def test_a_run_of_a_program_that_crashes_is_a_row(tmp_path: Path, in_this_proces
     del in_this_process
     program = "tests.emulator.cells.test_sweep:crash"
     row = emulator.sweep(TINY, {}, program=program, out=tmp_path).to_pylist()[0]
-    assert row["verdict"] == "invalid" and row["failed"]
+    assert row["verdict"] == "invalid" and row["failed"] and row["failure"]
     assert "Not valid: 1" in (tmp_path / "sweep.html").read_text()
+    (tmp_path / "t.toml").write_text("[run]\nduration_s = 0.4\n[network]\nvehicles = 3\n")
+    result = CliRunner().invoke(
+        command_app(command), [f"{tmp_path}/t.toml", "--program", program, "--out", f"{tmp_path}"]
+    )
+    assert f"first invalid: seed 1: {row['failed']}: {row['failure']}" in result.output
 
 
 async def crash(node: Any) -> None:
@@ -227,7 +232,7 @@ def test_columns_of_several_kinds_are_texts() -> None:
 def test_numbers_of_own_checks_are_columns() -> None:
     figures = {"slowest_s": 0.2, "late": 3, "who": "v02", "rows": [{"node": "v02"}]}
     checks = [
-        {"name": "own:warned", "verdict": "invalid", "figures": figures},
+        {"name": "own:warned", "verdict": "invalid", "text": "3 late", "figures": figures},
         {"name": "conservation", "verdict": "valid", "figures": {"frames": 10}},
     ]
     names = ("verdict", "vehicles", "emulated_s", "trace_sha256", "metrics_sha256", "wall_s", "real_time_factor")
@@ -237,4 +242,4 @@ def test_numbers_of_own_checks_are_columns() -> None:
         "own:warned.slowest_s": 0.2,
         "own:warned.late": 3,
     }
-    assert row["failed"] == "own:warned"
+    assert (row["failed"], row["failure"]) == ("own:warned", "3 late")
