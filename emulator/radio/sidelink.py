@@ -10,9 +10,9 @@ of the slots before n alone, whatever has been decided.
 **Grants.** The frames of a sender that tell the same period are a flow. One without a reservation selects a
 resource when a frame is ready (`grid`), and holds it for as many frames as its reselection counter says, one in
 each reservation interval. As the counter ends it keeps the resource with a probability, and selects another
-otherwise. Frames wait for their flow's grant in a queue. A frame that would wait beyond the selection window gets
-a resource of its own, once; so does each frame with dynamic scheduling. If the sender's other flows leave no slot,
-it is dropped.
+otherwise. A frame waits for the next use of its flow's grant. If another frame has that, or if it is beyond the
+selection window, the frame gets a resource of its own, once; so does each frame with dynamic scheduling. If the
+sender's other flows leave no slot, it is dropped.
 
 **Draws** are those of the frame for which something is drawn: they depend on the seed, its sender and its number.
 """
@@ -272,8 +272,8 @@ class Sidelink(Mac):
             return
         is_alone = self._is_one_shot(flow, frame)
         if grant is not None:
-            late = max(0, -(-(slot + self._mac.t1_slots - grant.slot) // grant.period))
-            if self._is_late(grant, max(late, len(flow.queue)), slot):
+            turn = max(0, -(-(slot + self._mac.t1_slots - grant.slot) // grant.period))
+            if len(flow.queue) > turn or grant.slot + grant.period * turn > slot + self._t2_slots:
                 is_alone = True
             else:
                 flow.queue.append((slot, None if is_alone else sent))
@@ -282,10 +282,6 @@ class Sidelink(Mac):
             self._reserve(flow)
         if is_alone:
             self._send_alone(flow, sent, slot)
-
-    def _is_late(self, grant: _Grant, turn: int, ready: int) -> bool:
-        """Return true if a frame that was ready in a slot would wait beyond its selection window for its turn."""
-        return grant.slot + grant.period * turn > ready + self._t2_slots
 
     def _is_one_shot(self, flow: _Flow, frame: Frame) -> bool:
         """Return true if it is time to send one frame elsewhere, which a persistent collision cannot reach."""
@@ -328,13 +324,11 @@ class Sidelink(Mac):
                 self._leave(sent, Outcome.no_grant, self._now_ns)
             return
         first, subchannel, repeat = self._choose(found, frame, _CHOICE)
-        flow.grant = grant = _Grant(first, subchannel, length, period, counter, repeat)
+        flow.grant = _Grant(first, subchannel, length, period, counter, repeat)
+        flow.queue.append(waiting[0])
         self._book(self._use_of(flow, last), checks=True)
-        for ready, sent in waiting:
-            if flow.queue and self._is_late(grant, len(flow.queue), ready):
-                self._send_alone(flow, sent, ready)
-            else:
-                flow.queue.append((ready, sent))
+        for ready, sent in waiting[1:]:
+            self._send_alone(flow, sent, ready)
 
     def _counter(self, frame: Frame, period: int) -> int:
         least, most = self._mac.counters(period * self._slot_ns // NS_PER_MS)

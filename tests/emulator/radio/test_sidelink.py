@@ -290,6 +290,19 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("radio", [LTE, NR])
+def test_a_burst_delays_no_frame_that_follows_it(radio: dict[str, Any]) -> None:
+    subject = engine(line(0, 50), access_jitter_ms=0.0, **radio)
+    for n in range(250):
+        for _ in range(6 if n == 50 else 1):
+            subject.transmit(n * 20 * MS, 0, [SentFrame("", b"x", period_ms=20)])
+        subject.advance(n * 20 * MS)
+    subject.drain()
+    rows = [row for row in subject.trace.to_table().to_pylist() if row["sent_ns"] > 1.1 * S]
+    assert max(row["on_air_ns"] - row["sent_ns"] for row in rows) <= 25 * MS
+
+
+@pytest.mark.slow
 def test_one_shots_leave_no_frame_behind() -> None:
     subject = engine(line(0, 50), **with_mac(LTE, one_shot=True))
     for n in range(500):
