@@ -194,9 +194,9 @@ def captured(command: Any, arguments: list[str]) -> tuple[str, int]:
 
 def _process(words: Sequence[str]) -> tuple[str, int]:
     started = process(words)
-    if len(started) > 1 and started[1].startswith("docs/examples/"):
+    if started[1].startswith("docs/examples/"):
         started = [*MODULE, started[1].removesuffix(".py").replace("/", "."), *started[2:]]
-    elif started[1:3] == ["-m", "pytest"]:
+    elif started[1] == "-m" and started[2].startswith(("pytest", "docs.examples.")):
         started = [*MODULE, *started[2:]]
     is_forked = started[: len(VNET)] == VNET or started[: len(MODULE)] == MODULE
     start = forked_commands.run if is_forked else subprocess.run

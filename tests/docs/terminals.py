@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.docs.commands import DocsError
-from tests.support.forked_commands import VNET, Command
+from tests.support.forked_commands import AGENT, VNET, Command
 
 TIMEOUT_S = 120.0
 """Seconds of wall clock until a command must have printed what it should, or ended."""
@@ -37,7 +37,7 @@ class Terminals:
             self._reserve(port)
         printed = self._folder.parent / f"{self._folder.name}.terminal-{len(self._started)}.log"
         with printed.open("wb") as log:
-            start = Command if list(process[: len(VNET)]) == VNET else subprocess.Popen
+            start = Command if list(process[: len(VNET)]) in (VNET, AGENT) else subprocess.Popen
             started = start(process, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
         self._stack.callback(started.wait)
         self._stack.callback(started.kill)

@@ -71,7 +71,11 @@ def _toml() -> dict[str, bytes]:
         b"inputs",
     )
     keys += (b"program.options.a", b"program.entry")
-    nasty = {f"{key.decode()} = {name}": key + b" = " + value for name, value in values.items() for key in keys}
+    nasty = {
+        f"{key.decode()} = {name}": key + b" = " + value
+        for name, value in values.items()
+        for key in (keys[:1] if "10⁵ deep" in name else keys)  # such values are never read to their end
+    }
     nasty |= {f"--set {name}": OVERRIDE + key for name, key in zip(nasty, nasty.values(), strict=True)}
     nasty["a network.path of nasty kind"] = b"network = {kind = 'file', path = \"\\u0000\"}"
     nasty["a network.path too long"] = b"network = {kind = 'file', path = '" + b"a" * 5000 + b"'}"

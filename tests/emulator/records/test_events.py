@@ -1,9 +1,5 @@
 """The enumeration of events is all that vnet knows about them."""
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -49,25 +45,6 @@ def test_events_have_the_details_that_are_declared(tmp_path: Path) -> None:
     events = session.folder.events
     assert {"started", "fault_started", "fault_ended", "restarted", "ended"} <= {event.kind for event in events}
     assert [event for event in events if not event.details.keys() <= set(KINDS[event.kind].details)] == []
-
-
-@pytest.mark.slow
-def test_a_kind_is_added_in_the_enumeration_alone(tmp_path: Path) -> None:
-    environment = os.environ | {"PYTHONHASHSEED": "0", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-P", "-m", "tests.support.added_event", str(tmp_path / "run")]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout.splitlines()[-1]) == {
-        "read": ["v01", "v02"],
-        "dead": 2,
-        "words": "v01 jammed: channel 5",
-        "bad": True,
-        "grouped": ["2 vehicles"],
-        "timeline": "failure",
-        "report": True,
-        "rerun": "WARN",
-        "reference": True,
-    }
 
 
 def _own(**details: object) -> Event:

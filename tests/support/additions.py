@@ -1,7 +1,7 @@
-"""Add an outcome to vnet as a developer would, in the table of outcomes alone, and tell where it shows.
+"""Add an outcome and a kind of event to vnet as a developer would, in its table alone, and tell where they show.
 
-Run as `python -m tests.support.added_outcome FOLDER`: the table is changed as it is imported, before the rest
-of vnet. The outcome's own code is `jam`; nothing else knows of it. Prints JSON.
+Run as `python -m tests.support.additions FOLDER`: the tables are changed as they are imported, before the rest of
+vnet. What gives the outcome, and writes the event, is here; nothing else knows of them. Prints JSON.
 """
 
 import json
@@ -14,7 +14,7 @@ from unittest.mock import Mock
 
 from tests.support.paths import ROOT
 
-MEMBER = """
+OUTCOME = """
     jammed = (
         17,
         Facts(
@@ -27,7 +27,10 @@ MEMBER = """
     )
 
 """
-BEFORE = "    @property\n    def title"
+BEFORE_OUTCOME = "    @property\n    def title"
+KIND = """    jammed = "jammed", "vehicle", "channel", "its radio is jammed", FAILURE, GROUPED | ENDS_PROGRAM
+"""
+BEFORE_KIND = "    # fmt: on"
 
 
 def add_to(name: str, before: str, added: str) -> None:
@@ -70,8 +73,8 @@ def legend(vehicles: int) -> list[str]:
     return [label for call in canvas.point_style.call_args_list for label in call.args[3]]
 
 
-def main(folder: Path) -> None:
-    """Simulate a run with the outcome, and print where it shows."""
+def of_outcome(folder: Path) -> dict[str, Any]:
+    """Simulate a run with the outcome; return where it shows."""
     from typer.testing import CliRunner
 
     from docs.generate.files import page
@@ -87,7 +90,7 @@ def main(folder: Path) -> None:
     done = CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, arguments)
     verdict = json.loads((folder / "verdict.json").read_text())
     shot = make(frames_per_s={"delivered": 50.0, "jammed": 50.0})
-    found = {
+    return {
         "summary": [line for line in done.output.splitlines() if "jammed" in line],
         "verdict": verdict["verdict"],
         "counted": verdict["frames_by_outcome"]["jammed"],
@@ -98,10 +101,48 @@ def main(folder: Path) -> None:
         "colour": outcome_colours([Outcome["jammed"]]).tolist(),  # type: ignore[arg-type]
         "reference": "| `jammed` | an interferer was on the air |" in page(),
     }
-    print(json.dumps(found))
+
+
+def of_event(folder: Path) -> dict[str, Any]:
+    """Simulate a run in which the event befalls two vehicles; return where it shows."""
+    from docs.generate.files import page
+    from emulator.drivers.session import Session
+    from emulator.records.events import EventKind, merged
+    from emulator.records.recorded_run import RecordedRun
+    from emulator.report.source import Source
+    from emulator.report.timeline import marks_of
+    from emulator.report.write import write_report
+    from emulator.scenario.loading import load_scenario
+    from emulator.stream import event_message
+    from emulator.viewer.scenes import OverviewScene
+
+    session = Session(load_scenario(ROOT / "scenarios" / "beacon.toml", ["run.duration_s=1"]), folder).open()
+    session.run()
+    for node in ("v01", "v02"):
+        session.folder.event(session.emulation.emulated_ns, EventKind["jammed"], node, channel=5)
+    session.close()
+    write_report(Source(folder))
+    run = RecordedRun.open(folder)
+    events = run.event("jammed")
+    canvas = Mock()
+    scene = Mock(_canvas=canvas)
+    OverviewScene.events(scene, [event_message(event) for event in events])
+    return {
+        "read": [event.node for event in events],
+        "dead": len(run.deaths_ns),
+        "words": events[0].text,
+        "bad": events[0].is_bad,
+        "grouped": [event.node for event in merged(events)],
+        "timeline": marks_of(events, run.number)[0].kind,
+        "report": "jammed" in (folder / "report.html").read_text(),
+        "rerun": str(canvas.log.call_args.args[1].level.as_arrow_array()[0]),
+        "reference": "| `jammed` | vehicle | `channel` | its radio is jammed |" in page(),
+    }
 
 
 if __name__ == "__main__":
-    add_to("emulator.radio.outcomes", BEFORE, MEMBER)
+    add_to("emulator.radio.outcomes", BEFORE_OUTCOME, OUTCOME)
+    add_to("emulator.records.events", BEFORE_KIND, KIND)
     jam_every_second_frame()
-    main(Path(sys.argv[1]))
+    where = Path(sys.argv[1])
+    print(json.dumps([of_outcome(where / "outcome"), of_event(where / "event")]))
