@@ -27,10 +27,13 @@ from benchmarks.cv2x.highway import (
     together,
 )
 from emulator.scenario.scenario import Radio
+from emulator.scenario.sections import DAY_S
 
 LIMITS = {"lte": 2.5, "nr": 3.0, "80211p": 5.0}
 """Largest deviations, in percentage points."""
 TABLES = ("lte", "nr", "80211p", "speed")
+LEAST_S = 3.0
+"""Shortest run: the first two seconds, in which nobody has sensed yet, do not count."""
 
 
 def main() -> int:
@@ -46,10 +49,15 @@ def main() -> int:
     tables = options.tables or list(TABLES)
     if options.data is None and {"lte", "80211p"} & {*tables}:
         parser.error("--data, or VNET_CV2X_DATA, must name the folder of the published curves")
+    if not LEAST_S <= options.seconds <= DAY_S or options.seeds < 1:
+        parser.error(f"--seconds is {LEAST_S:g} to {DAY_S:g}, and --seeds 1 or more")
     print_table = {"lte": _lte, "nr": _nr, "80211p": _dot11p, "speed": _speed}
     broken = 0
     for table in tables:
-        worst = print_table[table](options)
+        try:
+            worst = print_table[table](options)
+        except OSError as error:
+            parser.error(str(error))
         if table in LIMITS:
             print(f"largest deviation: {worst:.2f} percentage points; {LIMITS[table]:g} are allowed\n", flush=True)
             broken |= worst > LIMITS[table]
@@ -59,6 +67,15 @@ def main() -> int:
 def _runs(options: argparse.Namespace, radio_of: Callable[[Setting], Radio], setting: Setting) -> Measured:
     seeds = range(1, options.seeds + 1)
     return together([drive(radio_of(setting), setting, options.seconds, seed) for seed in seeds])
+
+
+def _chosen(found: dict[Setting, Curves], options: argparse.Namespace) -> list[tuple[Setting, Curves]]:
+    """Return the settings of a density with their curves, by name. Raise OSError if there is none."""
+    chosen = [each for each in found.items() if options.density in (None, each[0].density_per_m)]
+    if not chosen:
+        known = sorted({setting.density_per_m for setting in found})
+        raise FileNotFoundError(f"--density {options.density:g}: the curves are of {known}")
+    return sorted(chosen, key=lambda each: each[0].name)
 
 
 def _print_curves(ours: Curves, theirs: Curves) -> None:
@@ -75,9 +92,7 @@ def _lte(options: argparse.Namespace) -> float:
     )
     worst = 0.0
     found = published(Path(options.data) / "lte_mode4.csv")
-    for setting, theirs in sorted(found.items(), key=lambda each: each[0].name):
-        if options.density not in (None, setting.density_per_m):
-            continue
+    for setting, theirs in _chosen(found, options):
         measured = _runs(options, mode4_radio, setting)
         away = deviations(measured.curves(), theirs)
         cells = " | ".join(f"{away[name]:.2f}" for name in ("PDR", "HD", "SEN", "PRO", "COL"))
@@ -109,9 +124,7 @@ def _dot11p(options: argparse.Namespace) -> float:
     folder = Path(options.data)
     busy = dot11p.published_busy(folder / "80211p_cbr.csv")
     found = published(folder / "80211p.csv")
-    for setting, theirs in sorted(found.items(), key=lambda each: each[0].name):
-        if options.density not in (None, setting.density_per_m):
-            continue
+    for setting, theirs in _chosen(found, options):
         measured = _runs(options, dot11p.radio, setting)
         away = deviations(measured.curves(), {"PDR": theirs["PDR"]})["PDR"]
         ours, known = float(measured.busy.mean()), busy.get(setting)

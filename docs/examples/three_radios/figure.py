@@ -30,20 +30,21 @@ Point = tuple[str, str, int]
 
 
 def samples(*table_paths: str) -> dict[Point, dict[str, list[float]]]:
-    """Return the values of all seeds of each figure, by point."""
+    """Return the values of all seeds of each figure, by point, of the runs that have them."""
     found: dict[Point, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in (row for path in table_paths for row in pq.read_table(path).to_pylist()):
         options = json.loads(row["program.options"])
         traffic = f"{options['rate_hz']} Hz, {options['size_bytes']} bytes"
         point = json.loads(row["radio.mac"])["kind"], traffic, int(Path(row["network.path"]).stem)
         for name, (_, factor) in FIGURES.items():
-            found[point][name].append(factor * row[f"own:near.{name}"])
+            if (value := row[f"own:near.{name}"]) is not None:
+                found[point][name].append(factor * value)
     return found
 
 
 def half_width(values: list[float]) -> float:
     """Return the half-width of the 95 % confidence interval of the mean of independent values."""
-    if len(values) == 1 or not np.ptp(values):
+    if len(values) < 2 or not np.ptp(values):
         return 0.0
     return float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
 
@@ -54,8 +55,8 @@ def print_table(found: dict[Point, dict[str, list[float]]]) -> None:
         print(f"| {title} | {' | '.join(RADIOS.values())} |", "|---|---|---|---|", sep="\n")
         for traffic, density in dict.fromkeys(point[1:] for point in found):
             of_radios = [found[radio, traffic, density][name] for radio in RADIOS]
-            cells = " | ".join(f"{np.mean(each):.1f} ± {half_width(each):.1f}" for each in of_radios)
-            print(f"| {traffic}, {density}/km | {cells} |")
+            cells = [f"{np.mean(each):.1f} ± {half_width(each):.1f}" if each else "–" for each in of_radios]
+            print(f"| {traffic}, {density}/km | {' | '.join(cells)} |")
         print()
 
 
@@ -68,7 +69,8 @@ def draw(found: dict[Point, dict[str, list[float]]], picture_path: str) -> None:
         for column, traffic in enumerate(traffics):
             axes: Any = panels[row][column]
             for radio, label in RADIOS.items():
-                points = {density: each[name] for (*of, density), each in found.items() if of == [radio, traffic]}
+                known = {point: each[name] for point, each in found.items() if each[name]}
+                points = {density: values for (*of, density), values in known.items() if of == [radio, traffic]}
                 means = [np.mean(values) for values in points.values()]
                 halves = [half_width(values) for values in points.values()]
                 style: Any = {"color": COLOURS[radio], "marker": MARKERS[radio], "capsize": 3, "label": label}
