@@ -1,4 +1,4 @@
-"""What is added in a table alone shows everywhere: an outcome, and a kind of event."""
+"""Additions to a table show everywhere without another change: those of an outcome, and of a kind of event."""
 
 import json
 import os
