@@ -61,6 +61,8 @@ def show(
     """Say how long a map's roads are and what is odd about it, and draw it."""
     with one_line_errors():
         if out is not None:
+            if out.suffix.lower() != ".png":
+                raise VnetError(f"--out {out}: a picture is written as *.png")
             require(f"--out {out}", "matplotlib")
         roads = read_roads(map_file, pair("--origin", origin))
         middle = pair("--at", at)
@@ -78,6 +80,7 @@ def convert(map_file: MapArgument, out: OutArgument, origin: OriginOption = None
     """Write a map as GeoJSON or NPZ, by the name of OUT."""
     with one_line_errors():
         writer_of(out)  # before a large file is read
+        _refuse_input(out, "", map_file)
         write_roads(read_roads(map_file, pair("--origin", origin)), out)
         print(f"wrote {out}")
 
@@ -142,8 +145,7 @@ def datum(
     with one_line_errors():
         if others is not None:
             check_trips_name(others)
-            if others.exists() and any(others.samefile(read) for read in (trips_file, map_file) if read.exists()):
-                raise VnetError(f"--others {others}: is read by this command; name another file")
+            _refuse_input(others, "--others ", trips_file, map_file)
         motion = whole_motion(trips_file, pair("--origin", origin), RATE_HZ, RULES)
         roads = read_roads(map_file, pair("--origin", origin) or motion.origin_deg)
         lanes = roads.lane_map(drive_on.value)
@@ -164,6 +166,12 @@ def datum(
                 alone = str(error)
             print(f"# the other vehicles alone: {alone}")
             _others(others, motion, used, RATE_HZ)
+
+
+def _refuse_input(out: Path, option: str, *read: Path) -> None:
+    """Raise VnetError if a file that is to be written is one that is read."""
+    if out.exists() and any(out.samefile(path) for path in read if path.exists()):
+        raise VnetError(f"{option}{out}: is read by this command; name another file")
 
 
 def _print_datum(result: Calibration, vehicles: int) -> None:
@@ -231,6 +239,6 @@ def _draw(roads: Roads, out: Path, title: str, window: tuple[Array, Array] | Non
 
     try:
         draw_map(roads, out, title, window)
-    except (OSError, ValueError) as error:  # a kind of picture that matplotlib does not know is a ValueError
+    except OSError as error:
         raise ScenarioError(f"--out {out}: cannot be written: {error}") from None
     print(f"wrote {out}")

@@ -40,7 +40,7 @@ _DPI = 140
 def draw_map(roads: Roads, path: Path, title: str, window: tuple[Array, Array] | None = None) -> None:
     """Write a picture of a map, or of the part between the corners `window` (south-west and north-east, in metres).
 
-    Raise OSError if it cannot be written, and ValueError for a file format that matplotlib does not know.
+    Raise OSError if it cannot be written.
     """
     low, high = window or (roads.node_m.min(axis=0), roads.node_m.max(axis=0))
     margin_m = 0.0 if window else 0.02 * float((high - low).max()) + 5.0

@@ -170,7 +170,7 @@ class Run(Section):
     """Names the run's folder, and its keys on Zenoh."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Seed of all random draws: the same seed, the same run."""
-    duration_s: float = Field(30.0, gt=0, le=DAY_S)
+    duration_s: float = Field(30.0, ge=1e-9, le=DAY_S)
     """Length of the run, in emulated time."""
     settle_s: float = Field(5.0, ge=0, le=DAY_S)
     """Time without faults before the end (emulated time), so that the network is judged at rest."""

@@ -32,7 +32,7 @@ from typing import Any
 import typer
 import typer.main
 
-from vnet.errors import LONGEST_MESSAGE, VnetError, printable
+from vnet.errors import LONGEST_MESSAGE, VnetError, printable, sendable
 from vnet.extras import missed_by
 from vnet.runtime import interrupts
 
@@ -105,6 +105,8 @@ def run_app(app: typer.Typer, arguments: Sequence[str]) -> int:
     A line that makes no sense, and whatever else goes wrong, gets one line of error.
     """
     try:
+        with one_line_errors(_asked_for(arguments)):
+            _refuse_other_than_utf8(arguments)
         command: Any = typer.main.get_command(app)
         with command.make_context("vnet", list(arguments)) as context:
             interrupts.raise_from_now_on()
@@ -122,6 +124,16 @@ def run_app(app: typer.Typer, arguments: Sequence[str]) -> int:
         return interrupts.INTERRUPTED
     except Exception as error:
         return _say_unexpected(error, arguments)
+
+
+def _refuse_other_than_utf8(arguments: Sequence[str]) -> None:
+    """Raise VnetError for an argument or a current folder with other bytes: the files of a run are UTF-8."""
+    texts = list(arguments)
+    with suppress(FileNotFoundError):  # a current folder that is gone
+        texts.append(str(Path.cwd()))
+    for text in texts:
+        if sendable(text) != text:
+            raise VnetError(f"{text}: not UTF-8, as paths must be; rename it")
 
 
 def say_output_failed(error: OSError, arguments: Sequence[str]) -> int:
@@ -157,8 +169,8 @@ def _keep_traceback(error: Exception, arguments: Sequence[str]) -> str:
     """Write a traceback into a file of its own; returns where it is."""
     text = "".join(traceback.format_exception(error))
     try:
-        with tempfile.NamedTemporaryFile("w", prefix="vnet-bug-", suffix=".txt", delete=False) as file:
-            file.write(f"{shlex.join(['vnet', *arguments])}\nPython {sys.version}\n\n{text}")
+        with tempfile.NamedTemporaryFile(prefix="vnet-bug-", suffix=".txt", delete=False) as file:
+            file.write(sendable(f"{shlex.join(['vnet', *arguments])}\nPython {sys.version}\n\n{text}").encode())
     except OSError:
         return f"its traceback, which could not be written: {traceback.extract_tb(error.__traceback__)[-1]}"
     return f"its traceback, {file.name}"

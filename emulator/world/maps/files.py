@@ -77,7 +77,9 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
             if isinstance(entity, osmium.osm.Way):
                 _add_way(path, builder, entity)
     if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
-        raise ScenarioError(f"{path}: it lacks the nodes of its {clipped} ways: extract maps with their nodes")
+        raise ScenarioError(
+            f"{path}: it lacks the nodes of its {clipped} ways; nodes come before ways, with ids above 0"
+        )
     return builder.build_from_degrees(origin_deg)
 
 

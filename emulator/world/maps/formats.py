@@ -19,6 +19,7 @@ SUMO's, so that they match its trips; its projection, if it states one, becomes 
 
 from __future__ import annotations
 
+import codecs
 import math
 import xml.parsers.expat
 from collections import Counter
@@ -136,7 +137,8 @@ def _own_name(feature: Feature) -> str:
 def read_collection(path: Path) -> Collection:
     """Read a collection of features in WGS-84. Raise ScenarioError for a bad file."""
     try:
-        collection = msgspec.json.decode(read_bounded(path, LARGEST_GEOJSON_BYTES), type=Collection)
+        text = read_bounded(path, LARGEST_GEOJSON_BYTES).removeprefix(codecs.BOM_UTF8)
+        collection = msgspec.json.decode(text, type=Collection)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors

@@ -119,12 +119,26 @@ def test_a_bug_is_one_line_with_its_traceback_in_a_file(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert run_app(failing(ZeroDivisionError("by zero")), []) == 70
+    assert run_app(failing(ZeroDivisionError("by \udce9")), []) == 70
     (file,) = tmp_path.iterdir()
     assert capsys.readouterr().err == (
-        f"vnet: a bug in vnet: ZeroDivisionError: by zero; please report it with its traceback, {file}\n"
+        f"vnet: a bug in vnet: ZeroDivisionError: by \\udce9; please report it with its traceback, {file}\n"
     )
-    assert "raise error\nZeroDivisionError: by zero" in file.read_text()
+    assert "raise error\nZeroDivisionError: by \\udce9" in file.read_text()
+
+
+@pytest.mark.parametrize(("folder", "arguments"), [("b\udce9", []), (".", ["--log-format", "b\udce9"])])
+def test_names_that_are_not_utf8_are_refused(
+    folder: str,
+    arguments: list[str],
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / folder).mkdir(exist_ok=True)
+    monkeypatch.chdir(tmp_path / folder)
+    assert run_app(failing(ZeroDivisionError()), arguments) == 2
+    assert capsys.readouterr().err.endswith("b\\udce9: not UTF-8, as paths must be; rename it\n")
 
 
 def test_what_the_system_refuses_is_no_bug(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ from tests.support.command_line import app
 @pytest.fixture
 def town(tmp_path: Path) -> Path:
     path = tmp_path / "town.geojson"
-    path.write_text(maps.geojson())
+    path.write_text(maps.geojson(), encoding="utf-8-sig")  # with a byte-order mark, as on Windows
     return path
 
 
@@ -34,9 +34,8 @@ def test_show_says_how_long_roads_are_and_what_is_odd(town: Path) -> None:
     assert "0.6 km of road, 0.1 km one way; 0.9 km of lane" in text or "0.5 km of road" in text
     assert "its metres start at 42.280000, -83.740000" in text
     assert "dead ends: 3" in text
-    for out in ("town.shp", "no/such/folder/town.png"):
-        status, text = vnet_map("show", town, "--out", town.parent / out)
-        assert status == 2 and f"{out}: cannot be written" in text.replace("\n", "")
+    status, text = vnet_map("show", town, "--out", town.parent / "no/such/folder/town.png")
+    assert status == 2 and "no/such/folder/town.png: cannot be written" in text.replace("\n", "")
 
 
 @pytest.mark.slow
