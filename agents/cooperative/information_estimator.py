@@ -208,7 +208,9 @@ class InformationEstimator:
             return
         dt_s, self._now_ns = (own.time_ns - self._now_ns) / NS_PER_S, own.time_ns
         multipath = own.multipath_sigma_m, own.multipath_tau_s
-        seen = Observation(own.position_m, own.covariance_m2, own.heading_rad, multipath=multipath)
+        seen = Observation(
+            own.position_m, own.covariance_m2, own.heading_rad, multipath=multipath, speed_m_s=own.speed_m_s
+        )
         fix = seen if usable(own) else None
         said = self._lanes.step(dt_s, fix) if self._lanes else self.own.step(dt_s, fix).numbers
         increment = as_sent(said)

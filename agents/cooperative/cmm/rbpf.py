@@ -96,7 +96,7 @@ class RbpfConfig:
 
 @dataclass(frozen=True)
 class Observation:
-    """A fix of one vehicle: `position_m` (2,) by its receiver, covariance (2, 2), heading if known, age.
+    """A fix of one vehicle: `position_m` (2,) by its receiver, covariance (2, 2), heading and speed if known, age.
 
     multipath: deviation (m) and correlation time (s) of the part of the covariance that lasts; 0, 0 for none.
     """
@@ -106,6 +106,7 @@ class Observation:
     heading_rad: float | None
     age_s: float = 0.0
     multipath: tuple[float, float] = (0.0, 0.0)
+    speed_m_s: float | None = None
 
     @property
     def white_covariance_m2(self) -> Array:

@@ -1,5 +1,7 @@
 """A vehicle whose receiver is wrong for seconds never states a position that may be anywhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,21 +73,36 @@ def test_a_vehicle_that_drives_is_placed_by_fixes_that_come_rarely() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [1, 2, 5, 10])
+def test_two_outliers_on_opposite_sides_place_no_vehicle_that_tells_its_speed(rate_hz: int) -> None:
+    rng = np.random.default_rng(5)
+    for speed_m_s in (None, 0.1):
+        own = OwnVehicle(OwnConfig(RbpfConfig()), NOWHERE, rng)
+        for off_m in ([0.0, 30.0], [0.0, 0.0], [0.0, -30.0]):
+            own.step(1 / rate_hz, replace(fix(rng, np.array(off_m)), speed_m_s=speed_m_s))
+        assert (own.position_m() is None) == (speed_m_s is not None)
+
+
+@pytest.mark.parametrize("rate_hz", [1, 2, 5, 10])
 @pytest.mark.parametrize("speed_m_s", [0.0, 5.0, 15.0, 30.0])
-def test_a_vehicle_without_a_map_is_placed_as_well_as_its_fixes(rate_hz: int, speed_m_s: float) -> None:
+@pytest.mark.parametrize("tells_speed", [False, True])
+def test_a_vehicle_without_a_map_is_placed_as_well_as_its_fixes(
+    rate_hz: int, speed_m_s: float, tells_speed: bool
+) -> None:
     """It drives around, in circles of at least 150 m, and brakes and accelerates by 3 m/s² in every 20 s."""
     rng, step_s = np.random.default_rng(7), 0.02
     time_s = np.arange(0, 60, step_s)
     brakes_m_s = np.interp(time_s % 20, [8, 12, 16], [0, min(12.0, speed_m_s), 0])
     turned_rad = np.cumsum((speed_m_s - brakes_m_s) / 150) * step_s
     way_m = np.stack([np.cos(turned_rad), np.sin(turned_rad)], 1) * (speed_m_s - brakes_m_s)[:, None] * step_s
-    place_m = np.cumsum(way_m, axis=0)[:: round(1 / (rate_hz * step_s))]
+    each = round(1 / (rate_hz * step_s))
+    place_m, told_m_s = np.cumsum(way_m, axis=0)[::each], (speed_m_s - brakes_m_s)[::each]
     for sigma_m in (0.1, 1.0, 3.0):
         own = OwnVehicle(OwnConfig(RbpfConfig()), NOWHERE, rng)
         noise_m = sigma_m * rng.standard_normal(place_m.shape)
         off_m = []
-        for true_m, seen_m in zip(place_m, place_m + COMMON_M + noise_m, strict=True):
-            own.step(1 / rate_hz, Observation(seen_m, sigma_m**2 * np.eye(2), None))
+        for true_m, seen_m, told in zip(place_m, place_m + COMMON_M + noise_m, told_m_s.tolist(), strict=True):
+            speed = told if tells_speed else None
+            own.step(1 / rate_hz, Observation(seen_m, sigma_m**2 * np.eye(2), None, speed_m_s=speed))
             position = own.position_m()
             off_m.append((position[0] if position else seen_m) + own.estimate_m - COMMON_M - true_m)
         assert position is not None
