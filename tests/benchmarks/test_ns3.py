@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +11,7 @@ from benchmarks.ns3 import acknowledged, buildings
 from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, LEAST_PAIRS, Comparison, draw
 from benchmarks.ns3.ground import RATE_HZ, Curve, Outcome, ScheduleConstraints
 from benchmarks.ns3.simulators import ours
+from tests.support.forked_commands import MODULE, run
 from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow
@@ -80,8 +79,8 @@ def test_a_curve_counts_every_pair_at_its_distance() -> None:
 
 def test_without_ns3_it_says_in_one_line_how_to_get_it(tmp_path: Path) -> None:
     environment = {**os.environ, "PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-P", "-m", "benchmarks.ns3", "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    command = [*MODULE, "benchmarks.ns3", "--out", str(tmp_path / "out")]
+    done = run(command, cwd=tmp_path, env=environment, capture_output=True)
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and "apt-get install" in done.stderr
     assert not (tmp_path / "out").exists()

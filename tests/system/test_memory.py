@@ -28,8 +28,8 @@ async def once(node) -> None:
 
 
 async def hog(node) -> None:
-    """Take 4 MB a period from 2 s on."""
-    await keeps(node, (4_000_000 * (number > 20) for number, _ in enumerate(iter(int, 1))))
+    """Take 16 MB a period from 2 s on."""
+    await keeps(node, (16_000_000 * (number > 20) for number, _ in enumerate(iter(int, 1))))
 '''
 
 

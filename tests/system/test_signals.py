@@ -1,4 +1,7 @@
-"""A live run in the caller's own process leaves the caller's signal handlers as they were, however it ends."""
+"""A live run in the caller's own process leaves the caller's signal handlers as they were, however it ends.
+
+tests/emulator/drivers/test_signals.py has callers that ignore signals or leave them to the system.
+"""
 
 import asyncio
 import os
@@ -25,12 +28,11 @@ def own(number: int, frame: object) -> None:
     """A handler of the caller's."""
 
 
-@pytest.fixture(params=[own, signal.SIG_IGN], ids=["own", "ignored"], autouse=True)
-def handlers(request: pytest.FixtureRequest) -> Iterator[list[object]]:
-    """Signal handlers of the caller; SIGCHLD must not be ignored by whoever starts processes."""
-    chosen = dict.fromkeys(HANDLED[:2], request.param) | {signal.SIGCHLD: own}
-    earlier = {number: signal.signal(number, handler) for number, handler in chosen.items()}
-    yield list(chosen.values())
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[list[object]]:
+    """Signal handlers of the caller."""
+    earlier = {number: signal.signal(number, own) for number in HANDLED}
+    yield [own] * len(HANDLED)
     for number, handler in earlier.items():
         signal.signal(number, handler)
 
@@ -52,10 +54,8 @@ def now() -> list[object]:
     return [signal.getsignal(number) for number in HANDLED]
 
 
-@pytest.mark.parametrize("pacing", ["lockstep", "realtime"])
-def test_after_a_run_that_came_to_its_end(pacing: str, tmp_path: Path, handlers: list[object]) -> None:
-    emulation = emulation_of(tmp_path / "run", f"run.pacing='{pacing}'")
-    assert not live(emulation)
+def test_after_a_run_that_came_to_its_end(tmp_path: Path, handlers: list[object]) -> None:
+    assert not live(emulation_of(tmp_path / "run"))
     assert now() == handlers
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.forked_commands import VNET, run
 from tests.support.paths import ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("default_signals")]
@@ -56,15 +57,17 @@ def answered():
 
 
 def vnet(folder: Path, *arguments: str, at_start: str = "") -> tuple[int, str, str]:
-    """Run a command in a folder; returns its status, its output and its standard error."""
+    """Run a command in a folder; returns its status, its output and its standard error.
+
+    Unless something is to happen at the start of Python, it is forked.
+    """
     (folder / "sitecustomize.py").write_text(at_start)
     environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     environment.pop("PYTHONHASHSEED", None)
-    command = [sys.executable, "-P", "-m", "emulator", *arguments]
-    errors = folder / "stderr.txt"
+    errors, start = folder / "stderr.txt", subprocess.run if at_start else run
     with errors.open("w") as stderr:
-        done = subprocess.run(
-            command, env=environment, cwd=folder, stdout=subprocess.PIPE, stderr=stderr, text=True
+        done = start(
+            [*VNET, *arguments], env=environment, cwd=folder, stdout=subprocess.PIPE, stderr=stderr, text=True
         )
     return done.returncode, done.stdout, errors.read_text()
 
@@ -130,7 +133,7 @@ def test_a_program_that_does_not_yield_in_time_ends_as_at_the_second(
     tmp_path: Path, spins: str, shown: str, said: str
 ) -> None:
     (tmp_path / "busy.py").write_text(f"{ONCE}{spins}\n")
-    options = ("--program", "busy:main", "--quiet", "--set", "run.stall_timeout_s=1")
+    options = ("--program", "busy:main", "--quiet", "--set", "run.stall_timeout_s=0.3")
     status, output, errors = vnet(tmp_path, "simulate", BEACON, *options)
     assert (status, shown in output, said in errors) == (130, True, True), errors
     assert bool(output) == bool(shown)
