@@ -22,9 +22,10 @@ from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv, write_links
 from emulator.records.disk import atomically, disk_errors
+from emulator.records.manifest import differing_files, read_manifest
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, UnicastFigures, radio_metrics, unicast_figures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
-from emulator.terminal.console import one_line_errors
+from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError
 
@@ -161,6 +162,8 @@ def export(
         if definitions is not None and chosen is not Format.MCAP:
             raise VnetError(f"--definitions {definitions}: of mcap, and not of {chosen.value}")
         recorded = RecordedRun.open(run)
+        for problem in _damage(run):
+            tell(f"{run}: {problem}; vnet check says more")
         match chosen:
             case Format.PCAPNG:
                 path = out or run / "frames.pcapng"
@@ -177,6 +180,16 @@ def export(
             case Format.CSV:
                 path = out or run / "csv"
                 print(f"{', '.join(_write_folder(path, recorded))} in {path}")
+
+
+def _damage(run: Path) -> list[str]:
+    """Return what is wrong with the files of a finished run, if anything."""
+    try:
+        digests = read_manifest(run)
+    except VnetError as error:
+        return [str(error).removeprefix(f"{run}/")]
+    wrong = {} if digests is None else differing_files(run, digests)
+    return [f"{name} {problem}" for name, problem in wrong.items()]
 
 
 def _format(to: Format | None, out: Path | None) -> Format:

@@ -160,7 +160,7 @@ def _check_name(name: str) -> None:
     reserved = keyword.iskeyword(name) or name.startswith("test_") or name.endswith("_check")
     if reserved or not (name.isidentifier() and name.isascii()):
         raise VnetError(
-            f"{name}: no name for a program; letters of ASCII, digits and _, and neither test_… nor …_check"
+            f"{name}: no name for a program; ASCII letters, digits and _, no keyword of Python, test_… or …_check"
         )
     found = importlib.util.find_spec(name)
     if found is not None and found.origin is not None:

@@ -20,6 +20,7 @@ from emulator.records.radio_metrics import radio_metrics, sent_by_programs
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.tables import TABLES
 from emulator.world.radio_inputs import COLUMNS, LinkTable
+from vnet.errors import VnetError
 from vnet.types import IntArray, Mask
 from vnet.units import NS_PER_S
 
@@ -59,17 +60,11 @@ def _flat_columns(table: pa.Table) -> Iterator[tuple[str, pa.Array]]:
         elif pa.types.is_large_binary(kind):
             yield f"{name}_hex", pa.array([entry.hex() for entry in column.to_pylist()], pa.string())
         elif pa.types.is_nested(kind):
-            texts = (None if entry is None else json.dumps(_plain(entry)) for entry in column.to_pylist())
+            plain = dict if pa.types.is_map(kind) else list
+            texts = (None if entry is None else json.dumps(plain(entry)) for entry in column.to_pylist())
             yield name, pa.array(texts, pa.string())
         else:
             yield name, column
-
-
-def _plain(entry: object) -> object:
-    """Return a list as it is, and a map (a list of tuples) as a dictionary."""
-    if isinstance(entry, list) and entry and all(isinstance(pair, tuple) for pair in entry):
-        return dict(entry)
-    return entry
 
 
 DIGITS = 9
@@ -81,9 +76,11 @@ AT_SENDER = decided_at(Stage.SENDER)
 def write_links(recorded: OpenedRun, file: BinaryIO, every_s: float = 1.0) -> int:
     """Write the links of a run, with their losses in intervals of `every_s`; return the number of rows.
 
-    With 0 each reception is an interval of its own, so that its row says 0 or 1.
+    With 0 each reception is an interval of its own, so that its row says 0 or 1. Raise VnetError without a row.
     """
     table = measured_links(recorded, round(every_s * NS_PER_S))
+    if not len(table.time_ns):
+        raise VnetError(f"{recorded.folder}: no frame was on air to a vehicle in range: there are no links")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)

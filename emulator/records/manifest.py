@@ -28,8 +28,8 @@ from vnet.bounded import open_regular, read_regular
 from vnet.errors import VnetError, printable
 
 LARGEST_BYTES = 1 << 26
-CHECKS_LOG = "logs/checks.log"
-"""The log of checks of the user's own, which they also write when they judge a folder again."""
+UNLISTED = ("logs/checks.log", "logs/programs.log")
+"""Logs of checks of the user's own, which judge a folder again, and of what programs of earlier vnets printed."""
 _MANIFEST = TypeAdapter(dict[str, str])
 
 
@@ -61,7 +61,7 @@ def read_manifest(folder: Path) -> dict[str, str] | None:
 def differing_files(folder: Path, digests: dict[str, str]) -> dict[str, str]:
     """Return the files that are not those of the manifest, each with what is wrong with it."""
     found = {}
-    added = (name for name in _names(folder) if name != CHECKS_LOG)
+    added = (name for name in _names(folder) if name not in UNLISTED)
     for name in sorted({*digests, *added}):
         if name not in digests:
             found[name] = "is not in the manifest"
@@ -92,5 +92,5 @@ def _names(folder: Path) -> Iterator[str]:
     yield from (name for name in _evidence() if (folder / name).is_file())
     for below in (folder / "logs", folder / FILES):
         for path in sorted(below.rglob("*")):
-            if path.is_file() and not path.is_symlink() and path.name != PROGRAMS_LOG:
+            if path.is_file() and not path.is_symlink() and path != folder / "logs" / PROGRAMS_LOG:
                 yield path.relative_to(folder).as_posix()

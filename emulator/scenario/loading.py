@@ -197,7 +197,8 @@ def parse_values(key: str, text: str) -> list[Any]:
 def _value(text: str) -> Any:
     """A value in TOML's syntax, or a bare word."""
     try:
-        return parse_toml(f"value = {text}")["value"]
+        (value,) = parse_toml(f"value = {text}").values()  # not what further lines would set
+        return value
     except ValueError:
         return text.strip()
 

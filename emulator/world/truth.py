@@ -105,21 +105,23 @@ def _read(path: Path) -> tuple[Array, Array]:
     with open_csv(path, LONGEST_LINE) as lines:
         reader = csv.DictReader(lines)
         columns = _columns(path, reader.fieldnames or ())
-        rows = []
+        rows, lines_read = [], []
         for row in reader:
+            lines_read.append(reader.line_num)
             rows.append([_number(path, reader.line_num, name, row[name]) for name in columns])
             if len(rows) > MOST_ROWS:
                 raise ScenarioError(f"{path}: more than {MOST_ROWS:,} rows")
     if not rows:
         raise ScenarioError(f"{path}: no rows of errors")
     table = np.array(rows)
-    late = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+    late = np.flatnonzero(np.diff(table[:, 0]) <= 0) + 1
     if len(late):
-        time_s = table[late[0] + 1, 0]
-        raise ScenarioError(f"{path}: time_s = {time_s:.10g} follows {table[late[0], 0]:.10g}: times must increase")
-    far = np.abs(table[:, 1:]).max()
-    if far > FARTHEST_M:
-        raise ScenarioError(f"{path}: an error of {far:g} m; at most {FARTHEST_M:g} m are allowed")
+        where, (before_s, time_s) = f"{path}: line {lines_read[late[0]]}", table[late[0] - 1 : late[0] + 1, 0]
+        raise ScenarioError(f"{where}: time_s = {time_s:.10g} follows {before_s:.10g}: times must increase")
+    far_m = np.abs(table[:, 1:]).max(axis=1)
+    if far_m.max() > FARTHEST_M:
+        where = f"{path}: line {lines_read[far_m.argmax()]}"
+        raise ScenarioError(f"{where}: an error of {far_m.max():g} m; at most {FARTHEST_M:g} m are allowed")
     return table[:, 0], table[:, 1:].reshape(len(table), -1, 2)
 
 

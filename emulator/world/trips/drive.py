@@ -80,7 +80,8 @@ COLUMNS = ("time_s", "x_m", "y_m", "heading_rad")
 def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
     """Return the samples of a CSV file. Raise ScenarioError, naming the row (the header is 1), for a bad file."""
     with open_csv(path, _LONGEST_LINE) as lines:
-        columns = choose_columns(path, next(csv.reader(lines), []))
+        names = next(csv.reader(lines), [])
+        columns = choose_columns(path, names)
     types = {name: pa.string() if name == "id" else pa.float64() for name in columns}
     convert = pacsv.ConvertOptions(
         column_types=types, include_columns=columns, null_values=[], strings_can_be_null=False
@@ -90,7 +91,8 @@ def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
         reader = pacsv.open_csv(path, pacsv.ReadOptions(use_threads=False), convert_options=convert)
         return _collect(path, reader, columns, first_row=2, window_s=window_s)
     except (OSError, pa.ArrowInvalid) as error:
-        raise ScenarioError(f"{path}: not a CSV file of trips: {printable(str(error), 300)}") from None
+        problem = re.sub(r"^In CSV column #(\d+): ", lambda found: f"{names[int(found[1])]}: ", str(error))
+        raise ScenarioError(f"{path}: not a CSV file of trips: {printable(problem, 300)}") from None
 
 
 def read_parquet(path: Path, window_s: tuple[float, float] | None) -> Samples:
@@ -131,11 +133,18 @@ def _collect(
 ) -> Samples:
     samples = Samples(path, "row", window_s)
     for batch in batches:
-        numbers = {name: batch[name].cast(pa.float64()) for name in columns[1:]}
+        numbers = {name: _numbers(path, name, batch[name]) for name in columns[1:]}
         row = first_row + samples.taken + np.arange(len(batch), dtype=np.int64)
         values = {name: np.asarray(column.to_numpy(zero_copy_only=False)) for name, column in numbers.items()}
         samples.add(batch["id"].cast(pa.string()), row, values)
     return samples
+
+
+def _numbers(path: Path, name: str, column: pa.Array) -> pa.Array:
+    try:
+        return column.cast(pa.float64())
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        raise ScenarioError(f"{path}: {name} holds {column.type}: {printable(str(error), 300)}") from None
 
 
 def read_fcd(path: Path, window_s: tuple[float, float] | None) -> Samples:
@@ -308,6 +317,8 @@ def _ids(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> list[str]:
     if "id" not in arrays:
         width = len(str(count))
         return [f"v{number:0{width}d}" for number in range(1, count + 1)]
+    if arrays["id"].dtype.kind not in "Uiu":
+        raise ScenarioError(f"{path}: id holds {arrays['id'].dtype}: texts (str) or integers are needed")
     ids = [str(name) for name in arrays["id"].ravel()]
     if len(ids) != count:
         raise ScenarioError(f"{path}: {len(ids)} ids for {count} rows")

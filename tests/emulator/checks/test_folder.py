@@ -12,7 +12,7 @@ import pytest
 from emulator.checks.folder import check_files
 from emulator.checks.judge import CheckResult, Judgement, RecordedRun, Verdict, check_run
 from emulator.records.manifest import write_manifest
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.scenario.scenario import Scenario
 from tests.support.folder_edits import EDITS, Edit, forge, listing, table
 from tests.support.paths import ROOT
@@ -150,6 +150,16 @@ def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_
     of_format(2)(copy)
     judgement = check_run(copy)
     assert (broken(judgement), judgement.verdict) == (set(), Verdict.UNKNOWN)
+
+
+@pytest.mark.slow
+def test_a_log_is_of_the_manifest_whatever_its_vehicle_is_called(copy: Path) -> None:
+    (copy / "logs" / PROGRAMS_LOG).write_text("what programs printed\n")
+    (copy / "logs" / "programs.log").write_text("of a vehicle\n")
+    write_manifest(RunFolder(copy))
+    assert broken(check_run(copy)) == set()
+    (copy / "logs" / "programs.log").write_text("changed\n")
+    assert broken(check_run(copy)) == {"files"}
 
 
 @pytest.mark.slow

@@ -59,4 +59,4 @@ def test_all_pages_are_listed_and_printed_as_they_are() -> None:
 
 def test_a_name_that_is_not_ascii_is_refused_with_what_is_allowed(tmp_path: Path) -> None:
     status, output = new(tmp_path / "ünï")[:2]
-    assert status == 2 and "letters of ASCII, digits and _" in output
+    assert status == 2 and "ASCII letters, digits and _" in output

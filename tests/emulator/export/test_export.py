@@ -3,19 +3,21 @@
 import csv
 import io
 import json
+import shutil
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from emulator.export.mcap_file import SCHEMAS, write_mcap
 from emulator.export.pcapng import write_pcapng
-from emulator.export.tables import measured_links, write_csv
+from emulator.export.tables import flat, measured_links, write_csv
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
 from emulator.world.radio_inputs import read_link_table
@@ -253,6 +255,8 @@ def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: OpenedRun, 
     assert float(state["covariance_m2_yy"]) == 1.0
     assert json.loads(state["values"])["several"] == [1.0, 2.0]
     assert {"links", "vehicles", "distances", "events"} <= tables.keys()
+    nothing = pa.table({"values": pa.array([[]], pa.map_(pa.string(), pa.float64()))})
+    assert flat(nothing)["values"].to_pylist() == ["{}"], "an object as any other"
 
 
 # The commands.
@@ -315,6 +319,26 @@ def test_links_of_frames_to_one_vehicle_are_those_of_attempts_and_acknowledgemen
     came = [row for row in rows if row["outcome"] in ("delivered", "duplicate")]
     assert len(rows) > 50 and links["a", "b"] == pytest.approx(1 - len(came) / len(rows))
     assert links["b", "a"] == pytest.approx(1 - sum(row["acked"] for row in rows) / len(came))
+
+
+def test_a_run_without_frames_has_no_links(tmp_path: Path) -> None:
+    trips = write_trips(tmp_path / "t.csv", {"a": [(0, 2, still(0))]})
+    run_scenario(tmp_path / "run", scenario_of_trips(trips, 1.0, program=f"{__name__}:reports"))
+    done = RUNNER.invoke(app, ["export", str(tmp_path / "run"), "--to", "links"])
+    assert done.exit_code == 2 and "there are no links" in done.stderr
+    assert not (tmp_path / "run" / "links.csv").exists()
+
+
+def test_an_export_of_a_damaged_run_says_so(folder: Path, tmp_path: Path) -> None:
+    whole = RUNNER.invoke(app, ["export", str(folder), "--out", str(tmp_path / "whole")])
+    assert whole.exit_code == 0 and not whole.stderr
+    run = shutil.copytree(folder, tmp_path / "run")
+    (run / "events.jsonl").write_text("")
+    done = RUNNER.invoke(app, ["export", str(run), "--out", str(tmp_path / "csv")])
+    assert done.exit_code == 0 and "run: events.jsonl has other contents; vnet check says more" in done.stderr
+    (run / "manifest.json").write_text("")
+    done = RUNNER.invoke(app, ["export", str(run), "--out", str(tmp_path / "again")])
+    assert done.exit_code == 0 and "manifest.json: not a table of digests by file; vnet check" in done.stderr
 
 
 def test_what_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:

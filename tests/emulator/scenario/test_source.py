@@ -73,6 +73,7 @@ def test_values_of_all_kinds_reach_the_scenario() -> None:
             {},
             r"run\.name = .*: dates and times are written as text, in quotes",
         ),
+        ({}, {"network.vehicles=2\nrun.seed": 3}, r"network\.vehicles = '2\\nrun\.seed=3': a whole number is"),
         ({}, {"loss": 1}, r"--set loss=1: write it as section\.key=value"),
         (3, {}, r"^scenario = 3: a path, a shipped scenario's name, or a dict is needed"),
         ({"network": {"kind": "file", "path": "no.csv"}}, {}, r"network\.path = 'no\.csv': no such file"),

@@ -201,7 +201,7 @@ def test_a_wrong_parquet_file_is_refused(tmp_path: Path) -> None:
     pq.write_table(pa.table({**columns, "id": ["a", "a"], "x_m": [0.0, None]}), path)
     assert "row 2: x_m = nan" in refusal(path)
     pq.write_table(pa.table({**columns, "id": ["a", "a"], "x_m": ["one", "two"]}), path)
-    assert "not a Parquet file of trips" in refusal(path)
+    assert "x_m holds string: Failed to parse string: 'two'" in refusal(path)
 
 
 def test_other_files_are_refused_by_their_name(tmp_path: Path) -> None:
