@@ -325,7 +325,7 @@ class World:
         buildings = load_buildings(scenario, frame, self.area_m)
         self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings, scenario.roadside)
         if buildings is not None and not len(buildings):
-            self.notes = (*self.notes, f"radio.buildings: none is near a vehicle; check {_place_of(scenario)}")
+            self.notes = (*self.notes, f"radio.buildings: none is between vehicles; check {_place_of(scenario)}")
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((present[1:] != present[:-1]).any(axis=1)) + 1  # periods
         _check_exceptions(scenario, motion.node_ids)

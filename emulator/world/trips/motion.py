@@ -134,8 +134,9 @@ class Samples:
             is_wrong = ~(np.abs(values) <= _BOUND[name])  # NaN is in no range
             wrong = np.flatnonzero(is_wrong & ~np.isnan(values) if name in OPTIONAL else is_wrong)
             if len(wrong):
+                at = "" if name == "time_s" else f" at {columns['time_s'][wrong[0]]:.10g} s"
                 needed = f"a finite number is needed, within ±{_BOUND[name]:g}"
-                raise self._problem(line[wrong[0]], f"{name} = {values[wrong[0]]:g}: {needed}")
+                raise self._problem(line[wrong[0]], f"{name} = {values[wrong[0]]:g}{at}: {needed}")
         columns = {"code": self._codes(ids, line).astype(float), **columns}
         self._keep(columns, self._new(columns, line))
 

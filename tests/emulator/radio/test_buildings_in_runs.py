@@ -126,4 +126,4 @@ def test_the_largest_buildings_are_drawn_where_there_are_many() -> None:
 
 def test_buildings_far_from_all_vehicles_are_told(tmp_path: Path) -> None:
     world = build_world(among_buildings(tmp_path, FAR_AWAY))
-    assert world.notes == ("radio.buildings: none is near a vehicle; check the coordinates of its corners",)
+    assert world.notes == ("radio.buildings: none is between vehicles; check the coordinates of its corners",)
