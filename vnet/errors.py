@@ -38,6 +38,12 @@ def sendable(text: str) -> str:
     return text if text.isascii() else text.encode(errors="backslashreplace").decode()
 
 
+def check_utf8(path: str) -> None:
+    """Raise VnetError for a path with other bytes than UTF-8: the files of a run, which name paths, are UTF-8."""
+    if sendable(path) != path:
+        raise VnetError(f"{path}: not UTF-8, as paths must be; rename it")
+
+
 def shown(value: object) -> str:
     """Return any wrong value as a message quotes it."""
     try:

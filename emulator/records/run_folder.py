@@ -28,7 +28,7 @@ from emulator.records.disk import atomically, check_is_free, disk_errors
 from emulator.records.events import Event, EventKind
 from emulator.scenario.loading import dump_scenario, input_digests
 from emulator.scenario.scenario import Scenario
-from vnet.errors import VnetError
+from vnet.errors import VnetError, check_utf8
 from vnet.units import BYTES_PER_MB
 
 if TYPE_CHECKING:
@@ -90,9 +90,10 @@ class RunFolder:
 
     @classmethod
     def prepare(cls, out: Path | None, scenario: Scenario) -> RunFolder:
-        """Return the folder that `open` will make. Raises VnetError for an `out` that is not empty."""
+        """Return the folder that `open` will make. Raises VnetError for an `out` that is not empty, or not UTF-8."""
         path = out or RUNS / f"{scenario.run.name}-{scenario.run.seed}"
         with disk_errors(path):
+            check_utf8(str(path.absolute()))
             if out is not None:
                 check_is_free(out, "--out ")
         folder = cls(path)

@@ -32,7 +32,7 @@ from typing import Any
 import typer
 import typer.main
 
-from vnet.errors import LONGEST_MESSAGE, VnetError, printable, sendable
+from vnet.errors import LONGEST_MESSAGE, VnetError, check_utf8, printable, sendable
 from vnet.extras import missed_by
 from vnet.runtime import interrupts
 
@@ -127,13 +127,11 @@ def run_app(app: typer.Typer, arguments: Sequence[str]) -> int:
 
 
 def _refuse_other_than_utf8(arguments: Sequence[str]) -> None:
-    """Raise VnetError for an argument or a current folder with other bytes: the files of a run are UTF-8."""
-    texts = list(arguments)
+    """Raise VnetError for an argument or a current folder with other bytes."""
+    for argument in arguments:
+        check_utf8(argument)
     with suppress(FileNotFoundError):  # a current folder that is gone
-        texts.append(str(Path.cwd()))
-    for text in texts:
-        if sendable(text) != text:
-            raise VnetError(f"{text}: not UTF-8, as paths must be; rename it")
+        check_utf8(str(Path.cwd()))
 
 
 def say_output_failed(error: OSError, arguments: Sequence[str]) -> int:

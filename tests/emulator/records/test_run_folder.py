@@ -29,6 +29,8 @@ def test_a_place_that_the_system_refuses_is_one_line(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     with pytest.raises(VnetError, match="cannot write: File name too long"):
         RunFolder.create(tmp_path / ("a" * 300), Scenario())
+    with pytest.raises(VnetError, match=r"\\udce9: not UTF-8"):
+        RunFolder.create(tmp_path / "b\udce9", Scenario())
     (tmp_path / "runs").touch()
     with pytest.raises(VnetError, match="cannot write"):
         RunFolder.create(None, Scenario())
