@@ -90,7 +90,7 @@ class RunFolder:
 
     @classmethod
     def prepare(cls, out: Path | None, scenario: Scenario) -> RunFolder:
-        """Return the folder that `open` will make. Raises VnetError for an `out` that is not empty, or not UTF-8."""
+        """Return the folder that `open` will make. Raises VnetError for an `out` not empty, or not UTF-8."""
         path = out or RUNS / f"{scenario.run.name}-{scenario.run.seed}"
         with disk_errors(path):
             check_utf8(str(path.absolute()))
