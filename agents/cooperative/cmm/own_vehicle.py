@@ -7,7 +7,6 @@ error: the *increment*.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,8 +32,6 @@ LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest three agree."""
 LOST_FIXES = 5
 """Least number of consecutive outliers, where fixes are rare."""
-SPEED_SIGMA_M_S = 1.0
-"""Deviation (m/s) of the speed that a receiver tells: ten times that of a Doppler measurement under open sky."""
 INCREMENT_SHARE = 0.9
 """Share of what a fix says about c that is told: c moves between fixes, for all alike, and the part of that which
 filters take for offsets is an error that all increments have in common (Bar-Shalom 1981)."""
@@ -190,26 +187,17 @@ class OwnVehicle:
         if len(before) < 2 or before[1][0] <= 0:  # the clock of a vehicle may be set back
             return False
         (_, first), (gap_s, second) = before
-        if not (self._is_driven(first, second, gap_s) and self._is_driven(second, fix, since_s)):
-            return False
+        acceleration_m2_s4 = self._unknown.acceleration_m2_s4
+        if not (
+            second.follows(first, gap_s, acceleration_m2_s4) and fix.follows(second, since_s, acceleration_m2_s4)
+        ):
+            return False  # two outliers on opposite sides of a vehicle are on a straight line with it
         more = since_s / gap_s
         off_m = fix.position_m - second.position_m - more * (second.position_m - first.position_m)
         weighed = ((1.0, fix), ((1 + more) ** 2, second), (more**2, first))
         noise_m2 = sum(weight * float(np.trace(each.white_covariance_m2)) for weight, each in weighed) / 2
         moved_m2 = self._unknown.acceleration_m2_s4 * (since_s * (since_s + gap_s) / 2) ** 2
         return bool(off_m @ off_m <= GATE_SIGMAS**2 * (moved_m2 + noise_m2))
-
-    def _is_driven(self, before: Observation, fix: Observation, gap_s: float) -> bool:
-        """Tell whether two fixes are as far apart as their speeds say, if they tell any.
-
-        Two outliers on opposite sides of a vehicle are on a straight line with it.
-        """
-        if before.speed_m_s is None or fix.speed_m_s is None:
-            return True
-        off_m = math.dist(fix.position_m, before.position_m) - gap_s * (before.speed_m_s + fix.speed_m_s) / 2
-        noise_m2 = float(np.trace(before.white_covariance_m2 + fix.white_covariance_m2)) / 2
-        speed_m2_s2 = SPEED_SIGMA_M_S**2 + self._unknown.acceleration_m2_s4 * gap_s**2 / 4
-        return off_m**2 <= GATE_SIGMAS**2 * (noise_m2 + gap_s**2 * speed_m2_s2)
 
     def _suit(self, multipath: tuple[float, float]) -> None:
         """Take the model of a receiver with this multipath, deviation (m) and correlation time (s)."""

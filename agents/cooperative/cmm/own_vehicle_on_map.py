@@ -322,7 +322,9 @@ MULTIPATH_SHARE = 0.3
 vehicles alike: told whole, increments of 15 vehicles add up to less than half the deviation that c has. Where the
 offset is that of a lane, which changes with each turn, they are told whole."""
 LOST_S = 2.0
-"""Time (s) of nothing but outliers after which the vehicle is somewhere else."""
+"""Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest follow each other."""
+LOST_FIXES = 3
+"""Least number of consecutive outliers, where fixes are rare."""
 SAME_LANE_M = 0.5
 SAME_LANE_RAD = 0.1
 """Distance (m) and angle (rad) within which two segments are taken for one lane: a road may be cut anywhere."""
@@ -349,6 +351,9 @@ class OwnVehicleOnMap:
         self._is_placed = False
         self._anchor_m = np.full(2, np.nan)
         self._outliers_s = 0.0
+        self._taken: Observation | None = None  # the fix that was taken last
+        self._latest: Observation | None = None
+        self._untaken_s = self._since_s = 0.0  # the times since these
         self._heading_rad: float | None = None
         self._multipath = (0.0, 0.0)
         self._rest: tuple[Array, Array] | None = None  # what the latest fix says beyond `PRECISE_M2`
@@ -411,23 +416,29 @@ class OwnVehicleOnMap:
         self._take_moments()
         self.prior = self._said = Information.of(*self.belief)
         self._rest = None
+        self._untaken_s += dt_s
+        self._since_s += dt_s
         if fix is None:
             return NOTHING
         if fix.heading_rad is not None:
             self._heading_rad = fix.heading_rad
+        before, since_s = self._latest, self._since_s
+        self._latest, self._since_s = fix, 0.0
         exact_m2 = fix.white_covariance_m2
         more_m2 = max(PRECISE_M2 - float(exact_m2.diagonal().min()), 0.0)
         noise_m2 = exact_m2 + more_m2 * np.eye(2)
         if not self._is_placed:
             self._place(fix, noise_m2)
-        elif self._is_outlier(fix):
+        elif self._is_outlier(fix) or not self._follows(fix, self._taken, self._untaken_s):
             self._outliers_s += dt_s
-            if self._outliers_s < LOST_S:
+            is_lost = self._outliers_s >= max(LOST_S, LOST_FIXES * since_s)
+            if not (is_lost and self._follows(fix, before, since_s)):
                 return NOTHING
             self._place(fix, noise_m2)
         else:
             self._hypotheses.update(fix.position_m, noise_m2)
         self._outliers_s = 0.0
+        self._taken, self._untaken_s = fix, 0.0
         if more_m2:  # 1 / R − 1 / (R + more) is left
             self._rest = fix.position_m, exact_m2 + exact_m2 @ exact_m2 / more_m2
         self._look(fix)
@@ -466,6 +477,9 @@ class OwnVehicleOnMap:
         off_m = fix.position_m - _seen(self._mean)
         seen = _seen(_seen(self._covariance).T) + fix.white_covariance_m2
         return bool(off_m @ np.linalg.solve(seen, off_m) > self._config.gate_sigmas**2)
+
+    def _follows(self, fix: Observation, before: Observation | None, gap_s: float) -> bool:
+        return before is None or fix.follows(before, gap_s, self._config.driving_m2_s4[0])
 
     def _place(self, fix: Observation, noise_m2: Array) -> None:
         """Begin where the fix says up to noise (2, 2), on an unknown lane, with what is known of c and m."""

@@ -15,6 +15,7 @@ The parts: `common_error` has the particles, `tracks` the vehicles, `map_evidenc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -36,6 +37,10 @@ from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
+SPEED_SIGMA_M_S = 1.0
+"""Deviation (m/s) of the speed that a receiver tells: ten times that of a Doppler measurement under open sky."""
+SPEED_GATE_SIGMAS = 5.0
+"""Two fixes further from what their speeds say do not follow each other."""
 REST_SPEED_M_S = 0.5
 """Standard deviation (m/s) of a vehicle's speed at its first fix, on straight lanes, where vehicles stand."""
 START_FACTOR = 10
@@ -123,6 +128,29 @@ class Observation:
         if self.covariance_m2.diagonal().min() >= LEAST_NOISE_M2:
             return self.covariance_m2
         return self.covariance_m2 + LEAST_NOISE_M2 * np.eye(2)
+
+    def follows(self, before: Observation, gap_s: float, acceleration_m2_s4: float) -> bool:
+        """Tell whether this fix is where another, `gap_s` before, leads by what both tell of speed and heading.
+
+        The acceleration between them has the given variance. Without a speed any fix is, without a heading any that
+        is as far away.
+        """
+        if before.speed_m_s is None or self.speed_m_s is None:
+            return True
+        half_s, (east_m, north_m) = gap_s / 2, (self.position_m - before.position_m).tolist()
+        if before.heading_rad is None or self.heading_rad is None:
+            off_m = math.hypot(east_m, north_m) - half_s * (before.speed_m_s + self.speed_m_s)
+        else:
+            for speed_m_s, heading_rad in (
+                (before.speed_m_s, before.heading_rad),
+                (self.speed_m_s, self.heading_rad),
+            ):
+                east_m -= half_s * speed_m_s * math.cos(heading_rad)
+                north_m -= half_s * speed_m_s * math.sin(heading_rad)
+            off_m = math.hypot(east_m, north_m)
+        noise_m2 = float(np.trace(before.white_covariance_m2 + self.white_covariance_m2)) / 2
+        speed_m2_s2 = SPEED_SIGMA_M_S**2 + acceleration_m2_s4 * gap_s**2 / 16
+        return off_m**2 <= SPEED_GATE_SIGMAS**2 * (noise_m2 + gap_s**2 * speed_m2_s2)
 
 
 class Rbpf:

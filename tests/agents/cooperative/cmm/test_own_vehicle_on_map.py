@@ -65,6 +65,23 @@ def vehicle_on(lanes: RoadMap, config: RbpfConfig = STEADY) -> OwnVehicleOnMap:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("rate_hz", [1, 2, 10])
+def test_outliers_along_the_road_are_none_of_its_places_where_fixes_tell_a_speed(rate_hz: int) -> None:
+    """It drives with 8 to 16 m/s; one fix in five is 30 m behind or ahead, often two in succession."""
+    rng, vehicle = np.random.default_rng(4), vehicle_on(roads((0, 0, EAST)))
+    time_s = np.arange(0, 90, 1 / rate_hz)
+    speed_m_s, east_m = 12 + 4 * np.sin(time_s / 5), 12 * time_s + 20 - 20 * np.cos(time_s / 5)
+    off_m = 30.0 * rng.choice([-1, 0, 1], len(time_s), p=[0.1, 0.8, 0.1])
+    off_m[: 2 * rate_hz] = 0
+    for true_m, wrong_m, speed in zip(east_m, off_m, speed_m_s.tolist(), strict=True):
+        seen_m = np.array([true_m + wrong_m, 0.0]) + COMMON_M + rng.normal(0, 0.5, 2)
+        vehicle.step(1 / rate_hz, Observation(seen_m, 0.25 * np.eye(2), EAST, speed_m_s=speed))
+        position = vehicle.position_m()
+        assert position is not None
+        assert abs(position[0][0] + vehicle.estimate_m[0] - COMMON_M[0] - true_m) < 8
+
+
+@pytest.mark.slow
 def test_a_lane_counts_once_for_a_vehicle_that_stands() -> None:
     """However long it stands, it knows of c across the lane what one lane with its deviation says."""
     sigma_m2 = 1.0**2 + 0.85**2 / 3
