@@ -74,19 +74,6 @@ async def minds_the_order(node: Node) -> None:
     await asyncio.gather(hear(), locate(), tick("a", 0.1), tick("b", 0.1), tick("c", 0.05), tock())
 
 
-async def some_end(node: Node) -> None:
-    """One vehicle's program returns and one's crashes, early in the run; the others go on for ever."""
-    async for fix in node.gnss:
-        heard = [(packet.sender, packet.received_ns, packet.payload) for packet in node.radio.drain()]
-        digest = zlib.crc32(repr((node.now_ns, fix.time_ns, heard)).encode())
-        await node.radio.broadcast(digest.to_bytes(4, "big"))
-        node.report(fix.position_m, digest=digest)
-        if fix.time_ns >= 600_000_000 and node.id == "v01":
-            return
-        if fix.time_ns >= 600_000_000 and node.id == "v04":
-            raise RuntimeError("the battery is flat")
-
-
 async def does_not_give_up(node: Node) -> None:
     """Goes on after it was cancelled, and says so to all; its final messages are many."""
 

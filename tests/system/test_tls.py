@@ -115,19 +115,7 @@ def test_anothers_certificate_gives_no_rights(router: zenoh.Session, access: Acc
     assert subscriber.try_recv() is None
 
 
-def test_agents_over_tls_do_the_same_as_in_one_process(vnet: Vnet, tmp_path: Path) -> None:
-    with ExitStack() as stack:
-        folder = tmp_path / "embedded"
-        emulator, endpoint = start_emulator(stack, folder, "--listen", LISTEN, "--rerun", "save")
-        assert endpoint.startswith("tls/127.0.0.1:")
-        start_agents(stack, endpoint, folder / "access")
-        embedded = finish(emulator, folder)
-    assert embedded.status == 0, embedded.stderr + embedded.stdout
-    assert embedded.fingerprint == vnet("simulate", SCENARIO, *OPTIONS).fingerprint
-    assert (folder / "recording.rrd").stat().st_size > 10_000, "the recorder has joined as well"
-
-
-def test_a_separate_router_over_tls_changes_nothing(vnet: Vnet, tmp_path: Path) -> None:
+def test_agents_and_a_separate_router_over_tls_do_the_same_as_one_process(vnet: Vnet, tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tls/127.0.0.1:{free.getsockname()[1]}"

@@ -204,15 +204,6 @@ def test_what_a_sender_did_not_send_reaches_nobody() -> None:
     assert subject.outcome.tolist() == [[Outcome.pending] * 2, [Outcome.out_of_range, Outcome.queue_full]]
 
 
-def test_a_frame_keeps_the_surroundings_of_its_handing_over_among_others() -> None:
-    topology = Topology(np.array([[0.0, 0.0], [50.0, 0.0]]), Disc(100.0), 30)
-    near = frame_of(among=topology)
-    topology.move(np.array([[0.0, 0.0], [500.0, 0.0]]))
-    subject = Receptions.of([near, frame_of(among=topology)], 2)
-    in_range([near, frame_of(among=topology)], subject)
-    assert subject.outcome[:, 1].tolist() == [Outcome.pending, Outcome.out_of_range]
-
-
 def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]:
     """Return the end of each frame of one sender at 1 µs a byte without access jitter; None if the queue was full."""  # noqa: E501
     ends: list[int | None] = []
