@@ -36,7 +36,7 @@ CURVES = {
 """Every fourth point, from 0 to 500 m, of simulated curves of Gonzalez-Martin, Sepulcre, Molina-Masegosa and
 Gozalvez, IEEE TVT 68(2), 2019, as published in their repository msepulcre/C-V2X."""
 
-SECONDS = [float(each) for each in os.environ.get("CURVES_S", "8 4 3").split()]
+SECONDS = [float(each) for each in os.environ.get("CURVES_S", "5 3 3").split()]
 """Emulated seconds of each; `make radios` takes more."""
 
 

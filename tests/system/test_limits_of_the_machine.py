@@ -84,8 +84,6 @@ def test_too_little_address_space_is_told_before_anything_is_done(
 def test_a_simulation_needs_less_address_space_than_a_gibibyte(tmp_path: Path) -> None:
     done = shell(f"ulimit -v {1 << 20}; {VNET} simulate beacon --duration 1 --out run {OPTIONS}", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    done = shell(f"ulimit -v {1 << 20}; {VNET} check run", tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_memory_that_is_gone_in_the_midst_is_told_in_one_line(tmp_path: Path) -> None:
