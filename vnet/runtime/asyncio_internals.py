@@ -28,10 +28,10 @@ import heapq
 import inspect
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
-from types import CoroutineType, FrameType
+from types import FrameType
 from typing import Any, cast
 from weakref import WeakKeyDictionary
 
@@ -116,8 +116,8 @@ def handle_that_raised(error: BaseException) -> asyncio.Handle | None:
 def abandon(task: asyncio.Task[Any]) -> None:
     """Let a pending task, which goes no further, be destroyed without a message in the log."""
     _private(task)._log_destroy_pending = False
-    coroutine = _coroutine_of(task)
-    if inspect.getcoroutinestate(coroutine) == inspect.CORO_CREATED:
+    coroutine = task.get_coro()
+    if inspect.iscoroutine(coroutine) and inspect.getcoroutinestate(coroutine) == inspect.CORO_CREATED:
         coroutine.close()
 
 
@@ -130,25 +130,19 @@ def abandon_pending(tasks: Sequence[asyncio.Task[Any]]) -> list[asyncio.Task[Any
 
 
 def close_abandoned(task: asyncio.Task[Any]) -> None:
-    """Close an abandoned task's coroutine, whose loop is closed, whatever it raises.
+    """Close an abandoned task's coroutine, or what else it awaits as one, whose loop is closed, whatever it raises.
 
     Python would do so when it discards the coroutine, at any time, and print what it raises: a task group
     cannot cancel its tasks any more.
     """
     for _ in range(MOST_CLOSINGS):
         try:
-            _coroutine_of(task).close()
+            cast("Coroutine[Any, Any, Any]", task.get_coro()).close()
             return
         except KeyboardInterrupt:
             raise
         except BaseException:  # a task group raises a group of GeneratorExit
             pass
-
-
-def _coroutine_of(task: asyncio.Task[Any]) -> CoroutineType[Any, Any, Any]:
-    coroutine = task.get_coro()
-    assert inspect.iscoroutine(coroutine)
-    return coroutine
 
 
 def is_unretrieved(future: asyncio.Future[Any]) -> bool:

@@ -9,7 +9,7 @@ import re
 import selectors
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Any, ClassVar
@@ -278,6 +278,24 @@ def test_an_abandoned_task_is_closed_although_it_awaits_something_in_answer(loop
     asyncio_internals.abandon(task)
     asyncio_internals.close_abandoned(task)
     assert ended == ["ended"]
+
+
+@pytest.mark.parametrize("begins", [False, True])
+def test_a_task_that_awaits_the_next_of_an_iterator_is_abandoned_as_others(
+    loop: StandingLoop, begins: bool
+) -> None:
+    async def ticks() -> AsyncIterator[int]:
+        await loop.create_future()
+        yield 1
+
+    following = anext(ticks())
+    task = asyncio.ensure_future(following, loop=loop)
+    if begins:
+        loop.round()
+    asyncio_internals.abandon(task)
+    asyncio_internals.close_abandoned(task)
+    with pytest.raises(RuntimeError, match="cannot reuse"):
+        following.__await__().send(None)
 
 
 def test_a_task_group_that_is_discarded_raises_nothing(loop: StandingLoop) -> None:
