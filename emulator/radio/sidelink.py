@@ -277,8 +277,9 @@ class Sidelink(Mac):
                 is_alone = True
             else:
                 flow.queue.append((slot, None if is_alone else sent))
-        elif not is_alone:
-            flow.queue.append((slot, sent))
+        else:
+            if not is_alone:
+                flow.queue.append((slot, sent))
             self._reserve(flow)
         if is_alone:
             self._send_alone(flow, sent, slot)

@@ -256,7 +256,7 @@ def test_a_frame_that_would_wait_longer_than_t2_has_a_resource_of_its_own(radio:
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.tuples(st.sampled_from([0, 2, 30, 150]), st.sampled_from([50, 300, 500])), min_size=2, max_size=40),
-    st.sampled_from([LTE, NR]),
+    st.sampled_from([LTE, with_mac(LTE, one_shot=True), NR]),
     st.sampled_from([20, 100]),
     st.sampled_from([0, 20, 100, 1000]),
 )
@@ -269,7 +269,9 @@ def test_no_frame_waits_beyond_its_window_whatever_the_others_size(
         subject.advance(time_ms * MS)
         subject.transmit(time_ms * MS, 0, [SentFrame("", bytes(size), period_ms=period_ms)])
     subject.drain()
-    for row in subject.trace.to_table().to_pylist():
+    rows = subject.trace.to_table().to_pylist()
+    assert len(rows) == len(frames)
+    for row in rows:
         assert row["outcome"] in ("delivered", "queue_full", "no_grant")
         if row["left_ns"] is not None:
             assert row["left_ns"] - row["sent_ns"] <= (t2_ms + 2) * MS
@@ -287,6 +289,15 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
     assert max(len(list(run)) for is_one, run in groupby(is_shot) if not is_one) == 5, (
         "the sixth is one at the latest"
     )
+
+
+def test_a_one_shot_that_ends_a_reservation_leaves_nothing_that_waited_for_it() -> None:
+    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(LTE, one_shot=True))
+    for time_ms, size in [*((each, 50) for each in (100, 200, 220, 320, 420, 520, 620, 720, 820)), (840, 500)]:
+        subject.advance(time_ms * MS)
+        subject.transmit(time_ms * MS, 0, [SentFrame("", bytes(size), period_ms=100)])
+    subject.drain()
+    assert len(subject.trace.to_table()) == 10
 
 
 @pytest.mark.slow
