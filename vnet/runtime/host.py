@@ -9,15 +9,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import contextvars
+import gc
 import logging
+import os
 import shutil
+import sys
 import threading
 import traceback
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
@@ -289,6 +292,7 @@ class Host:
             self._unhandled.silence(gone)
             self._killed[gone] = asyncio_internals.abandon_pending(self._tasks_of(gone))
             self._hold()
+            self._disks.release(node)
         else:
             self._stopped_ns[gone] = time_ns
             self._tell_deadlocks([gone] if goes_on else [])
@@ -570,7 +574,11 @@ class Host:
 
     def discard_abandoned(self) -> None:
         """Discard what is left of programs that were killed or wait at the end, after the loop has been closed."""
-        for task in [task for tasks in (*self._killed.values(), self._left) for task in tasks]:
+        if self._killed:
+            with nothing_changed():
+                for task in [task for tasks in self._killed.values() for task in tasks]:
+                    asyncio_internals.close_abandoned(task)
+        for task in self._left:
             asyncio_internals.close_abandoned(task)
 
     async def cancel(self) -> None:
@@ -661,6 +669,79 @@ class Disks:
         folder = self._root / node
         folder.mkdir(parents=True, exist_ok=True)
         return folder
+
+    def release(self, node: str) -> None:
+        """Release what a killed program holds open on its disk, unflushed and unlocked, as a system does.
+
+        What it has left in buffers goes nowhere, and an open transaction of SQLite is rolled back.
+        """
+        if self._root is None:
+            return
+        below = f"{os.path.realpath(self._root / node)}/"
+        for database in _open_databases():
+            with contextlib.suppress(Exception):  # of a thread of the program, or closed
+                cursor = database.cursor()
+                cursor.row_factory = None
+                if any(file.startswith(below) for _, _, file in cursor.execute("PRAGMA database_list").fetchall()):
+                    database.close()
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for descriptor in Path("/proc/self/fd").iterdir():
+            with contextlib.suppress(OSError):  # that of the list is closed
+                if str(descriptor.readlink()).startswith(below):
+                    os.dup2(nowhere, int(descriptor.name), inheritable=False)
+        os.close(nowhere)
+
+
+def _open_databases() -> list[Any]:
+    if "sqlite3" not in sys.modules:
+        return []
+    kind = sys.modules["sqlite3"].Connection
+    return [each for each in gc.get_objects() if isinstance(each, kind)]
+
+
+CHANGES = (
+    *(
+        "os.remove",
+        "os.rename",
+        "os.mkdir",
+        "os.rmdir",
+        "os.link",
+        "os.symlink",
+        "os.truncate",
+        "os.chmod",
+        "os.utime",
+    ),
+    *("os.chown", "os.kill", "os.system", "os.fork", "os.forkpty", "os.posix_spawn", "subprocess.Popen"),
+    *("socket.connect", "socket.bind", "socket.sendto", "sqlite3.connect"),
+)
+"""Audit events of what a program does to the world, beside opening a file to write to it."""
+_discarding: int | None = None
+"""The thread in which what was killed is discarded."""
+
+
+def _refuse_changes(event: str, arguments: tuple[Any, ...]) -> None:
+    if _discarding == get_ident() and (
+        event in CHANGES or (event == "open" and arguments[2] & (os.O_ACCMODE | os.O_CREAT))
+    ):
+        raise ProcessEndedError(f"{event}: the program has been killed")
+
+
+@contextlib.contextmanager
+def nothing_changed() -> Iterator[None]:
+    """Refuse what is done to the world meanwhile: Python runs `finally` blocks as it discards what was killed."""
+    global _discarding
+    _watched()
+    _discarding = get_ident()
+    try:
+        yield
+    finally:
+        _discarding = None
+
+
+@cache
+def _watched() -> None:
+    """Have audit events looked at, from the first kill on: they are for ever."""
+    sys.addaudithook(_refuse_changes)
 
 
 LONGEST_NOTE = 4000

@@ -1,6 +1,11 @@
 """Disks of vehicles survive kills, are the same in both drivers, and are collected with care."""
 
+import asyncio
+import fcntl
+import gc
 import os
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -52,6 +57,41 @@ def test_what_was_written_is_there_after_a_kill_and_in_the_run_at_its_end(nodes_
     for emulation in (together, apart, again):
         assert files_of(emulation.folder.path / "files") == expected
         assert not emulation.folder.disks.exists()
+
+
+async def holds_its_disk(node: Node) -> None:
+    """Hold a lock and an open transaction, count in a `finally` block, and write without flushing."""
+    lock, unflushed = (node.folder / "lock").open("w"), (node.folder / f"{node.incarnation}.txt").open("w")
+    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    database, counted = sqlite3.connect(node.folder / "rows.db", timeout=0), 0
+    database.execute("create table if not exists rows(n int)")
+    database.commit()
+    try:
+        async for fix in node.gnss:
+            counted += 1
+            unflushed.write("lost\n")
+            database.execute("insert into rows values(1)")
+            await asyncio.sleep(0.05)
+            if counted % 3:
+                database.commit()
+            node.report(fix.position_m, fix.covariance_m2, entries=counted)
+    finally:
+        (node.folder / "counted.txt").write_text(f"{node.incarnation} {counted}")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+def test_what_was_killed_holds_nothing_and_writes_no_more() -> None:
+    emulation = run_together(scenario_of(FAULTS[:1], f"{__name__}:holds_its_disk", vehicles=1))
+    concluded(emulation)
+    gc.collect()  # while nobody minds files that were not closed
+    assert not [event for event in emulation.folder.events if event.kind == "crashed"]
+    disk = emulation.folder.path / "files" / "v01"
+    assert (disk / "0.txt").read_text() == ""
+    incarnation, counted = map(int, (disk / "counted.txt").read_text().split())
+    with closing(sqlite3.connect(disk / "rows.db")) as database:
+        ((rows,),) = database.execute("select count(*) from rows")
+    assert incarnation == 1 and rows >= counted - 2, "what either has committed is there"
 
 
 @pytest.mark.slow

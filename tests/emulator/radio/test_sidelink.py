@@ -291,8 +291,9 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
     )
 
 
-def test_a_one_shot_that_ends_a_reservation_leaves_nothing_that_waited_for_it() -> None:
-    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(LTE, one_shot=True))
+@pytest.mark.parametrize("seed", range(6))
+def test_a_one_shot_that_ends_a_reservation_leaves_nothing_that_waited_for_it(seed: int) -> None:
+    subject = engine(line(0, 50), seed, access_jitter_ms=0.0, **with_mac(LTE, one_shot=True))
     for time_ms, size in [*((each, 50) for each in (100, 200, 220, 320, 420, 520, 620, 720, 820)), (840, 500)]:
         subject.advance(time_ms * MS)
         subject.transmit(time_ms * MS, 0, [SentFrame("", bytes(size), period_ms=100)])
