@@ -595,10 +595,13 @@ class Emulation:
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)
 
-    def take_final(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
-        """Take what programs told as they were ended at `time_ns`; of frames, reports and endings nobody hears."""
+    def take_final(self, time_ns: int, traffic: Iterable[wire.Traffic], by_fault: bool = False) -> None:
+        """Take what programs told as they were ended at `time_ns`; of frames, reports and endings nobody hears.
+
+        Notes are those of the run's end: of what a fault ends, or a vehicle's leaving, nobody hears them either.
+        """
         parts = list(traffic)
-        notes = [note for part in parts for note in part.notes]
+        notes = [note for part in parts for note in part.notes if not by_fault]
         self.log_book.tell(time_ns, notes, [each for part in parts for each in part.unhandled])
 
     def _place(self, period: int) -> None:

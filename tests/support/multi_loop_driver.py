@@ -120,7 +120,7 @@ class _Apart(Processes):
             killed = [actions.stop[node] for node in nodes if node in actions.stop]
             if killed:
                 traffic = self.processes.pop(process_id).end(killed=any(killed))
-                self._emulation.take_final(actions.time_ns, traffic)
+                self._emulation.take_final(actions.time_ns, traffic, by_fault=True)
             if any(node in actions.start for node in nodes):
                 self.processes[process_id] = _Process(self._emulation, nodes)
 

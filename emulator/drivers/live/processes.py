@@ -637,7 +637,7 @@ class LiveProcesses(Processes):
         await self._all_final([process_id], time.monotonic() + FINAL_WAIT_S)
         so_far = self._so_far.pop(process_id, None)
         if (traffic := self._finals.pop(process_id, so_far)) is not None:
-            self._emulation.take_final(time_ns, [traffic])
+            self._emulation.take_final(time_ns, [traffic], by_fault=True)
 
     async def _all_final(self, process_ids: Collection[str], deadline_s: float) -> None:
         """Wait until these processes have sent their last message, or have gone without: it is optional."""

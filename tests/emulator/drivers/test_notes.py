@@ -94,6 +94,23 @@ async def breaks_lines(node: Node) -> None:
     node.event("said", text="one\ntwo")
 
 
+async def says_goodbye(node: Node) -> None:
+    try:
+        await asyncio.sleep(100)
+    finally:
+        node.event("bye")
+        node.log("bye")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+def test_what_a_restart_ends_is_not_heard_any_more(run: Callable[[Scenario], Emulation]) -> None:
+    fault = {"kind": "restart", "at_s": 0.5, "duration_s": 0.2, "nodes": ["v02"]}
+    emulation = run(scenario_of([fault], f"{__name__}:says_goodbye", vehicles=2))
+    said = [event.time_ns for event in emulation.folder.events if event.kind in ("event", "log")]
+    assert not [time_ns for time_ns in said if time_ns < 1_000_000_000]
+
+
 def test_lines_that_are_broken_keep_their_beginning_apart() -> None:
     emulation = run_together(scenario_of([], f"{__name__}:breaks_lines", vehicles=2))
     lines = (emulation.folder.logs / "v01.log").read_text().splitlines()
