@@ -149,8 +149,11 @@ class Observation:
                 north_m -= half_s * speed_m_s * math.sin(heading_rad)
             off_m = math.hypot(east_m, north_m)
         noise_m2 = float(np.trace(before.white_covariance_m2 + self.white_covariance_m2)) / 2
+        if self.multipath[0]:
+            noise_m2 += 2 * self.multipath[0] ** 2 * -math.expm1(-gap_s / self.multipath[1])
         speed_m2_s2 = SPEED_SIGMA_M_S**2 + acceleration_m2_s4 * gap_s**2 / 16
-        return off_m**2 <= SPEED_GATE_SIGMAS**2 * (noise_m2 + gap_s**2 * speed_m2_s2)
+        within_m2 = SPEED_GATE_SIGMAS**2 * (noise_m2 + gap_s**2 * speed_m2_s2)
+        return off_m**2 <= within_m2 or not math.isfinite(off_m)  # such a speed tells nothing
 
 
 class Rbpf:

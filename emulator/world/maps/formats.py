@@ -55,7 +55,7 @@ from emulator.world.maps.roads import (
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import CoordinateFrame, project
 from vnet.bounded import read_bounded
-from vnet.errors import ScenarioError, printable, shown
+from vnet.errors import ScenarioError, printable, sendable, shown
 from vnet.types import Array
 
 LARGEST_GEOJSON_BYTES = 512 * 2**20
@@ -184,7 +184,8 @@ def _own_street(where: str, properties: dict[str, Any]) -> Street:
     if kind is None:
         raise ScenarioError(f"{where}: class = {shown(name)}: allowed are {', '.join(NAMES)}")
     stated = properties.get("oneway") or "no"
-    if (direction := _DIRECTIONS.get(str(stated).lower())) is None:
+    whole = int(stated) if isinstance(stated, float) and stated.is_integer() else stated
+    if (direction := _DIRECTIONS.get(str(whole).lower())) is None:
         raise ScenarioError(f"{where}: oneway = {shown(stated)}: allowed are {', '.join(_DIRECTIONS)}")
     one_way = direction != 0
     usual = CLASSES[NAMES[kind]].lanes
@@ -304,7 +305,7 @@ def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) ->
     if name not in arrays:
         raise ScenarioError(f"{path}: no array {name!r}")
     array = arrays[name]
-    if array.ndim != 1 or array.dtype.kind not in "iuf" or count not in (None, len(array)):
+    if array.ndim != 1 or array.dtype.kind not in "biuf" or count not in (None, len(array)):
         wanted = f"({'n' if count is None else count},)"
         raise ScenarioError(
             f"{path}: {name}: numbers of shape {wanted} are needed, not {array.dtype} {array.shape}"
@@ -399,6 +400,8 @@ def _texts(path: Path, arrays: Arrays, name: str, count: int) -> NDArray[Any]:
         raise ScenarioError(
             f"{path}: {name}: texts of shape ({count},) are needed, not {texts.dtype} {texts.shape}"
         )
+    if odd := next((text for text in texts.tolist() if sendable(text) != text), None):
+        raise ScenarioError(f"{path}: {name}: {shown(odd)}: a text with a lone surrogate")
     return texts
 
 
@@ -528,9 +531,8 @@ def write_graph(roads: Roads, path: Path) -> None:
         "road_lane_width_m": roads.lane_width_m,
         "road_one_way": roads.one_way.astype(np.uint8),
     }
-    names = np.array(roads.name)
-    if names.nbytes <= LARGEST_ARRAY_BYTES:
-        arrays["road_name"] = names
+    if 4 * len(roads) * max(map(len, roads.name)) <= LARGEST_ARRAY_BYTES:
+        arrays["road_name"] = np.array(roads.name)
     if roads.frame is not None:
         arrays["frame_proj"] = np.array(roads.frame.proj)
         arrays["frame_offset_m"] = np.array(roads.frame.offset_m)

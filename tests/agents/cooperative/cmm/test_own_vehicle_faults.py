@@ -1,6 +1,7 @@
 """A vehicle whose receiver is wrong for seconds never states a position that may be anywhere."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -80,6 +81,20 @@ def test_two_outliers_on_opposite_sides_place_no_vehicle_that_tells_its_speed(ra
         for off_m in ([0.0, 30.0], [0.0, 0.0], [0.0, -30.0]):
             own.step(1 / rate_hz, replace(fix(rng, np.array(off_m)), speed_m_s=speed_m_s))
         assert (own.position_m() is None) == (speed_m_s is not None)
+
+
+def test_fixes_follow_each_other_as_their_noise_and_multipath_allow() -> None:
+    """Multipath of 5 m and 5 s, which fixes state, moves them by 3 m in a second; a speed of NaN says nothing."""
+    rng, place_m, off_m = np.random.default_rng(6), np.zeros(2), 5.0 * np.random.default_rng(7).normal(size=2)
+    told: list[Observation] = []
+    for _ in range(400):
+        place_m = place_m + np.array([12.0, 0.0])
+        off_m = off_m * np.exp(-0.2) + 5 * np.sqrt(-np.expm1(-0.4)) * rng.normal(size=2)
+        seen_m = place_m + off_m + rng.normal(0, 0.5, 2)
+        told.append(Observation(seen_m, 25.25 * np.eye(2), 0.0, multipath=(5.0, 5.0), speed_m_s=12.0))
+    assert all(fix.follows(before, 1.0, 0.0) for before, fix in pairwise(told))
+    assert not told[1].follows(replace(told[0], speed_m_s=60.0), 1.0, 0.0)
+    assert told[1].follows(replace(told[0], speed_m_s=np.nan), 1.0, 0.0)
 
 
 @pytest.mark.parametrize("rate_hz", [1, 2, 5, 10])

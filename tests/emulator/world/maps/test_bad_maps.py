@@ -148,6 +148,7 @@ def test_an_origin_for_a_network_that_does_not_say_where_it_is(tmp_path: Path) -
         ("road_backward", [0, 0], "road_forward[1]: a road without lanes"),
         ("road_class", ["primary", "path"], "road_class[1] = 'path': allowed are "),
         ("road_name", [1, 2], "road_name: texts of shape (2,) are needed"),
+        ("road_name", ["a", "\udc80"], "road_name: '\\udc80': a text with a lone surrogate"),
         ("road_one_way", None, "no array 'road_one_way'"),
     ],
 )
@@ -160,7 +161,7 @@ def test_roads_that_cannot_be(tmp_path: Path, array: str, values: list[object] |
         "road_forward": [1, 0],
         "road_backward": [0, 1],
         "road_lane_width_m": [3.5, 3.5],
-        "road_one_way": [0, 1],
+        "road_one_way": [False, True],
     }
     np.savez(tmp_path / "town.npz", **arrays)
     assert read_roads(tmp_path / "town.npz").name == ("road 0", "road 1")

@@ -149,7 +149,7 @@ def test_properties_of_lines_of_our_own(tmp_path: Path) -> None:
     here, there = [-83.74, 42.28], [-83.73, 42.28, 250.0]
     text = maps.collection(
         maps.line([here, there], **{"class": "service"}, lanes_forward=2, lanes_backward=0, lane_width_m=2.5),
-        maps.line([here, there], oneway=True),
+        maps.line([here, there], oneway=1.0),
         {"type": "Feature", "properties": None, "geometry": {"type": "Point", "coordinates": here}},
         {"type": "Feature", "properties": {}, "geometry": None},
         {"type": "Feature", "geometry": {"type": "MultiLineString", "coordinates": [[here, there], [there, here]]}},
