@@ -773,7 +773,7 @@ class NodeLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Take a record."""
-        node = present_node()
+        node = outside_loop.awaited_node()
         if node is None or record.name == "asyncio":
             last = logging.lastResort
             alone = logging.getLogger().handlers == [self]

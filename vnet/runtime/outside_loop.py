@@ -22,7 +22,7 @@ import sys
 import threading
 import weakref
 from collections.abc import Callable, Collection, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial, wraps
@@ -88,6 +88,8 @@ _takers: weakref.WeakKeyDictionary[Node, weakref.WeakMethod[Taker]] = weakref.We
 is_nobodys: ContextVar[bool] = ContextVar("is_nobodys", default=False)
 """True where threads are started that serve all nodes of a process, whichever asks first."""
 _started_by: weakref.WeakKeyDictionary[threading.Thread, Node] = weakref.WeakKeyDictionary()
+_served = threading.local()
+"""The node whose job a thread of an executor does, as `node`."""
 _watchers = 0
 _before: tuple[Any, Any] = (sys.unraisablehook, threading.excepthook)
 _start_thread = threading.Thread.start
@@ -248,17 +250,30 @@ class ExecutorJob(Future[Any]):
 
 
 def _noted(submit: Callable[..., Future[Any]]) -> Callable[..., Future[Any]]:
-    """Return an executor's `submit` that notes on whose behalf it is called."""
+    """Return an executor's `submit` that notes on whose behalf it is called, and jobs of its threads are done."""
 
     @wraps(submit)
-    def submit_noted(*args: Any, **options: Any) -> Future[Any]:
-        owner, job = present_node(), submit(*args, **options)
+    def submit_noted(
+        executor: Executor, function: Callable[..., Any], /, *args: Any, **options: Any
+    ) -> Future[Any]:
+        owner = present_node()
+        if owner is not None and isinstance(executor, ThreadPoolExecutor):
+            function = partial(_on_behalf_of, owner, function)
+        job = submit(executor, function, *args, **options)
         if owner is not None and type(job) is Future:
             job.__class__ = ExecutorJob
             Future.add_done_callback(job, partial(_job_done, owner))
         return job
 
     return submit_noted
+
+
+def _on_behalf_of(owner: Node, job: Callable[..., Any], /, *args: Any, **options: Any) -> Any:
+    _served.node = owner
+    try:
+        return job(*args, **options)
+    finally:
+        _served.node = None
 
 
 def _job_done(owner: Node, job: Future[Any]) -> None:
@@ -268,8 +283,14 @@ def _job_done(owner: Node, job: Future[Any]) -> None:
 
 
 def present_node() -> Node | None:
-    """Return the node on whose behalf the present code runs: that of its callback, its context, or its thread."""
-    return own_asyncio.present_node() or _started_by.get(threading.current_thread())
+    """Return the node on whose behalf the present code runs: that of its callback, context, job, or thread."""
+    return awaited_node() or _started_by.get(threading.current_thread())
+
+
+def awaited_node() -> Node | None:
+    """Return the node on whose behalf the present code runs, unless in a thread for which no time waits."""
+    served: Node | None = getattr(_served, "node", None)
+    return own_asyncio.present_node() or served
 
 
 def _unraisable(ignored: sys.UnraisableHookArgs) -> None:

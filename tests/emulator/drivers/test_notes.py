@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,21 @@ def test_logs_and_events_are_the_same_live_and_simulated(nodes_per_process: int)
 async def breaks_lines(node: Node) -> None:
     node.log("one\ntwo")
     node.event("said", text="one\ntwo")
+
+
+async def logs_in_jobs(node: Node) -> None:
+    loop, pool = asyncio.get_running_loop(), ThreadPoolExecutor(1)
+    for executor, text in ((None, "default"), (pool, "own")):
+        await loop.run_in_executor(executor, logging.warning, text)
+    pool.shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+def test_what_a_job_of_an_executor_logs_is_its_vehicles(run: Callable[[Scenario], Emulation]) -> None:
+    emulation = run(scenario_of([], f"{__name__}:logs_in_jobs", vehicles=2))
+    said = [(event.node, event.details["text"]) for event in emulation.folder.events if event.kind == "log"]
+    assert sorted(said) == [(node, f"root: {pool}") for node in ("v01", "v02") for pool in ("default", "own")]
 
 
 async def says_goodbye(node: Node) -> None:

@@ -202,9 +202,9 @@ async def fails_in_a_job_whose_threads_another_started(node: Node) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_threads_of_the_default_executor_are_nobodys() -> None:
+def test_a_job_is_that_of_who_gave_it_whoever_started_the_thread() -> None:
     emulation = run_together(scenario_of([], entry(fails_in_a_job_whose_threads_another_started), vehicles=2))
-    assert exceptions(emulation) == []
+    assert [event.node for event in exceptions(emulation)] == ["v02"]
 
 
 survivors: list[Callable[[], None]] = []
