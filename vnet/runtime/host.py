@@ -477,12 +477,12 @@ class Host:
                 self._end_exited(leave)
 
     def _end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
-        """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand.
+        """After a SpinError: end the nodes whose callbacks or timers were still coming, and say where they stand.
 
         What spins on although it was cancelled loses its callbacks.
         """
-        ready = asyncio_internals.ready_queue(loop)
-        owners = dict.fromkeys(node_of(handle) for handle in ready)
+        ready, timer = asyncio_internals.ready_queue(loop), asyncio_internals.next_timer(loop)
+        owners = dict.fromkeys(node_of(handle) for handle in ready or ([] if timer is None else [timer]))
         spinning = [owner for owner in owners if owner is not None] or list(self.nodes.values())
         if not any(self._runs(node) for node in spinning):
             kept = [handle for handle in ready if node_of(handle) not in spinning]

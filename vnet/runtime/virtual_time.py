@@ -43,6 +43,10 @@ OLD_A_YOUNG = 10
 """Collections of young garbage for one of all: a full one looks at everything, and empties Python's free lists."""
 MOST_GENERATORS = 10_000
 """Async generators whose nodes are remembered before those that are gone are forgotten."""
+LEAST_S = 1 / NS_PER_S
+"""Shortest time in which anything waits: what is less goes lost when it is added to a time."""
+SPIN_NS = 1_000_000
+"""Time within which rounds of callbacks are counted together."""
 LATEST_S = 1e9
 """Timers after this, more than thirty years, are for never."""
 
@@ -220,7 +224,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
 class VirtualTimeLoop(SkewedLoop):
     """An event loop in virtual time; see the module's text.
 
-    `spin_limit` is how many rounds of callbacks one instant may take before the loop raises `SpinError`.
+    `spin_limit` is how many rounds of callbacks a millisecond may take before the loop raises `SpinError`.
     `before_job` is called before a job is given to an executor, whose threads may look for packets.
     """
 
@@ -228,6 +232,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._process = os.getpid()
         self._exchange = exchange
         self._spin_limit = spin_limit
+        self._counted_ns = 0  # the instant from which rounds are counted
         self._rounds = 0
         self._now_ns = 0
         self._ending = False
@@ -300,14 +305,20 @@ class VirtualTimeLoop(SkewedLoop):
     def call_at(  # type: ignore[override]
         self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        """Call at `when` on the clock of the task that asks, at the nearest nanosecond."""
+        """Call at `when` on the clock of the task that asks, at the nearest nanosecond.
+
+        What is later than that clock shows is a nanosecond later at least: who waits for the rest of a time that
+        rounding has cut would wait for ever.
+        """
         asyncio_internals.check_not_closed(self)
         self._check_thread()
-        when = self._own_when(when)
+        asked, when = when, self._own_when(when)
         number = next(self._timers)
         place: int | tuple[int, int] = number
         if when < LATEST_S:
             when_ns = round(when * NS_PER_S)
+            if when_ns <= self._now_ns and asked > self.time():
+                when_ns = self._now_ns + 1
             if self._timer_grid.step_ns:
                 place = when_ns, number
                 when_ns = self._timer_grid.at_or_after(when_ns)
@@ -319,6 +330,14 @@ class VirtualTimeLoop(SkewedLoop):
             timer.setter = self._ordered.setter(present_node(), asyncio.current_task(self))
         asyncio_internals.push_timer(self, timer)
         return timer
+
+    def call_later(  # type: ignore[override]
+        self, delay: float, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """Call after `delay` seconds: a nanosecond at least, if it is any time."""
+        if 0 < delay < LEAST_S:
+            delay = LEAST_S
+        return super().call_later(delay, callback, *args, context=context)
 
     # Whose a callback is: its context says so, unless it is one of the program's own making.
 
@@ -444,7 +463,9 @@ class VirtualTimeLoop(SkewedLoop):
         if next_timer_ns == self._now_ns:  # a timer closer than the clock's resolution: due already
             self._count_round()
             return []
-        self._rounds = 0
+        if next_timer_ns is None or next_timer_ns - self._counted_ns > SPIN_NS:
+            self._rounds, self._counted_ns = 0, self._now_ns
+        self._count_round()
         if self._meter is not None:
             self._meter.end_instant()
         self._pass_on(next_timer_ns)

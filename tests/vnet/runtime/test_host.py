@@ -247,12 +247,13 @@ def test_an_early_exit_takes_the_nodes_other_tasks_with_it() -> None:
     assert sum(len(traffic.frames) for traffic in world.traffic) == 10
 
 
+@pytest.mark.parametrize("sleep_s", [0.0, 1e-12])
 @pytest.mark.parametrize("stubborn", [False, True])
-def test_a_spinning_node_is_named_and_shown_and_the_others_go_on(stubborn: bool) -> None:
+def test_a_spinning_node_is_named_and_shown_and_the_others_go_on(stubborn: bool, sleep_s: float) -> None:
     async def spin() -> None:
         while True:
             try:
-                await asyncio.sleep(0)
+                await asyncio.sleep(sleep_s)
             except asyncio.CancelledError:
                 if not stubborn:
                     raise

@@ -197,6 +197,33 @@ def test_spinning_at_one_instant_is_an_error(loop: VirtualTimeLoop, step_s: floa
         run(loop, program)
 
 
+@pytest.mark.parametrize("ways", ["sleep", "call_at"])
+@settings(max_examples=60, deadline=None)
+@given(start_s=st.floats(0, 1e4), for_s=st.floats(0, 2))
+def test_who_waits_for_the_rest_of_a_time_comes_to_its_end(ways: str, start_s: float, for_s: float) -> None:
+    """Deadlines are waited for like this by programs, rate limiters and anyio; times are whole nanoseconds."""
+    loop, rounds = VirtualTimeLoop(lambda next_ns: next_ns or 0, spin_limit=1000), 0
+
+    async def program() -> float:
+        nonlocal rounds
+        await asyncio.sleep(start_s)
+        deadline_s = loop.time() + for_s
+        while loop.time() < deadline_s:
+            rounds += 1
+            if ways == "sleep":
+                await asyncio.sleep(deadline_s - loop.time())
+            else:
+                event = asyncio.Event()
+                loop.call_at(deadline_s, event.set)
+                await event.wait()
+        return loop.time() - deadline_s
+
+    try:
+        assert 0 <= run(loop, program) <= 1e-8 and rounds <= 3
+    finally:
+        loop.close()
+
+
 def test_many_rounds_over_time_are_no_spin(loop: VirtualTimeLoop) -> None:
     async def program() -> None:
         for _ in range(50):
