@@ -15,7 +15,7 @@ from tests.support.paths import ROOT
 
 CODE = ("vnet", "agents", "emulator", "studies", "docs", "benchmarks", "tests")
 FRAGMENT = re.compile(r"(who|whom|whose|what|when|where|which|whether|of|how)\b", re.IGNORECASE)
-BEGINS = re.compile(f'"""{FRAGMENT.pattern}', re.IGNORECASE)
+BEGINS = re.compile(f"[\"']\\s*{FRAGMENT.pattern}", re.IGNORECASE)
 
 REPLACED_NAMES = {
     "luck",
@@ -186,7 +186,7 @@ def replaced_words(language: Language) -> list[str]:
 
 def may_be_wrong(code: str) -> bool:
     """Tell, much faster than parsing it, whether some code may say anything in other words."""
-    text = code.lower().replace("\\n", " ")
+    text = re.sub(r"\\[nt]|#.*", " ", code.lower())
     words = set(re.findall(r"\w+", text))
     return (
         BEGINS.search(code) is not None

@@ -172,7 +172,7 @@ def _order(emulation: Emulation) -> dict[str, Any] | None:
 def _own_findings(
     recorded: RecordedRun, folder: RunFolder, write: Callable[[], None] = lambda: None
 ) -> list[Finding]:
-    """Judge a run by its own checks. What they print goes to logs/checks.log; Ctrl-C ends them, and no more.
+    """Judge a run by its own checks. What they print goes to logs/checks.txt; Ctrl-C ends them, and no more.
 
     `write` makes the folder's files should a check ask for them.
     """
@@ -182,7 +182,7 @@ def _own_findings(
     with redirect_stdout(StringIO()) as printed, signals_handled(signal.default_int_handler, signal.SIGINT):
         findings = own_findings(program, Run(recorded, folder.path, write=write))
     if printed.getvalue():
-        folder.keep("logs/checks.log", lambda path: write_text(path, printed.getvalue()))
+        folder.keep("logs/checks.txt", lambda path: write_text(path, printed.getvalue()))
     return findings
 
 

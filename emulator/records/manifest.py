@@ -28,8 +28,8 @@ from vnet.bounded import open_regular, read_regular
 from vnet.errors import VnetError, printable
 
 LARGEST_BYTES = 1 << 26
-UNLISTED = ("logs/checks.log", "logs/programs.log")
-"""Logs of checks of the user's own, which judge a folder again, and of what programs of earlier vnets printed."""
+UNLISTED = ("logs/checks.txt", "logs/checks.log", "logs/programs.log")
+"""Output of own checks, which judge a folder again, and logs of checks and programs of earlier vnets."""
 _MANIFEST = TypeAdapter(dict[str, str])
 
 

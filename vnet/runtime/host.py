@@ -680,9 +680,11 @@ class Disks:
         below = f"{os.path.realpath(self._root / node)}/"
         for database in _open_databases():
             with contextlib.suppress(Exception):  # of a thread of the program, or closed
-                cursor = database.cursor()
-                cursor.row_factory = None
-                if any(file.startswith(below) for _, _, file in cursor.execute("PRAGMA database_list").fetchall()):
+                cursor, texts = database.cursor(), database.text_factory
+                cursor.row_factory, database.text_factory = None, str
+                files = cursor.execute("PRAGMA database_list").fetchall()
+                database.text_factory = texts
+                if any(file.startswith(below) for _, _, file in files):
                     database.close()
         nowhere = os.open(os.devnull, os.O_RDWR)
         for descriptor in Path("/proc/self/fd").iterdir():
@@ -696,7 +698,9 @@ def _open_databases() -> list[Any]:
     if "sqlite3" not in sys.modules:
         return []
     kind = sys.modules["sqlite3"].Connection
-    return [each for each in gc.get_objects() if isinstance(each, kind)]
+    return [
+        each for each in gc.get_objects() if issubclass(type(each), kind)
+    ]  # to ask what is a proxy runs its code
 
 
 CHANGES = (

@@ -8,7 +8,7 @@ heading, with normal n and n·p = offset, leaves the residual r = n·q − offse
 
 is fitted by least squares with weights that fall to 0 at 4.7 deviations (Tukey's biweight): a vehicle on a
 road that the map does not have says nothing. Residuals are alike within some 500 m, and where one person drives:
-the standard error is the larger of what squares of that side tell and what a fit without each vehicle in turn does.
+the standard error is the larger of what squares of that side tell and what the jackknife over vehicles does.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ MIN_PLACES = 10
 """Least number of squares that make a calibration."""
 ROUNDS = 30
 """Rounds of reweighting."""
+GROUPS = 50
+"""Most groups of vehicles without which a fit is made: each is a fit."""
 BIWEIGHT = 4.685
 """Tukey's constant: 95 % as efficient as least squares where residuals are Gaussian."""
 NORMAL_MAD = 1.4826
@@ -57,7 +59,10 @@ class Residuals:
 
     def of(self, vehicles: NDArray[np.bool_]) -> Residuals:
         """Return those of the vehicles of a mask (N,)."""
-        kept = vehicles[self.vehicle]
+        return self.rows(vehicles[self.vehicle])
+
+    def rows(self, kept: NDArray[np.bool_]) -> Residuals:
+        """Return those of a mask (n,)."""
         return Residuals(self.metres[kept], self.normal[kept], self.place[kept], self.vehicle[kept])
 
 
@@ -112,15 +117,12 @@ def calibrate(found: Residuals) -> Calibration:
         raise ScenarioError(
             f"vehicles drive on its lanes in {places} squares of {PLACE_M:g} m: at least {MIN_PLACES} are needed"
         )
-    fit = _fit(found)
+    fit = _fit(found, np.ones(len(found.metres)))
     # Sums over each square are independent; residuals in it are not (White 1980, by clusters).
     score = np.zeros((places, 3))
     np.add.at(score, index.ravel(), fit.weighted * fit.off_m[:, None])
     variance_m2 = np.diag(fit.inverse @ score.T @ score @ fit.inverse)[1:]
-    vehicles = np.unique(found.vehicle)
-    if len(vehicles) > 1:  # the jackknife
-        without = [_fit(found.of(np.arange(vehicles[-1] + 1) != vehicle)).found_m[1:] for vehicle in vehicles]
-        variance_m2 = np.maximum(variance_m2, (len(vehicles) - 1) * np.var(without, axis=0))
+    variance_m2 = np.maximum(variance_m2, _jackknife_m2(found, fit)[1:])
     return Calibration(
         datum_m=fit.found_m[1:],
         error_m=np.sqrt(variance_m2),
@@ -133,26 +135,39 @@ def calibrate(found: Residuals) -> Calibration:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fit: coefficients (3,), weighted regressors (n, 3), residuals (n,), and inverse normal matrix (3, 3)."""
+    """A fit: coefficients (3,), weighted regressors (n, 3), weights (n,), residuals (n,), inverse matrix (3, 3)."""
 
     found_m: Array
     weighted: Array
+    weight: Array
     off_m: Array
     inverse: Array
     scale_m: float
 
 
-def _fit(found: Residuals) -> _Fit:
+def _jackknife_m2(found: Residuals, fit: _Fit) -> Array:
+    """Return the variances (3,) by fits without each group of vehicles in turn, from the weights of all on."""
+    vehicles, index = np.unique(found.vehicle, return_inverse=True)
+    groups = min(len(vehicles), GROUPS)
+    if groups < 2:
+        return np.zeros(3)
+    without = []
+    for group in range(groups):
+        kept = index % groups != group
+        without.append(_fit(found.rows(kept), fit.weight[kept], ROUNDS // 5).found_m)
+    return np.asarray((groups - 1) * np.var(without, axis=0))
+
+
+def _fit(found: Residuals, weight: Array, rounds: int = ROUNDS) -> _Fit:
     regressors = np.column_stack([np.ones(len(found.metres)), found.normal])
-    weight = np.ones(len(found.metres))
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         weighted = regressors * weight[:, None]
         inverse = np.linalg.pinv(weighted.T @ regressors)
         found_m = inverse @ weighted.T @ found.metres
         off_m = found.metres - regressors @ found_m
         scale_m = NORMAL_MAD * float(np.median(np.abs(off_m))) + 1e-9
         weight = np.maximum(0.0, 1 - (off_m / (BIWEIGHT * scale_m)) ** 2) ** 2
-    return _Fit(found_m, weighted, off_m, np.asarray(inverse), scale_m)
+    return _Fit(found_m, weighted, weight, off_m, np.asarray(inverse), scale_m)
 
 
 def moved(lanes: RoadMap, east_north_m: tuple[float, float] | Array) -> RoadMap:

@@ -132,7 +132,7 @@ def test_results_stand_in_the_verdict_of_a_run(here: Path) -> None:
         "figures": {"frames": 30, "rate": 0.5},
     }
     assert written["not_exercised"][-1] == {"name": "own:crowded", "reason": "there are only three vehicles"}
-    assert (here / "run" / "logs" / "checks.log").read_text() == "looked at 30\n"
+    assert (here / "run" / "logs" / "checks.txt").read_text() == "looked at 30\n"
     assert "looked at" not in text
 
 

@@ -5,6 +5,7 @@ import fcntl
 import gc
 import os
 import sqlite3
+import weakref
 from contextlib import closing
 from pathlib import Path
 
@@ -64,8 +65,10 @@ async def holds_its_disk(node: Node) -> None:
     lock, unflushed = (node.folder / "lock").open("w"), (node.folder / f"{node.incarnation}.txt").open("w")
     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     database, counted = sqlite3.connect(node.folder / "rows.db", timeout=0), 0
+    database.text_factory = bytes
     database.execute("create table if not exists rows(n int)")
     database.commit()
+    of_nothing = [weakref.proxy(Path("gone").joinpath)]  # whoever asks what it is has an error
     try:
         async for fix in node.gnss:
             counted += 1
@@ -74,7 +77,7 @@ async def holds_its_disk(node: Node) -> None:
             await asyncio.sleep(0.05)
             if counted % 3:
                 database.commit()
-            node.report(fix.position_m, fix.covariance_m2, entries=counted)
+            node.report(fix.position_m, fix.covariance_m2, entries=counted, odd=len(of_nothing))
     finally:
         (node.folder / "counted.txt").write_text(f"{node.incarnation} {counted}")
 

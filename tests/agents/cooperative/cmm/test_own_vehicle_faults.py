@@ -95,6 +95,10 @@ def test_fixes_follow_each_other_as_their_noise_and_multipath_allow() -> None:
     assert all(fix.follows(before, 1.0, 0.0) for before, fix in pairwise(told))
     assert not told[1].follows(replace(told[0], speed_m_s=60.0), 1.0, 0.0)
     assert told[1].follows(replace(told[0], speed_m_s=np.nan), 1.0, 0.0)
+    east, north = (Observation(np.array(at), np.eye(2), 0.0, speed_m_s=50.0) for at in ((50.0, 0.0), (0.0, 50.0)))
+    start = replace(east, position_m=np.zeros(2))
+    assert east.follows(start, 1.0, 0.0) and not north.follows(start, 1.0, 0.0)
+    assert replace(north, heading_rad=None).follows(start, 1.0, 0.0), "it is as far away"
 
 
 @pytest.mark.parametrize("rate_hz", [1, 2, 5, 10])
