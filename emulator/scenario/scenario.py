@@ -205,7 +205,8 @@ class Run(Section):
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
     """An agent that has lost its emulator for so long (wall clock) ends."""
     spin_limit: int = Field(100_000, ge=100, le=MANY)
-    """Rounds of callbacks that a process may take at one instant; more ends its spinning programs. Lockstep."""
+    """Rounds of callbacks that a process may take at one instant, or at instants 1 ns apart; more ends its spinning
+    programs. Lockstep."""
     files_max_mb: float = Field(10.0, ge=0, le=1_000_000)
     """Megabytes of a vehicle's files (`node.folder`) that are kept in the run's folder, and 1000 files at most."""
     memory_limit_mb: float | None = Field(None, gt=0, le=1_000_000_000)

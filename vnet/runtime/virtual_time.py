@@ -45,8 +45,6 @@ MOST_GENERATORS = 10_000
 """Async generators whose nodes are remembered before those that are gone are forgotten."""
 LEAST_S = 1 / NS_PER_S
 """Shortest time in which anything waits: what is less goes lost when it is added to a time."""
-SPIN_NS = 1_000_000
-"""Time within which rounds of callbacks are counted together."""
 LATEST_S = 1e9
 """Timers after this, more than thirty years, are for never."""
 
@@ -224,15 +222,14 @@ class SkewedLoop(asyncio.SelectorEventLoop):
 class VirtualTimeLoop(SkewedLoop):
     """An event loop in virtual time; see the module's text.
 
-    `spin_limit` is how many rounds of callbacks a millisecond may take before the loop raises `SpinError`.
-    `before_job` is called before a job is given to an executor, whose threads may look for packets.
+    `spin_limit` is how many rounds of callbacks one instant, or instants 1 ns apart, may take before the loop
+    raises `SpinError`. `before_job` is called before a job is given to an executor: threads may look for packets.
     """
 
     def __init__(self, exchange: Exchange, spin_limit: int = 100_000) -> None:
         self._process = os.getpid()
         self._exchange = exchange
         self._spin_limit = spin_limit
-        self._counted_ns = 0  # the instant from which rounds are counted
         self._rounds = 0
         self._now_ns = 0
         self._ending = False
@@ -463,9 +460,10 @@ class VirtualTimeLoop(SkewedLoop):
         if next_timer_ns == self._now_ns:  # a timer closer than the clock's resolution: due already
             self._count_round()
             return []
-        if next_timer_ns is None or next_timer_ns - self._counted_ns > SPIN_NS:
-            self._rounds, self._counted_ns = 0, self._now_ns
-        self._count_round()
+        if next_timer_ns is not None and next_timer_ns - self._now_ns <= 1:
+            self._count_round()  # the least time that anything waits is no time
+        else:
+            self._rounds = 0
         if self._meter is not None:
             self._meter.end_instant()
         self._pass_on(next_timer_ns)
