@@ -220,7 +220,8 @@ def check_liveness(recorded: RecordedRun) -> Finding:
             if not recorded.plan and (len(reports) or len(mine) < START_UP_NS // recorded.scenario.period_ns):
                 mine = mine[mine >= reports.min(initial=recorded.periods)]  # it may take its time at the start
             edges = [int(mine[0]) - 1, *reports.tolist(), int(mine[-1]) + 1] if len(mine) else []
-            gaps = [(before, after) for before, after in pairwise(edges) if after - before > longest[node]]
+            # One that comes up, and reports a second later, is on time.
+            gaps = [(last, next_) for last, next_ in pairwise(edges) if next_ - max(last, mine[0]) > longest[node]]
             if gaps:
                 before, after = gaps[0]
                 silent.append({"node": recorded.node_ids[node], "last_period": before, "next_period": after})

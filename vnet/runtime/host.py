@@ -682,8 +682,10 @@ class Disks:
             with contextlib.suppress(Exception):  # of a thread of the program, or closed
                 cursor, texts = database.cursor(), database.text_factory
                 cursor.row_factory, database.text_factory = None, str
-                files = cursor.execute("PRAGMA database_list").fetchall()
-                database.text_factory = texts
+                try:
+                    files = cursor.execute("PRAGMA database_list").fetchall()
+                finally:
+                    database.text_factory = texts
                 if any(file.startswith(below) for _, _, file in files):
                     database.close()
         nowhere = os.open(os.devnull, os.O_RDWR)

@@ -515,6 +515,20 @@ def test_a_program_that_reports_about_once_a_second_is_alive_until_it_falls_sile
     assert found.text.endswith("silent for over 2.0 s, v03 from period 28")
 
 
+async def listens_first_when_it_comes_back(node: Node) -> None:
+    """Report with each fix, and a second after it has come up again."""
+    if node.incarnation:
+        await asyncio.sleep(1.0)
+    async for fix in node.gnss:
+        node.report(fix.position_m, fix.covariance_m2)
+
+
+def test_one_that_reports_a_second_after_it_has_come_up_is_alive() -> None:
+    fault = {"kind": "kill", "at_s": 2.0, "duration_s": 1.0, "nodes": ["v01"]}
+    recorded = simulated(fault, program=f"{__name__}:listens_first_when_it_comes_back")
+    assert verdict(recorded, "liveness") is Verdict.VALID
+
+
 async def nearly_stops(node: Node) -> None:
     """Report in the first four periods, and every three seconds after them."""
     async for fix in node.gnss:
