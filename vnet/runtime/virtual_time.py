@@ -43,6 +43,8 @@ OLD_A_YOUNG = 10
 """Collections of young garbage for one of all: a full one looks at everything, and empties Python's free lists."""
 MOST_GENERATORS = 10_000
 """Async generators whose nodes are remembered before those that are gone are forgotten."""
+MOST_AT_ONCE = 100
+"""Rounds of an instant in which a node may set timers for it, before they are a nanosecond later."""
 LEAST_S = 1 / NS_PER_S
 """Shortest time in which anything waits: what is less goes lost when it is added to a time."""
 LATEST_S = 1e9
@@ -230,6 +232,8 @@ class VirtualTimeLoop(SkewedLoop):
         self._process = os.getpid()
         self._exchange = exchange
         self._spin_limit = spin_limit
+        # Of each node the last instant at which it has set a timer for it, the last round of that, and how many.
+        self._asked_at_once: WeakKeyDictionary[Node, tuple[int, int, int]] = WeakKeyDictionary()
         self._rounds = 0
         self._now_ns = 0
         self._ending = False
@@ -304,8 +308,8 @@ class VirtualTimeLoop(SkewedLoop):
     ) -> asyncio.TimerHandle:
         """Call at `when` on the clock of the task that asks, at the nearest nanosecond.
 
-        What is later than that clock shows is a nanosecond later at least: who waits for the rest of a time that
-        rounding has cut would wait for ever.
+        What is later than that clock shows is a nanosecond later at least, and so is what is asked for at one
+        instant again and again: who waits for the rest of a time that rounding has cut would wait for ever.
         """
         asyncio_internals.check_not_closed(self)
         self._check_thread()
@@ -314,7 +318,7 @@ class VirtualTimeLoop(SkewedLoop):
         place: int | tuple[int, int] = number
         if when < LATEST_S:
             when_ns = round(when * NS_PER_S)
-            if when_ns <= self._now_ns and asked > self.time():
+            if when_ns <= self._now_ns and (asked > self.time() or self._asks_on()):
                 when_ns = self._now_ns + 1
             if self._timer_grid.step_ns:
                 place = when_ns, number
@@ -327,6 +331,17 @@ class VirtualTimeLoop(SkewedLoop):
             timer.setter = self._ordered.setter(present_node(), asyncio.current_task(self))
         asyncio_internals.push_timer(self, timer)
         return timer
+
+    def _asks_on(self) -> bool:
+        """Return true if a node has set timers for the present instant in many rounds of it."""
+        if (node := present_node()) is None:
+            return False
+        asked_ns, last, rounds = self._asked_at_once.get(node, (-1, 0, 0))
+        if asked_ns != self._now_ns:
+            last, rounds = -1, 0
+        rounds += last != self._rounds
+        self._asked_at_once[node] = self._now_ns, self._rounds, rounds
+        return rounds > MOST_AT_ONCE
 
     def call_later(  # type: ignore[override]
         self, delay: float, callback: Callable[..., object], *args: Any, context: Context | None = None

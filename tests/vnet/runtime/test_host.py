@@ -272,6 +272,27 @@ def test_a_spinning_node_is_named_and_shown_and_the_others_go_on(stubborn: bool,
     assert (finished.node, finished.kind) == ("v1", "finished")
 
 
+def test_a_bucket_whose_rest_is_nothing_beside_the_time_fills_all_the_same() -> None:
+    """At 1 s a rest of 1e-17 s is lost when it is added; on a real clock time passes from look to look."""
+
+    async def program(node: Node) -> None:
+        loop, level, looks = asyncio.get_running_loop(), 1e-15, 0
+        await asyncio.sleep(1.0)
+        before_s = loop.time()
+        while level > 0:
+            turn = loop.create_future()
+            loop.call_at(loop.time() + level / 30, turn.set_result, None)
+            await turn
+            now_s, looks = loop.time(), looks + 1
+            level, before_s = level - 30 * (now_s - before_s), now_s
+        node.event("full", looks=looks)
+
+    world = World("v1")
+    world.run(program)
+    (finished,) = world.endings
+    assert finished.kind == "finished"
+
+
 def test_reports_and_frames_travel_with_the_yield_of_their_instant() -> None:
     async def program(node: Node) -> None:
         async for fix in node.gnss:
