@@ -675,7 +675,7 @@ class Disks:
 
         What it has left in buffers goes nowhere, and an open transaction of SQLite is rolled back.
         """
-        if self._root is None:
+        if self._root is None or not (self._root / node).is_dir():
             return
         below = f"{os.path.realpath(self._root / node)}/"
         for database in _open_databases():
@@ -700,25 +700,14 @@ def _open_databases() -> list[Any]:
     if "sqlite3" not in sys.modules:
         return []
     kind = sys.modules["sqlite3"].Connection
-    return [
-        each for each in gc.get_objects() if issubclass(type(each), kind)
-    ]  # to ask what is a proxy runs its code
+    # By its type: to ask a proxy what it is an instance of runs its code.
+    return [each for each in gc.get_objects() if issubclass(type(each), kind)]
 
 
 CHANGES = (
-    *(
-        "os.remove",
-        "os.rename",
-        "os.mkdir",
-        "os.rmdir",
-        "os.link",
-        "os.symlink",
-        "os.truncate",
-        "os.chmod",
-        "os.utime",
-    ),
-    *("os.chown", "os.kill", "os.system", "os.fork", "os.forkpty", "os.posix_spawn", "subprocess.Popen"),
-    *("socket.connect", "socket.bind", "socket.sendto", "sqlite3.connect"),
+    *("os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate"),
+    *("os.chmod", "os.chown", "os.utime", "socket.connect", "socket.bind", "socket.sendto", "sqlite3.connect"),
+    *("os.kill", "os.system", "os.fork", "os.forkpty", "os.posix_spawn", "subprocess.Popen"),
 )
 """Audit events of what a program does to the world, beside opening a file to write to it."""
 _discarding: int | None = None

@@ -531,7 +531,7 @@ def write_graph(roads: Roads, path: Path) -> None:
         "road_lane_width_m": roads.lane_width_m,
         "road_one_way": roads.one_way.astype(np.uint8),
     }
-    if 4 * len(roads) * max(map(len, roads.name)) <= LARGEST_ARRAY_BYTES:
+    if 4 * len(roads) * max(map(len, roads.name), default=0) <= LARGEST_ARRAY_BYTES:
         arrays["road_name"] = np.array(roads.name)
     if roads.frame is not None:
         arrays["frame_proj"] = np.array(roads.frame.proj)
