@@ -467,6 +467,7 @@ def _run_lockstep(
         attachment.say(wire.Final(attachment.nonce, host.take_final()))
     finally:
         loop.close()
+        host.discard_abandoned()
 
 
 def _run_realtime(

@@ -386,7 +386,7 @@ class Kill(ProcessFault):
 
 
 class Restart(ProcessFault):
-    """The programs are ended in order, so that their `finally` blocks run; else as `kill`.
+    """The programs are ended in order: `finally` blocks run, in lockstep without waiting; else as `kill`.
 
     Zenoh programs are ended by SIGTERM, at which Python runs nothing more, unless in real time the program
     handles it.

@@ -223,3 +223,4 @@ class _Process:
             self._final = final.traffic
         finally:
             loop.close()
+            self._host.discard_abandoned()

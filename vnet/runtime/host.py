@@ -256,10 +256,13 @@ class Host:
                 self._start(node)
 
     def _start(self, node: Node) -> None:
+        main, context = self._main(node, self._programs[node.id]), self._context_of(node)
+        self._mains[node.id] = self._loop.create_task(main, name=f"{node.id} main", context=context)
+
+    def _context_of(self, node: Node) -> contextvars.Context:
         context = contextvars.copy_context()
         context.run(current_node.set, node)
-        main = self._main(node, self._programs[node.id])
-        self._mains[node.id] = self._loop.create_task(main, name=f"{node.id} main", context=context)
+        return context
 
     def _chooser_of(self, node: Node) -> EventChooser:
         order = self._orders[node.id]
@@ -300,11 +303,17 @@ class Host:
                 task.cancel()
 
     def _settle_stopped(self) -> None:
-        """Hear no more of processes that have ended: they have done what they could without waiting."""
+        """End processes that have been ended in order: they have done what they could without waiting."""
+        if not self._stopped_ns:
+            return
         for gone in self._stopped_ns:
             self._unhandled.settle(gone)
             self._unhandled.silence(gone)
+            for task in asyncio_internals.abandon_pending(self._tasks_of(gone)):
+                self._context_of(gone).run(asyncio_internals.close_abandoned, task)
+            self._killed[gone] = asyncio_internals.abandon_pending(self._tasks_of(gone))
         self._stopped_ns.clear()
+        self._hold()
 
     def restart(self, welcome: wire.Welcome) -> None:
         """Run a node's program again, as another incarnation (simulated)."""
@@ -385,8 +394,7 @@ class Host:
         """
         if self._calls:
             self._take_process_ends()
-        if self._stopped_ns:
-            self._settle_stopped()
+        self._settle_stopped()
         (window := self._window).end_instant(self._clock(), self.take_traffic())
         next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
         next_ns = self.news.first_ns(self._paused, next_ns)

@@ -3,12 +3,14 @@
 import asyncio
 import gc
 import random
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.faults import KINDS, parse_fault
+from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.radio import SentFrame
@@ -22,6 +24,7 @@ ORDERED = "tests.support.fault_programs:minds_the_order"
 PERIOD_NS = 200_000_000
 IDS = ["v01", "v02", "v03", "v04"]
 Entry = tuple[int, int, str]
+Run = Callable[[Scenario], Emulation]
 diary: dict[str, list[Entry]] = {}
 """Record of the programs below, by node: when by the loop's clock, in which incarnation, and what."""
 
@@ -43,6 +46,21 @@ async def lives(node: Node) -> None:
         note(node, "ends")
         await node.radio.broadcast(b"last words")
         node.report(incarnation=-1)
+
+
+async def waits_at_its_end(node: Node) -> None:
+    """Waits in its `finally` block for longer than it is down, and writes down that it does."""
+    try:
+        await asyncio.Event().wait()
+    finally:
+        with (node.folder / f"log{node.incarnation}").open("w") as file:
+            file.write("begins to end, ")
+            try:
+                for _ in range(40):
+                    await asyncio.sleep(0.1)
+                    note(node, "goes on")
+            finally:
+                file.write("ends")
 
 
 async def clings_to_life(node: Node) -> None:
@@ -180,6 +198,15 @@ def test_who_is_restarted_runs_its_finally_blocks_and_nobody_hears_them() -> Non
     assert not any(row["size_bytes"] == len(b"last words") for row in rows(emulation))
     assert all(incarnation >= 0 for _, incarnation in reports(emulation, "v02"))
     assert sent_by(emulation, "v02") == [t for t in range(0, 15 * PERIOD_NS, PERIOD_NS) if not 1.1e9 <= t < 1.7e9]
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+def test_who_is_restarted_waits_for_nothing_more_and_keeps_what_it_has_written(run: Run) -> None:
+    diary.clear()
+    emulation = run(scenario_of([fault("restart", 1.1, 0.6, "v02")], f"{HERE}:waits_at_its_end"))
+    assert diary == {}, "no time passes in processes that end"
+    written = {file.name: file.read_text() for file in emulation.folder.disks.glob("v02/log*")}
+    assert written == dict.fromkeys(["log0", "log1"], "begins to end, ends")
 
 
 @pytest.mark.parametrize("kind", ["kill", "restart"])
