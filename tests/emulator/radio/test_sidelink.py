@@ -252,6 +252,22 @@ def test_a_frame_that_would_wait_longer_than_t2_has_a_resource_of_its_own(radio:
     assert max(row["left_ns"] - row["sent_ns"] for row in rows) <= 22 * MS
 
 
+def test_a_frame_keeps_its_window_where_a_longer_one_ends_the_reservation_it_waits_for() -> None:
+    def sent(seed: int, *frames: tuple[int, int]) -> list[dict[str, Any]]:
+        subject = engine(line(0, 50), seed, access_jitter_ms=0.0, **LTE)
+        for time_ns, size in frames:
+            subject.advance(time_ns)
+            subject.transmit(time_ns, 0, [SentFrame("", bytes(size), period_ms=100)])
+        subject.drain()
+        rows: list[dict[str, Any]] = subject.trace.to_table().to_pylist()
+        return rows
+
+    for seed in range(8):
+        first_ns = sent(seed, (0, 50))[0]["on_air_ns"]
+        rows = sent(seed, (0, 50), (first_ns + 2 * MS, 50), (first_ns + 70 * MS, 500))
+        assert [row["on_air_ns"] - row["sent_ns"] <= 100 * MS for row in rows] == [True] * 3
+
+
 @pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
@@ -285,10 +301,13 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
     assert 200 / 6 - 10 <= elsewhere <= 200 / 2
     rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True)), 1, 60.0)
     phase = [row["on_air_ns"] % (100 * MS) for row in rows]
-    is_shot = (at not in (before, after) for before, at, after in zip(phase, phase[1:], phase[2:], strict=False))
+    is_shot = [at not in (before, after) for before, at, after in zip(phase, phase[1:], phase[2:], strict=False)]
     assert max(len(list(run)) for is_one, run in groupby(is_shot) if not is_one) == 5, (
         "the sixth is one at the latest"
     )
+    kept = [(n, at) for n, (at, is_one) in enumerate(zip(phase[1:], is_shot, strict=False)) if not is_one]
+    first = [n for n, at in (next(run) for _, run in groupby(kept, lambda each: each[1]))]
+    assert 9 < np.mean(np.diff(first)) < 11.5, "the counter of 5 to 15 frames counts them"
 
 
 @pytest.mark.parametrize("seed", range(6))
