@@ -162,6 +162,22 @@ def test_a_vehicle_that_is_lost_begins_again_where_its_fixes_are() -> None:
     assert position is not None and abs(position[0][0] - 1500.0) < 10
 
 
+def test_a_vehicle_begins_again_only_where_fixes_follow_each_other() -> None:
+    vehicle, rng = vehicle_on(roads((0, 0, EAST))), np.random.default_rng(2)
+
+    def drive(east_m: Array, off_m: Array | float = 0.0) -> float:
+        for at_m in east_m + off_m:
+            seen_m = np.array([at_m, 0.0]) + COMMON_M + rng.normal(0, 0.5, 2)
+            vehicle.step(0.5, Observation(seen_m, 0.25 * np.eye(2), EAST, speed_m_s=10.0))
+        position = vehicle.position_m()
+        assert position is not None
+        return float(position[0][0] + vehicle.estimate_m[0] - COMMON_M[0] - east_m[-1])
+
+    assert abs(drive(np.arange(0, 200, 5.0))) < 3
+    assert abs(drive(np.arange(200, 240, 5.0), 300.0 * np.tile([1, -1, 2, -2], 2))) < 30
+    assert abs(drive(np.arange(1000, 1050, 5.0))) < 3
+
+
 def test_a_belief_from_outside_replaces_its_own() -> None:
     vehicle = vehicle_on(roads((0, 0, EAST)))
     run(vehicle, fixes(standing(3), EAST))
