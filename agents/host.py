@@ -450,7 +450,7 @@ def _run_lockstep(
         return ahead.open_window(message)
 
     loop = VirtualTimeLoop(lambda next_timer_ns: ahead.exchange(next_timer_ns), welcomes[0].spin_limit)
-    host = Host(welcomes, lambda: loop.now_ns, lambda: ahead.catch_up(), write_line, disks, debugger)
+    host = Host(welcomes, lambda: loop.now_ns, lambda: ahead.tell(), write_line, disks, debugger)
     ahead = RunAhead(host, lambda: loop.now_ns, swap)
     loop.before_job = ahead.catch_up
     attachment.time_ns = lambda: loop.now_ns
@@ -660,7 +660,7 @@ Swap = Callable[[int | None], int]
 class RunAhead:
     """Passes a host through its windows and the quiet instants behind them. `clock` is the loop's own, in ns.
 
-    It is made in the thread of the loop. The loop calls `catch_up` before each job, the host with new traffic.
+    It is made in the thread of the loop. The loop calls `catch_up` before each job, the host `tell`.
     """
 
     def __init__(self, host: Host, clock: Callable[[], int], swap: Swap) -> None:
@@ -699,7 +699,7 @@ class RunAhead:
 
     def _pass_on(self, next_timer_ns: int | None) -> int:
         now_ns = self._clock()
-        if now_ns >= self._end_ns and (self._host.has_traffic or not self._may_pass(self._wake_ns(next_timer_ns))):
+        if now_ns >= self._end_ns and (self._host.must_ask or not self._may_pass(self._wake_ns(next_timer_ns))):
             self._reach(now_ns)  # the last of quiet instants, too: a program that is ended finds what came by then
         next_ns = self._host.next_instant(next_timer_ns)
         if next_ns is not None:
@@ -716,8 +716,13 @@ class RunAhead:
         self.catch_up()
         refill()
 
+    def tell(self) -> None:
+        """Have this instant granted if it is quiet, and what is told at it cannot be told in advance."""
+        if self._host.must_ask:
+            self.catch_up()
+
     def catch_up(self) -> None:
-        """Have this instant granted if it is quiet: a program looks for packets, tells anything, or begins a job.
+        """Have this instant granted if it is quiet: a program looks for packets, begins a job, or ends.
 
         Other threads, and processes that a program has forked, cannot ask. What ends the run here must not pass
         through the program: it leaves the loop when the instant is over.

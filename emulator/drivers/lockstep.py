@@ -9,13 +9,14 @@ sent before T, the next instant at which anything happens: each process may pass
 Arrivals are *shown* to processes before the window, and *decided* after it, in the order of time with what the
 processes did: a program that ends within the window does not receive what arrives later. A window ends with the
 period at the latest, and before faults and the horizon. A process that runs `ahead` may go on by itself where
-nobody could notice, and has the fixes of the next period for that (`agents/host.py`).
+nobody could notice, and tell in advance what it sends there; it has the fixes of the next period for that
+(`agents/host.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from itertools import count
 from typing import Any
 
@@ -47,10 +48,10 @@ class LockstepProcess:
         self.plan = -1
         self.seq = 0
         self.granted_ns = 0
+        self.quiet_ns = 0
         self.next_timer_ns: int | None = None
         self.waiting_radio: Sequence[str] = ()
         self.waiting_gnss: Sequence[str] = ()
-        self.steps: Sequence[wire.Step] = ()
         self.packets: dict[str, list[Packet]] = {}
         """Packets that have yet to be granted, by node."""
         self.next_fix = dict.fromkeys(self.nodes, 0)
@@ -101,7 +102,8 @@ class Lockstep:
         self._plans = count()
         self._listens = np.zeros(len(emulation.world.node_ids), dtype=bool)
         """Nodes (N,) that an arrival wakes."""
-        self._yielded: list[LockstepProcess] = []
+        self._steps: list[tuple[int, int, wire.Step]] = []
+        """Heap of what processes have told and is not taken yet: time, order of the process, and the step."""
         self._deaths: list[tuple[LockstepProcess, dict[str, Any]]] = []
         self._news = emulation.news
         self._crowded: set[str] = set()
@@ -155,21 +157,21 @@ class Lockstep:
         if self.owed.get(process_id) != message.seq:
             raise ProtocolError(f"yield {message.seq} of {process_id}: expected {self.owed.get(process_id)}")
         process = self._processes[process_id]
-        check_yield(process.nodes, message, process.granted_ns, self._end_ns)
+        check_yield(process.nodes, message, process.granted_ns, self._end_ns, process.quiet_ns)
         del self.owed[process_id]
         process.next_timer_ns = message.next_timer_ns
         process.waiting_radio = message.waiting_radio
         process.waiting_gnss = message.waiting_gnss
-        process.steps = message.steps
-        self._yielded.append(process)
+        for step in message.steps:
+            heappush(self._steps, (step.time_ns, process.order, step))
         self._plan(process)
         self._emulation.costs.wake_ups[process_id] += message.instants
 
     def died(self, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from the beginning of the window on, and nothing is owed by it.
 
-        What it did within the window is lost with it; at quiet instants since it has told nothing. `step` tells of
-        those of a window in the order of processes, whichever the system has told of first.
+        What it did within the window is lost with it, and what it has told in advance. `step` tells of those of a
+        window in the order of processes, whichever the system has told of first.
         """
         if process := self._processes.get(process_id):  # else a fault was faster
             self._remove(process_id)
@@ -193,15 +195,13 @@ class Lockstep:
         """Take what was enqueued in the window, in the order of time, and decide what has arrived in it."""
         assert not self.owed, self.owed
         emulation = self._emulation
-        instants: dict[int, list[wire.Traffic]] = {}
-        for process in sorted(self._yielded, key=lambda process: process.order):
-            for step in process.steps:
-                instants.setdefault(step.time_ns, []).append(step.traffic)
-        self._yielded = []
-        for time_ns in sorted(instants):
-            if any(traffic.endings for traffic in instants[time_ns]):
+        while self._steps and (time_ns := self._steps[0][0]) < self._end_ns:
+            told: list[wire.Traffic] = []
+            while self._steps and self._steps[0][0] == time_ns:
+                told.append(heappop(self._steps)[2].traffic)
+            if any(traffic.endings for traffic in told):
                 emulation.pass_to(time_ns)  # what arrives at the same instant is still received
-            emulation.take(time_ns, instants[time_ns])
+            emulation.take(time_ns, told)
         emulation.pass_to(self._end_ns - 1)
 
     def _go_on(self) -> dict[str, wire.Grant]:
@@ -246,7 +246,8 @@ class Lockstep:
         far nobody will but for those whom an arrival wakes.
         """
         emulation = self._emulation
-        next_ns = min(ns for ns in (emulation.duration_ns, self._next_planned_ns()) if ns is not None)
+        told_ns = self._steps[0][0] if self._steps else None
+        next_ns = min(ns for ns in (emulation.duration_ns, self._next_planned_ns(), told_ns) if ns is not None)
         until_ns = [next_ns, emulation.next_change_ns(), emulation.next_control_ns(), self.horizon_ns]
         listening = np.flatnonzero(self._listens)
         emulation.engine.look_ahead(min(time_ns for time_ns in until_ns if time_ns is not None), listening)
@@ -326,6 +327,8 @@ class Lockstep:
         process = self._processes.pop(process_id, None)
         if process is not None:
             self._listens[process.numbers] = False
+            self._steps = [told for told in self._steps if told[1] != process.order]
+            heapify(self._steps)
         self._news.take(() if process is None else process.nodes)
 
     def _plan(self, process: LockstepProcess) -> None:
@@ -424,6 +427,7 @@ class Lockstep:
         self._mail[process.id] = Mail(packets, fixes)
         if process.id in self.ahead and self._lookahead_ns > 1 and not process.paused:
             grant = self._quiet_grant(process, grant)
+        process.quiet_ns = grant.quiet_ns
         self.owed[process.id] = process.seq
         process.seq += 1
         return grant

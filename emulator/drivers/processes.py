@@ -87,8 +87,11 @@ def _told(traffic: wire.Traffic) -> Sequence[Sequence[Any]]:
     return *sent, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations
 
 
-def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_ns: int) -> None:
-    """Raise ProtocolError if a yield of these nodes' process breaks its window, `granted_ns` to `end_ns`."""
+def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_ns: int, quiet_ns: int) -> None:
+    """Raise ProtocolError if a yield of these nodes' process breaks its window, `granted_ns` to `end_ns`.
+
+    Before `quiet_ns` it may have gone on, and have steps in advance.
+    """
     if message.next_timer_ns is not None and message.next_timer_ns < end_ns:
         raise ProtocolError(
             f"yield {message.seq} of {nodes[0]}: its next timer, {message.next_timer_ns}, lies before the end "
@@ -96,10 +99,10 @@ def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_
         )
     earliest_ns = granted_ns
     for step in message.steps:
-        if not earliest_ns <= step.time_ns < end_ns:
+        if not earliest_ns <= step.time_ns < max(end_ns, quiet_ns):
             raise ProtocolError(
                 f"yield {message.seq} of {nodes[0]}: a step at {step.time_ns}, where {earliest_ns} to "
-                f"{end_ns - 1} are allowed"
+                f"{max(end_ns, quiet_ns) - 1} are allowed"
             )
         earliest_ns = step.time_ns + 1
     waiting = [*message.waiting_radio, *message.waiting_gnss]

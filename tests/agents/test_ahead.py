@@ -32,7 +32,7 @@ def run() -> Iterator[Callable[[Program, Swap], wire.Traffic]]:
     def run(program: Program, swap: Swap) -> wire.Traffic:
         emulation = emulation_of(scenario_of([], "agents.beacon:main", vehicles=1))
         welcome = emulation.welcome(emulation.world.node_ids[0], b"n")
-        parts.host = Host([welcome], lambda: loop.now_ns, lambda: parts.ahead.catch_up())
+        parts.host = Host([welcome], lambda: loop.now_ns, lambda: parts.ahead.tell())
         parts.ahead = RunAhead(parts.host, lambda: loop.now_ns, lambda timer_ns: parts.swap(timer_ns))
         parts.swap = lambda timer_ns: parts.ahead.open_window(granted(swap(timer_ns)))
         loop.before_job = parts.ahead.catch_up
@@ -120,19 +120,16 @@ async def computes(node: Node) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("does", [sends, reports, logs, notes, listens, works])
-def test_what_a_program_tells_is_asked_for_at_once(
+@pytest.mark.parametrize("does", [listens, works])
+def test_what_the_emulator_must_know_first_is_asked_for_at_once(
     run: Callable[[Program, Swap], wire.Traffic], does: Program
 ) -> None:
-    """So the emulator stands at this instant, whatever becomes of the process in the next line."""
     assert asked_by(run, does) == [20 * MS]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("does", [computes, forks, starts_a_thread])
-def test_what_nobody_could_notice_is_not_asked_for(
-    run: Callable[[Program, Swap], wire.Traffic], does: Program
-) -> None:
+@pytest.mark.parametrize("does", [computes, forks, starts_a_thread, sends, reports, logs, notes])
+def test_what_needs_no_answer_is_not_asked_for(run: Callable[[Program, Swap], wire.Traffic], does: Program) -> None:
     assert asked_by(run, does) == []
 
 

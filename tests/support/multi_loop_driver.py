@@ -206,7 +206,7 @@ class _Process:
         loop = self._loop = VirtualTimeLoop(
             lambda timer_ns: self._ahead.exchange(timer_ns), self._welcomes[0].spin_limit
         )
-        self._host = Host(self._welcomes, lambda: loop.now_ns, lambda: self._ahead.catch_up(), disks=self._disks)
+        self._host = Host(self._welcomes, lambda: loop.now_ns, lambda: self._ahead.tell(), disks=self._disks)
         self._ahead = RunAhead(self._host, lambda: loop.now_ns, self._swap)
         loop.before_job = self._ahead.catch_up
         asyncio.set_event_loop(loop)

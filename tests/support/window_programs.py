@@ -127,11 +127,15 @@ async def ticks(node: Node) -> None:
 
 
 async def looks_once_a_period(node: Node) -> None:
-    """Sleep some times after each fix, then look for packets and send."""
+    """Sleep some times after each fix, and speak meanwhile; then look for packets and send."""
     diary = Diary(node)
     async for fix in node.gnss:
-        for _ in range(3):
+        for nth in range(3):
             await asyncio.sleep(0.02)
+            if nth == node.rng.integers(3):
+                await node.radio.broadcast(bytes(nth))
+                node.report(nth=nth)
+                node.event("spoke", nth=nth)
         diary.note([(packet.sender, packet.received_ns) for packet in node.radio.drain()])
         await node.radio.broadcast(fix.position_m.tobytes())
         node.report(fix.position_m, digest=diary.number)

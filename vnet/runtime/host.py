@@ -61,7 +61,7 @@ class Host:
     """The nodes of one process and their programs; see the module's text.
 
     `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic: real time puts
-    it at once, lockstep has a quiet instant granted. `on_line` is called with a node and a line of its log.
+    it at once, lockstep may have a quiet instant granted. `on_line` is called with a node and a line of its log.
     `disks` has the nodes' folders, by default temporary ones. `debugger` stops in the program of one of them.
     """
 
@@ -351,6 +351,11 @@ class Host:
     def has_traffic(self) -> bool:
         """True if nodes have enqueued anything since `take_traffic`."""
         return self._outbox.has_any or self._unhandled.has_any
+
+    @property
+    def must_ask(self) -> bool:
+        """True if nodes have enqueued what cannot be told before its instant has been granted (lockstep)."""
+        return self._outbox.must_ask or self._unhandled.has_any
 
     def take_traffic(self) -> wire.Traffic:
         """Return everything that the nodes have enqueued since the last call."""
@@ -650,6 +655,11 @@ class Outbox:
     def has_any(self) -> bool:
         """True if there is anything that the emulator must be told at this instant."""
         return bool(self.frames or self.reports or self.endings or self.notes or self.actions or self.messages)
+
+    @property
+    def must_ask(self) -> bool:
+        """True if there is more than frames, reports and notes, after which programs go on without an answer."""
+        return bool(self.endings or self.deviations or self.actions or self.messages)
 
     def take(self, unhandled: Sequence[wire.Unhandled]) -> wire.Traffic:
         """Remove and return all of it, with exceptions that nobody handled."""

@@ -285,8 +285,8 @@ class Hello(Message, frozen=True):
 class Yield(Message, frozen=True):
     """Lockstep: the process has nothing left to do before the end of the window of grant `seq`.
 
-    `steps` are in the order of time; instants at which nothing was enqueued have none. `instants` is the number of
-    all instants of the window at which the process ran.
+    `steps` are in the order of time; instants at which nothing was enqueued have none. Those of quiet instants are
+    told in advance. `instants` is the number of all instants at which the process ran.
     """
 
     nonce: bytes

@@ -435,7 +435,7 @@ class LiveProcesses(Processes):
         window = self._windows[process_id]  # the barrier would refuse it only when all others have yielded
         if message.seq != window.seq:
             raise ProtocolError(f"yield {message.seq} of {process_id}: expected {window.seq}")
-        check_yield(self.members.nodes_with(process_id), message, window.time_ns, window.end_ns)
+        check_yield(self.members.nodes_with(process_id), message, window.time_ns, window.end_ns, window.quiet_ns)
         self._incomplete.pop(process_id, None)
         if refs := refs_of(message):
             self._check_refs(process_id, refs)
