@@ -64,7 +64,8 @@ async def cooperate(node: Node, options: Options, estimator: Estimator | Informa
         clock.set_by(fix)
 
         await clock.sleep_until(fix.time_ns + slot_ns)
-        estimator.read(node.radio.drain(), clock.now_ns)
+        if options.exchange == "particles":  # whose frames have what the vehicle has just heard
+            estimator.read(node.radio.drain(), clock.now_ns)
         payload_bytes = await _broadcast(node, estimator, fix)
 
         await clock.sleep_until(fix.time_ns + listening_ns)
