@@ -453,6 +453,7 @@ def _run_lockstep(
     host = Host(welcomes, lambda: loop.now_ns, lambda: ahead.tell(), write_line, disks, debugger)
     ahead = RunAhead(host, lambda: loop.now_ns, swap)
     loop.before_job = ahead.catch_up
+    count_as_death(ahead.catch_up)
     attachment.time_ns = lambda: loop.now_ns
     asyncio.set_event_loop(loop)
     try:

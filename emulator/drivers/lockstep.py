@@ -9,8 +9,8 @@ sent before T, the next instant at which anything happens: each process may pass
 Arrivals are *shown* to processes before the window, and *decided* after it, in the order of time with what the
 processes did: a program that ends within the window does not receive what arrives later. A window ends with the
 period at the latest, and before faults and the horizon. A process that runs `ahead` may go on by itself where
-nobody could notice, and tell in advance what it sends there; it has the fixes of the next period for that
-(`agents/host.py`).
+nobody could notice, and tell in advance the frames that it sends there; it has the fixes of the next period for
+that (`agents/host.py`).
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ async def computes(node: Node) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("does", [listens, works])
+@pytest.mark.parametrize("does", [listens, works, reports, logs, notes])
 def test_what_the_emulator_must_know_first_is_asked_for_at_once(
     run: Callable[[Program, Swap], wire.Traffic], does: Program
 ) -> None:
@@ -128,7 +128,7 @@ def test_what_the_emulator_must_know_first_is_asked_for_at_once(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("does", [computes, forks, starts_a_thread, sends, reports, logs, notes])
+@pytest.mark.parametrize("does", [computes, forks, starts_a_thread, sends])
 def test_what_needs_no_answer_is_not_asked_for(run: Callable[[Program, Swap], wire.Traffic], does: Program) -> None:
     assert asked_by(run, does) == []
 

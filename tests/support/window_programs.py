@@ -134,8 +134,6 @@ async def looks_once_a_period(node: Node) -> None:
             await asyncio.sleep(0.02)
             if nth == node.rng.integers(3):
                 await node.radio.broadcast(bytes(nth))
-                node.report(nth=nth)
-                node.event("spoke", nth=nth)
         diary.note([(packet.sender, packet.received_ns) for packet in node.radio.drain()])
         await node.radio.broadcast(fix.position_m.tobytes())
         node.report(fix.position_m, digest=diary.number)

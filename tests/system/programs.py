@@ -77,11 +77,13 @@ async def exits_early(node: Node) -> None:
 
 
 async def dies(node: Node) -> None:
-    """One vehicle's process is killed in the middle of the run."""
+    """One vehicle's process is killed in the middle of the run, or ends itself."""
     async for fix in node.gnss:
         await node.radio.broadcast(b"x")
         if node.id == "v02" and fix.time_ns >= 500_000_000:
             print("v02 is about to be killed", flush=True)
+            if node.options.get("exits"):
+                os._exit(7)
             os.kill(os.getpid(), signal.SIGKILL)
 
 

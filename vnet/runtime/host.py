@@ -658,8 +658,9 @@ class Outbox:
 
     @property
     def must_ask(self) -> bool:
-        """True if there is more than frames, reports and notes, after which programs go on without an answer."""
-        return bool(self.endings or self.deviations or self.actions or self.messages)
+        """True if there is more than frames: what is reported and logged stays whatever becomes of the process."""
+        told = self.reports or self.endings or self.notes or self.deviations or self.actions or self.messages
+        return bool(told)
 
     def take(self, unhandled: Sequence[wire.Unhandled]) -> wire.Traffic:
         """Remove and return all of it, with exceptions that nobody handled."""

@@ -47,6 +47,7 @@ JOBS = "vnet"
 _end_takers: list[Callable[[Node | None, str], None]] = []
 _process = os.getpid()
 _is_programs_own = False
+_before_death: list[Callable[[], None]] = []
 _status_late = 0
 
 
@@ -336,11 +337,14 @@ def caught(taker: Callable[[Node | None, str], None]) -> Iterator[None]:
         _end_takers.remove(taker)
 
 
-def count_as_death() -> None:
-    """Have this process, which is that of its programs, end with a status other than 0 if one of them ends it."""
+def count_as_death(*first: Callable[[], None]) -> None:
+    """Have this process, which is that of its programs, end with a status other than 0 if one of them ends it.
+
+    What is in `first` is called before.
+    """
     global _process, _is_programs_own
     _replace()
-    _process, _is_programs_own = os.getpid(), True
+    _process, _is_programs_own, _before_death[:] = os.getpid(), True, first
 
 
 def refuse_success() -> None:
@@ -371,6 +375,8 @@ def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
         node = present_node()
         if _is_programs_own:
             status = args[0] if name == "_exit" and args and isinstance(args[0], int) else 0
+            for call_first in _before_death:
+                call_first()
             _end_as_death(node, call, status)
         if not _end_takers or (node is None and not threading.current_thread().name.startswith(f"{JOBS}_")):
             if _status_late and (name != "_exit" or not args or args[0] == 0):
