@@ -66,7 +66,7 @@ NAMES = ["a", "b", "c"]
 LOST = {"run": {"name": "lost", "duration_s": 2.0, "stall_timeout_s": 2.0}, "network": {"vehicles": 6}, "fault": []}
 """A run of three hosts with two vehicles each."""
 ASKED_NS = 900_000_000
-"""When programs that speak in each period have last asked that are gone at one second."""
+"""Last request of programs that speak in each period and are gone at one second."""
 
 
 @pytest.fixture
