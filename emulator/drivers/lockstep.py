@@ -102,8 +102,8 @@ class Lockstep:
         self._plans = count()
         self._listens = np.zeros(len(emulation.world.node_ids), dtype=bool)
         """Nodes (N,) that an arrival wakes."""
-        self._steps: list[tuple[int, int, wire.Step]] = []
-        """Heap of what processes have told and is not taken yet: time, order of the process, and the step."""
+        self._steps: list[tuple[int, int, int, wire.Step]] = []
+        """Heap of what processes have told and is not taken yet: time, order of the process, number, and step."""
         self._deaths: list[tuple[LockstepProcess, dict[str, Any]]] = []
         self._news = emulation.news
         self._crowded: set[str] = set()
@@ -163,7 +163,7 @@ class Lockstep:
         process.waiting_radio = message.waiting_radio
         process.waiting_gnss = message.waiting_gnss
         for step in message.steps:
-            heappush(self._steps, (step.time_ns, process.order, step))
+            heappush(self._steps, (step.time_ns, process.order, next(self._plans), step))
         self._plan(process)
         self._emulation.costs.wake_ups[process_id] += message.instants
 
@@ -198,7 +198,7 @@ class Lockstep:
         while self._steps and (time_ns := self._steps[0][0]) < self._end_ns:
             told: list[wire.Traffic] = []
             while self._steps and self._steps[0][0] == time_ns:
-                told.append(heappop(self._steps)[2].traffic)
+                told.append(heappop(self._steps)[3].traffic)
             if any(traffic.endings for traffic in told):
                 emulation.pass_to(time_ns)  # what arrives at the same instant is still received
             emulation.take(time_ns, told)

@@ -92,10 +92,11 @@ def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_
 
     Before `quiet_ns` it may have gone on, and have steps in advance.
     """
-    if message.next_timer_ns is not None and message.next_timer_ns < end_ns:
+    passed_ns = max(end_ns, message.steps[-1].time_ns + 1) if message.steps else end_ns
+    if message.next_timer_ns is not None and message.next_timer_ns < passed_ns:
         raise ProtocolError(
             f"yield {message.seq} of {nodes[0]}: its next timer, {message.next_timer_ns}, lies before the end "
-            f"of its window, {end_ns}"
+            f"of its window or its last step, {passed_ns}"
         )
     earliest_ns = granted_ns
     for step in message.steps:

@@ -348,11 +348,6 @@ class Host:
             self._outbox.deviations.append(deviation)
 
     @property
-    def has_traffic(self) -> bool:
-        """True if nodes have enqueued anything since `take_traffic`."""
-        return self._outbox.has_any or self._unhandled.has_any
-
-    @property
     def must_ask(self) -> bool:
         """True if nodes have enqueued what cannot be told before its instant has been granted (lockstep)."""
         return self._outbox.must_ask or self._unhandled.has_any
@@ -650,11 +645,6 @@ class Outbox:
     messages: list[SentMessage] = field(default_factory=list)
     numbers: Iterator[int] = field(default_factory=count)
     """Numbers of messages of the backbone, of which no two are equal."""
-
-    @property
-    def has_any(self) -> bool:
-        """True if there is anything that the emulator must be told at this instant."""
-        return bool(self.frames or self.reports or self.endings or self.notes or self.actions or self.messages)
 
     @property
     def must_ask(self) -> bool:

@@ -194,6 +194,25 @@ def test_a_yield_that_does_not_fit_its_grant_is_refused_and_still_owed(
         lockstep.receive("v01", yielded(grants["v01"]))
 
 
+def test_steps_in_advance_are_taken_when_their_time_comes_unless_their_process_has_died() -> None:
+    lockstep, emulation = barrier()
+    lockstep.ahead = IDS
+    lockstep.start()
+    for node in IDS:
+        steps = [wire.Step(t * MS, wire.Traffic([SentFrame(node, b"x")])) for t in (50, 90)]
+        with pytest.raises(ProtocolError):
+            lockstep.receive(node, wire.Yield(b"n", 0, 90 * MS, [], [], steps, 1))
+        lockstep.receive(node, wire.Yield(b"n", 0, 95 * MS, [], [], steps, 1))
+    lockstep.died("v04", how="SIGKILL")
+    grants = lockstep.step()
+    assert times(grants) == dict.fromkeys(IDS[:3], 95 * MS)
+    yield_all(lockstep, grants)
+    lockstep.step()
+    emulation.engine.drain()
+    rows = emulation.engine.trace.to_table().to_pylist()
+    assert {(row["sender"], row["sent_ns"]) for row in rows} == {(n, t * MS) for n in IDS[:3] for t in (50, 90)}
+
+
 def test_a_process_that_died_owes_nothing_and_its_nodes_are_down() -> None:
     lockstep, emulation = barrier(processes=[["v01", "v02"], ["v03"], ["v04"]])
     grants = lockstep.start()
