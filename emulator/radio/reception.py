@@ -112,6 +112,7 @@ class Reception:
     def __init__(self, radio: Radio, signals: Signals) -> None:
         self._signals = signals
         self._threshold = Threshold(radio.receiver or Receiver())
+        cost(np.zeros(1), radio.bitrate_mbps)  # what is slow to import is there before the first frame
 
     def __call__(self, transmissions: Sequence[Transmission], receptions: Receptions) -> None:
         """Decide the receptions of the frames that were sent."""

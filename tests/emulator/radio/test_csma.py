@@ -1,5 +1,7 @@
 """The shared medium: nothing depends on how time is cut, and access goes by the rules of 802.11p."""
 
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
@@ -16,6 +18,7 @@ from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.faults import DataReplay, DoS, Duplicate, Fault, StaleMessages, Throttle
 from emulator.scenario.scenario import Radio
+from tests.support.paths import ROOT
 
 MS = 1_000_000
 US = 1_000
@@ -63,6 +66,24 @@ def run(
     heard += [(d.packet.received_ns, d.receiver, d.packet.payload) for d in subject.advance(10**10)]
     subject.drain()
     return heard
+
+
+IMPORTS = """
+import sys
+from tests.emulator.radio.test_csma import engine, line, run
+for mac in ({"kind": "80211p"}, {"kind": "lte-mode4"}, {"kind": "nr-mode2"}):
+    subject = engine(line(0, 100), path_loss={"kind": "winner_b1", "frequency_ghz": 5.9}, mac=mac)
+    before = set(sys.modules)
+    run(subject, [(0, 0, 100)])
+    print(*sorted(set(sys.modules) - before))
+"""
+
+
+@pytest.mark.slow
+def test_a_first_frame_imports_nothing() -> None:
+    """In real time it would be late by the time that an import takes, and the machine be blamed for it."""
+    done = subprocess.run([sys.executable, "-c", IMPORTS], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 crowds = st.lists(
