@@ -25,6 +25,8 @@ from vnet.gateway.ros2 import MOST_KEYS, ROS2_KEYS, Ros2
 from vnet.node import Fix
 from vnet.units import NS_PER_S
 
+ALL_CACHES = "/@adv/**"
+"""End of the key with which an advanced subscriber asks all caches for history (zenoh-ext 1.10)."""
 TOKEN_PERIODS = 3
 """Times `liveliness_s` without word of a vehicle's tokens after which they are gone."""
 
@@ -46,6 +48,8 @@ class RadioSide(ABC, Generic[Q]):
         self._reassembly = Reassembly()
         self._queries: dict[int, Q] = {}
         """Queries of this vehicle to which replies are awaited."""
+        self._histories: list[tuple[zenoh.KeyExpr, list[int]]] = []
+        """Keys for which all caches are asked now, and the numbers of the queries that end together with that."""
         self._query_numbers = count()
         self._tokens_ns = round(TOKEN_PERIODS * liveliness_s * NS_PER_S)
         self._told: dict[str, tuple[int, tuple[str, ...]]] = {}
@@ -70,11 +74,29 @@ class RadioSide(ABC, Generic[Q]):
             self._publish(*self._ros2.clock(time_ns))
 
     def keep(self, query: Q) -> CrossingQuery:
-        """Keep a query for as long as replies are awaited; return what crosses the radio."""
-        number = next(self._query_numbers)
+        """Keep a query for as long as replies are awaited; return what crosses the radio.
+
+        An advanced subscriber holds samples back while it asks all caches for history. One that asks a single
+        cache meanwhile, and waits for longer, would drop them (zenoh-ext 1.10): such queries end with the first.
+        """
+        number, loop = next(self._query_numbers), asyncio.get_running_loop()
         self._queries[number] = query
-        asyncio.get_running_loop().call_later(self._query_s, lambda: self._conclude(self._queries.pop(number)))
-        return crossing_query(number, query)
+        crossing = crossing_query(number, query)
+        key = zenoh.KeyExpr(crossing.selector.partition("?")[0])
+        asks_all = str(key).endswith(ALL_CACHES)
+        open_now = () if asks_all else (numbers for keys, numbers in self._histories if keys.includes(key))
+        if (numbers := next(iter(open_now), None)) is None:
+            numbers = []
+            loop.call_later(self._query_s, self._end, numbers)
+        if asks_all:
+            self._histories.append((key, numbers))
+        numbers.append(number)
+        return crossing
+
+    def _end(self, numbers: list[int]) -> None:
+        self._histories = [each for each in self._histories if each[1] is not numbers]
+        for number in reversed(numbers):  # that for which the others have been waiting is the first
+            self._conclude(self._queries.pop(number))
 
     def hear(self, sender: str, payload: bytes, time_ns: int) -> None:
         """Give the programs what a frame carries. Raises ValueError for bytes that a fault has changed."""

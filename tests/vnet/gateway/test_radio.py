@@ -335,6 +335,20 @@ def test_advanced_subscriber_recovers_most_of_what_the_radio_loses_in_order(driv
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("recovery", ["", "heartbeat=True"])
+def test_history_is_whole_although_queries_stay_open(drive: Drive, recovery: str) -> None:
+    """A vehicle that is restarted hears of a token while it asks all caches, and then asks that one by itself."""
+    restarts = [
+        {"kind": "restart", "at_s": 0.2, "duration_s": 0.1 * number, "nodes": [f"v0{number}"]}
+        for number in (2, 3, 4, 5)
+    ]
+    run = drive(RECOVER.format(history=True, recovery=recovery), vehicles=5, duration_s=4.0, fault=restarts)
+    for node in ("v02", "v03", "v04", "v05"):
+        heard = [line.split()[1] for line in log(run, node) if line.startswith("heard")]
+        assert heard == [str(number) for number in range(40)]
+
+
+@pytest.mark.slow
 def test_sample_miss_listener_reports_exactly_what_the_radio_has_lost(drive: Drive) -> None:
     run = drive(RECOVER.format(history=False, recovery=""), vehicles=2, loss=0.3, duration_s=4.0)
     heard = [int(line.split()[2]) for line in log(run, "v02") if line.startswith("heard")]
