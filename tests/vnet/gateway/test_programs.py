@@ -175,6 +175,7 @@ def test_chance_of_numpy_is_the_vehicles_own(drive: Drive) -> None:
         "while not semaphore.acquire(timeout=0): pass",
         "while threading.active_count() > 2: pass",
         "while thread in threading.enumerate(): pass",
+        "while not told: time.sleep(0)",
     ],
 )
 def test_a_program_that_polls_without_a_pause_comes_to_its_time(drive: Drive, waits: str) -> None:
@@ -183,9 +184,10 @@ def test_a_program_that_polls_without_a_pause_comes_to_its_time(drive: Drive, wa
         from concurrent.futures import ThreadPoolExecutor, wait
         session, lock = zenoh.open(zenoh.Config()), threading.Lock()
         samples, came, items = session.declare_subscriber("a"), threading.Event(), queue.Queue(1)
-        semaphore = threading.Semaphore(0)
+        semaphore, told = threading.Semaphore(0), []
         def put():
             time.sleep(0.1)
+            told.append("a variable")
             session.put("a", "b")
             came.set()
             items.put(1)
@@ -384,10 +386,12 @@ def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Driv
         with ProcessPoolExecutor(2) as pool:
             jobs = [pool.submit(work, 4)]
             print(list(pool.map(work, range(3))), [job.result() for job in as_completed(jobs)])
+        with multiprocessing.Pool(2) as pool, multiprocessing.get_context("spawn").Pool(2) as other:
+            print(pool.map(lambda number: work(number), [5]), other.map(work, [6]))
         """
     )
     lines = [line for line in log(run)[:-1] if "child processes" not in line]
-    assert lines == ["(9, True, False, True) 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]"]
+    assert lines == ["(9, True, False, True) 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]", "[25] [36]"]
 
 
 @pytest.mark.parametrize("method", ["spawn", "fork"])
@@ -771,6 +775,73 @@ def test_sys_exit_in_a_callback_ends_nothing_and_is_told(drive: Drive) -> None:
     assert run.verdict == "invalid"
     assert any("SystemExit(5)" in line for line in log(run))
     assert "goes on" in log(run)
+
+
+def test_a_callback_that_cannot_be_called_is_named_by_its_own_line(drive: Drive) -> None:
+    run = drive(
+        """
+        import zenoh
+        session = zenoh.open(zenoh.Config())
+        session.declare_subscriber("a", lambda: None)
+        session.put("a", "b")
+        """
+    )
+    (told,) = events(run, "exception")
+    assert "program0.py:4" in told["place"]
+
+
+def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) -> None:
+    """Sessions, queriers and advanced publishers end what they do; rings of what has ended are lost."""
+    run = drive(
+        """
+        import time, zenoh
+        from zenoh import *
+        from zenoh.ext import CacheConfig, declare_advanced_publisher
+        from zenoh.handlers import RingChannel
+        def say(*words):
+            print(f"{time.monotonic():.1f}", *words)
+        def talker():
+            session = zenoh.open(Config())
+            session.declare_subscriber("a", lambda sample: say("heard by nobody's session"))
+            return session.declare_publisher("a"), session.declare_subscriber("a")
+        def cache():
+            declare_advanced_publisher(session, "c", cache=CacheConfig(3)).put("x")
+        def answer(query):
+            time.sleep(0.1)
+            query.reply("q", "x")
+        publisher, subscriber = talker()
+        config = Config()
+        config.insert_json5("timestamping/enabled", "true")
+        session, other = zenoh.open(config), zenoh.open(Config())
+        session.put("a", "x")
+        for use in (lambda: publisher.put("x"), subscriber.recv):
+            try:
+                use()
+            except ZError as error:
+                say(error)
+        queryable = session.declare_queryable("q", answer)
+        querier = other.declare_querier("q")
+        say(len(list(querier.get())), len(list(other.declare_querier("q").get())))
+        cache()
+        say(len(list(other.get("c/@adv/**", consolidation=ConsolidationMode.NONE))))
+        ring = session.declare_subscriber("r", RingChannel(2))
+        reader = ring.handler
+        session.put("r", "x")
+        ring.undeclare()
+        try:
+            reader.try_recv()
+        except ZError as error:
+            say(error)
+        """,
+        program={"zenoh": {"query_s": 0.3}},
+    )
+    assert [line.split(" ", 1)[1] for line in log(run)[:-1]] == [
+        "session closed",
+        "channel is empty and closed",
+        "1 0",
+        "0",
+        "The ringbuffer has been deleted",
+    ]
 
 
 SLOW = """

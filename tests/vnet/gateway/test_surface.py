@@ -25,7 +25,7 @@ MODULES = zenoh_modules(
 
 def declared(module: str) -> Iterator[ast.stmt]:
     """Yield what a module's interface declares."""
-    name = {"zenoh": "__init__"}.get(module, module.removeprefix("zenoh."))
+    name = {"zenoh": "__init__", "zenoh.zenoh": "__init__"}.get(module, module.removeprefix("zenoh."))
     yield from ast.parse((Path(zenoh.__file__).parent / f"{name}.pyi").read_text()).body
 
 

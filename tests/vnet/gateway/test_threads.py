@@ -359,7 +359,20 @@ def test_deadlock_of_threads_is_found_with_their_lines(drive: Drive) -> None:
 
 
 def test_program_that_does_not_let_time_advance_is_ended(drive: Drive) -> None:
-    run = drive("import time\nwhile True:\n    time.sleep(0)\n")
+    run = drive(
+        """
+        import queue, threading
+
+        def play(take, give):
+            while True:
+                give.put(take.get())
+
+        here, there = queue.Queue(), queue.Queue()
+        threading.Thread(target=play, args=(here, there), daemon=True).start()
+        here.put("ball")
+        play(there, here)
+        """
+    )
     assert [event["node"] for event in events(run, "spun")] == ["v01"]
 
 

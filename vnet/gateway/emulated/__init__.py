@@ -78,7 +78,7 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
             raise zenoh.ZError("timestamp_callback is not available on virtual time")
         go_no_further_if_ended()
         program.has_session = True
-        return sessions.Session(vehicle, new_outlet(), config)
+        return sessions.Session(vehicle, new_outlet(), config).of_program()
 
     def scout(handler: Any = None, what: Any = None, config: zenoh.Config | None = None) -> sessions.Scout:
         return sessions.Scout(vehicle, new_outlet(), handler, what)
@@ -98,7 +98,9 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
         try_init_log_from_env=lambda: None,
         init_log_from_env_or=lambda level: None,
     )
-    return {"zenoh": package, "zenoh.ext": ext, "zenoh.handlers": handlers, "zenoh.shm": zenoh.shm}
+    vars(package)["zenoh"] = package  # in Zenoh its compiled part, which has the same names
+    parts = {"zenoh": package, "ext": ext, "handlers": handlers, "shm": zenoh.shm}
+    return {"zenoh": package} | {f"zenoh.{name}": part for name, part in parts.items()}
 
 
 async def main(node: Node) -> None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial, partialmethod
 from typing import Any, Literal, NoReturn
+from weakref import proxy
 
 import msgspec
 import zenoh
@@ -152,6 +153,7 @@ class AdvancedPublisher(Publisher):
     ) -> None:
         given = {"cache": cache, "sample_miss_detection": sample_miss_detection, "session": session}
         check({**given, "publisher_detection": publisher_detection}, **_KINDS)
+        session = session.inner
         super().__init__(session, key_expr, **options)
         misses = sample_miss_detection
         if misses is None and cache is not None and not session.stamps:
@@ -170,7 +172,8 @@ class AdvancedPublisher(Publisher):
         if publisher_detection:
             self.until_end(LivelinessToken(session, own_key).end)
         if misses is not None and (period_s := misses.heartbeat or misses.sporadic_heartbeat) is not None:
-            heart = _every(period_s, partial(self._beat, own_key, misses.heartbeat is None))
+            beat = partial(AdvancedPublisher._beat, proxy(self), own_key, misses.heartbeat is None)
+            heart = _every(period_s, beat)
             self.until_end(session.until_end(heart.cancel))
 
     def _beat(self, key: zenoh.KeyExpr, sporadic: bool) -> None:
@@ -290,7 +293,7 @@ class AdvancedSubscriber(Subscriber):
     ) -> None:
         given = {"history": history, "recovery": recovery, "session": session}
         check({**given, "subscriber_detection": subscriber_detection}, **_KINDS)
-        self._history, self._recovery = history or HistoryConfig(), recovery
+        session, self._history, self._recovery = session.inner, history or HistoryConfig(), recovery
         for name in ("max_samples", "max_age"):
             if getattr(self._history, name) == 0:
                 raise zenoh.ZError(f"{name} must not be zero")

@@ -13,6 +13,7 @@ import importlib
 import importlib.machinery
 import importlib.metadata
 import importlib.util
+import multiprocessing
 import os
 import random
 import select
@@ -24,6 +25,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
+from copy import copy
 from functools import cache, partial
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
@@ -183,6 +185,7 @@ class ProgramModules:
             "time": self._time,
             "uvloop": self._uvloop,
             **{name: partial(self._package, name) for name in _SHARED_PARENTS},
+            "multiprocessing": self._multiprocessing,
         }
         self._preparations: dict[str, Callable[[Any], None]] = {
             "asyncio": lambda module: prepare_asyncio(module, node, self.threads, self.process.set_handler),
@@ -382,6 +385,20 @@ class ProgramModules:
         own = [each for each in _OWN_COPIES if each.startswith(f"{name}.")]
         return facade(import_shared(name), {each.rpartition(".")[2]: partial(self.load, each) for each in own})
 
+    def _multiprocessing(self) -> ModuleType:
+        package = self._package("multiprocessing")
+
+        def new_pool(*args: Any, **options: Any) -> Any:
+            return vars(self.load("multiprocessing.pool"))["Pool"](*args, **options)
+
+        def get_context(method: str | None = None) -> Any:
+            context = copy(multiprocessing.get_context(method))
+            vars(context)["Pool"] = new_pool
+            return context
+
+        vars(package).update(Pool=new_pool, get_context=get_context)
+        return package
+
     def _uvloop(self) -> ModuleType:
         """Return what stands for a faster loop that is in C."""
         if self._find("uvloop") is None:
@@ -533,7 +550,7 @@ class ProgramModules:
 
     def _prepare_pools(self, module: Any) -> None:
         """Have jobs of processes run in threads here, too, and what keeps a pool wait for a queue, no pipe."""
-        base, package = module.Pool, self.modules["multiprocessing"]
+        base = module.Pool
         vars(module)["get_context"] = partial(SimpleNamespace, SimpleQueue=module.queue.SimpleQueue)
         module.ThreadPool._get_sentinels = lambda pool: []
         module.ThreadPool._wait_for_updates = staticmethod(lambda sentinels, notifier: notifier.get())
@@ -544,7 +561,7 @@ class ProgramModules:
             ) -> None:
                 base.__init__(self, processes, initializer, initargs)
 
-        vars(package)["Pool"] = module.Pool = Pool
+        module.Pool = Pool
 
 
 def _import_on(sys: ModuleType, load: Callable[[str], ModuleType]) -> Callable[..., ModuleType]:

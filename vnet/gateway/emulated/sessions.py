@@ -80,7 +80,7 @@ class Ending(Numbered):
     def end(self) -> None:
         """End it unless it has ended."""
         ends, self._ends = self._ends, None
-        for end in ends or ():
+        for end in list(ends or ()):
             end()
 
     def discard(self) -> None:
@@ -175,7 +175,7 @@ class Subscriber(Listening):
         complete: bool | None = None,
     ) -> None:
         check({"allowed_origin": allowed_origin, "complete": complete})
-        own_id, key = session.new_id(), key_of(key_expr)
+        session, own_id, key = session.inner, session.new_id(), key_of(key_expr)
         super().__init__(handler, session.outlet)
         self.session = session
         self._entity = Entity(self.kind, session, own_id, key, self._intake(), allowed_origin, bool(complete))
@@ -211,7 +211,8 @@ class LivelinessToken(Declared):
     """A token."""
 
     def __init__(self, session: Session, key: Any) -> None:
-        self._ends = {session.declare(Entity("token", session, session.new_id(), key_of(key))): None}
+        entity = Entity("token", session.inner, session.new_id(), key_of(key))
+        self._ends = {session.inner.declare(entity): None}
 
     def __del__(self) -> None:
         self.discard()
@@ -310,13 +311,27 @@ class Sending(Declared):
     """Returns whether anybody may take its samples, or may answer."""
 
     def __init__(self, session: Session, key: Any) -> None:
-        self.session, self.id, self.key_expr = session, session.new_id(), key_of(key)
+        self.session, self.id, self.key_expr = session.inner, session.new_id(), key_of(key)
         self._ends = {}
 
     def until_undeclared(self, end: Callable[[], object]) -> Callable[[], None]:
-        """Have `end` called when it is undeclared, or its session closed; return what calls it before."""
+        """Have `end` called when it is undeclared, or its session closed; return what calls it before.
+
+        That does not hold this object, which is undeclared as the program discards it.
+        """
         self.check_declared()
-        return self.until_end(self.session.until_end(end))
+        ends, end_before = self._ends, self.session.until_end(end)
+        assert ends is not None
+        ends[end_before] = None
+
+        def forget() -> None:
+            ends.pop(end_before, None)
+            end_before()
+
+        return forget
+
+    def __del__(self) -> None:
+        self.discard()
 
     @property
     def matching_status(self) -> MatchingStatus:
@@ -438,6 +453,8 @@ class Session(Ending):
 
     def __init__(self, vehicle: Vehicle, outlet: Outlet, config: zenoh.Config) -> None:
         check({"config": config})
+        self.inner = self
+        """The session itself, which what it has declared holds; the program has `of_program`."""
         self.vehicle, self.outlet = vehicle, outlet
         self._entity_numbers = count(1)
         self._ends = {}
@@ -458,6 +475,16 @@ class Session(Ending):
     info = property(SessionInfo)
     id = property(lambda self: EntityGlobalId(self._zid, 0))
 
+    def of_program(self) -> Session:
+        """Return the session as its program has it: closed once the program lets go of it, as at Zenoh."""
+        held = Session.__new__(Session)
+        held.__dict__ = self.__dict__
+        return held
+
+    def __del__(self) -> None:
+        if vars(self).get("inner") is not self:
+            self.discard()
+
     def __repr__(self) -> str:
         return f"Session(Session {{ id: {self._zid} }})"
 
@@ -470,6 +497,11 @@ class Session(Ending):
         if not self.is_closed():
             super().end()
             give_way()  # to what is called in answer
+
+    def discard(self) -> None:
+        """As `Ending.discard`; a finalizer cannot give way."""
+        if asyncio._get_running_loop() is not None:
+            super().end()
 
     close = end
 
@@ -491,7 +523,7 @@ class Session(Ending):
     def declare(self, entity: Entity) -> Callable[[], None]:
         """Declare an entity until the session is closed; return what undeclares it before."""
         self.vehicle.declare(entity)
-        return self.until_end(partial(self.vehicle.undeclare, entity))
+        return self.inner.until_end(partial(self.vehicle.undeclare, entity))
 
     def undeclare(self, obj: Any) -> None:
         """Undeclare a key expression, which is none the less valid."""
@@ -539,12 +571,12 @@ class Session(Ending):
             attachment=bytes_or_none(attachment),
             **{name: value for name, value in options.items() if value is not None},
         )
-        self.vehicle.put(self, sample, allowed_destination != REMOTE, allowed_destination != LOCAL)
+        self.vehicle.put(self.inner, sample, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return sample
 
     def get(self, selector: Any, handler: Any = None, **options: Any) -> Any:
         """Ask for replies."""
-        return self.query(self.until_end, selector, handler, **options)
+        return self.query(self.inner.until_end, selector, handler, **options)
 
     def query(
         self,
@@ -580,7 +612,7 @@ class Session(Ending):
         if cancellation_token is not None:
             cancellation_token.add(sink, asking)
         timeout_s = self._timeout_s if timeout is None else timeout
-        self.vehicle.ask(asking, self, timeout_s, allowed_destination != REMOTE, allowed_destination != LOCAL)
+        self.vehicle.ask(asking, self.inner, timeout_s, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return seen
 
     declare_subscriber = partialmethod(Subscriber)

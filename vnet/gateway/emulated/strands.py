@@ -37,6 +37,8 @@ MOST_EXITS = 10
 MOST_LOOKS, BUSY_WAIT_S = 1000, 0.001
 """Looks of a thread, at one instant, at what only time or others change, and how long it is let wait then. What it
 puts and asks counts like them."""
+LOOKS_A_TURN = 10
+"""Looks for which a sleep of nothing counts, which takes longer."""
 LONGEST_WAIT_S = 1e9
 """Largest timeout of a lock in seconds, as `threading.TIMEOUT_MAX`."""
 
@@ -227,13 +229,13 @@ def leave_hard(leave: HardExit | None) -> None:
         strand.parent.switch(leave or next(asyncio.get_running_loop().create_future().__await__()))
 
 
-def look() -> None:
+def look(looks: int = 1) -> None:
     """Take note that the present strand looks at what others change; one that does nothing else is let wait."""
     strand = current_strand()
     if strand is None or _is_child:
         return
     now_s = asyncio.get_running_loop().time()
-    strand.looks = strand.looks + 1 if now_s == strand.looked_s else 1
+    strand.looks = strand.looks + looks if now_s == strand.looked_s else looks
     strand.looked_s = now_s
     if strand.looks > MOST_LOOKS:
         sleep(BUSY_WAIT_S)
@@ -274,6 +276,8 @@ def sleep(seconds: float) -> None:
     if _is_child:
         time.sleep(seconds)
         return
+    if seconds == 0:
+        look(LOOKS_A_TURN)
     block_on(asyncio.sleep(seconds))
 
 

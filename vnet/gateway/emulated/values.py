@@ -12,6 +12,7 @@ from datetime import timedelta
 from functools import lru_cache
 from math import inf, isfinite
 from operator import index
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
@@ -419,9 +420,9 @@ class Handler(_Queue):
     """A channel, with the reading end that a program sees."""
 
     def __init__(self, channel: DefaultHandler, intake: Intake) -> None:
-        is_ring = isinstance(channel, RingChannel)
-        super().__init__(inf if is_ring else max(channel.capacity, 1), intake)
-        self._items = deque(maxlen=channel.capacity if is_ring else None)
+        self._is_ring = isinstance(channel, RingChannel)
+        super().__init__(inf if self._is_ring else max(channel.capacity, 1), intake)
+        self._items = deque(maxlen=channel.capacity if self._is_ring else None)
         self._waiting = Waiting()
 
     def __class_getitem__(cls, item: object) -> type[Handler]:
@@ -431,18 +432,21 @@ class Handler(_Queue):
         """Return the next item, None if there is none now. Raises ZError if there will be none."""
         if self._items:
             return self._next()
-        if self._closed:
-            raise zenoh.ZError("channel is empty and closed")
+        self._check_open()
         look()
         return None
 
     def recv(self) -> Any:
         """Return the next item; block until there is one. Raises ZError if there will be none."""
         while not self._items:
-            if self._closed:
-                raise zenoh.ZError("channel is empty and closed")
+            self._check_open()
             self._waiting.wait()
         return self._next()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            why = "The ringbuffer has been deleted" if self._is_ring else "channel is empty and closed"
+            raise zenoh.ZError(why)
 
     def __iter__(self) -> Iterator[Any]:
         return self
@@ -462,8 +466,10 @@ class Handler(_Queue):
             self._waiting.wake()
 
     def close(self) -> None:
-        """Add no more."""
+        """Add no more; what a ring has is lost with its writer, as at Zenoh."""
         self._closed = True
+        if self._is_ring:
+            self._items.clear()
         self._waiting.wake_all()
         self._freed()
 
@@ -541,7 +547,10 @@ class CallbackSink(_Queue):
             error = RuntimeError(f"SystemExit({leave.code!r}) in a callback ends nothing")
             fail(error.with_traceback(leave.__traceback__), "in a callback of Zenoh")
         except Exception as error:
-            fail(error, "in a callback of Zenoh")
+            is_called = error.__traceback__ is not None and error.__traceback__.tb_next is not None
+            code = None if is_called else getattr(function, "__code__", None)
+            of = "" if code is None else f" defined at {Path(code.co_filename).name}:{code.co_firstlineno}"
+            fail(error, f"in a callback of Zenoh{of}")
 
 
 @dataclass(eq=False)
