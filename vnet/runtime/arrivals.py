@@ -191,23 +191,26 @@ class Window:
         if traffic:
             self._steps.append(wire.Step(time_ns, traffic))
 
-    @property
-    def with_packets(self) -> list[str]:
-        """Nodes with packets that are yet to be taken."""
-        return [*self._packets]
+    def with_packets(self, time_ns: int) -> list[str]:
+        """Return the nodes at which packets have arrived by then that are yet to be taken."""
+        return [node for node, some in self._packets.items() if some[0].received_ns <= time_ns]
 
     def first_packet_ns(self, awaits: Callable[[str], bool]) -> int:
         """Return the arrival of the first packet at a node that `awaits` one, or the window's end."""
-        firsts_ns = (some[0].received_ns for node, some in self._packets.items() if awaits(node))
-        return min(firsts_ns, default=self.end_ns)
+        first_ns = self.end_ns
+        for node, some in self._packets.items():
+            if some[0].received_ns < first_ns and awaits(node):  # few are asked: this runs at every instant
+                first_ns = some[0].received_ns
+        return first_ns
 
     def take_packets(self, node: str, time_ns: int) -> list[Packet]:
         """Remove and return the packets that have arrived at a node by then, oldest first."""
-        some = self._packets.pop(node, [])
+        some = self._packets.get(node, [])
         if not some or some[-1].received_ns <= time_ns:
-            return some
+            return self._packets.pop(node, some)
         due = bisect_right(some, time_ns, key=_received_ns)
-        self._packets[node] = some[due:]
+        if due:
+            self._packets[node] = some[due:]
         return some[:due]
 
     def take_final(self, last: wire.Traffic) -> wire.Traffic:

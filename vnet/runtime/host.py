@@ -405,8 +405,11 @@ class Host:
         self._deliver_due(next_ns)
         return next_ns
 
+    def _may_take(self, node: str) -> bool:
+        return self._active[node] and node not in self._paused
+
     def _awaits_packet(self, node: str) -> bool:
-        return self._active[node] and node not in self._paused and self.nodes[node].radio.inbox.waiting
+        return self._may_take(node) and self.nodes[node].radio.inbox.waiting
 
     def _deliver_due(self, time_ns: int, fixes: Sequence[tuple[str, Fix]] = ()) -> None:
         self.mail.deliver(Mail(self._take_packets(time_ns), fixes), time_ns)
@@ -416,13 +419,12 @@ class Host:
     def _take_packets(self, time_ns: int) -> dict[str, list[Packet]]:
         """Return the packets that are due now at nodes that await some; other nodes take theirs as they look."""
         if self.mail.ordered is not None:
-            nodes = [node for node in self._window.with_packets if self._active[node] and node not in self._paused]
+            nodes = [node for node in self._window.with_packets(time_ns) if self._may_take(node)]
         elif self._waits["radio"].count:
-            nodes = [node for node in self._window.with_packets if self._awaits_packet(node)]
+            nodes = [node for node in self._window.with_packets(time_ns) if self._awaits_packet(node)]
         else:
             return {}
-        due = ((node, self._window.take_packets(node, time_ns)) for node in nodes)
-        return {node: packets for node, packets in due if packets}
+        return {node: self._window.take_packets(node, time_ns) for node in nodes}
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""

@@ -424,7 +424,7 @@ def test_packets_of_a_window_wait_until_they_are_due_and_keep_their_order() -> N
     assert window.take_packets("v2", 5) == [early]
     assert window.take_packets("v1", 8) == []
     assert window.take_packets("v1", 9) == [late]
-    assert not window.with_packets
+    assert not window.with_packets(9)
 
 
 def test_packets_that_an_earlier_window_has_left_come_first() -> None:
