@@ -19,6 +19,7 @@ import select
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from abc import abstractmethod
 from collections import deque
@@ -27,7 +28,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import coroutine
+from types import FrameType, coroutine
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TextIO
 
 from msgspec.structs import replace
@@ -46,7 +47,7 @@ from vnet.runtime import running_node
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.die_with_parent import signal_at_parent_death
-from vnet.runtime.error_text import error_line
+from vnet.runtime.error_text import NOT_THE_PROGRAM, error_line
 from vnet.runtime.host import Disks, Host
 from vnet.runtime.outside_loop import caught, present_node
 from vnet.runtime.programs import Programs, load_programs
@@ -58,6 +59,10 @@ from vnet.transport import wire
 if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
 
+STACK_S, MOST_CALLS = 1.0, 10
+"""Seconds for which a process that does not answer is asked where it is, and the number of calls that are kept."""
+_STACK = b"Most recent call last:\n"
+"""Beginning of what such a process says; the pickles of other answers begin otherwise."""
 NONCE = b""
 """Nonce of simulated processes, which nobody can impersonate."""
 
@@ -423,7 +428,11 @@ class ProcessDiedError(VnetError):
 
 
 class StalledError(VnetError):
-    """A process does not end its window. Its text is the node whose program runs."""
+    """A process does not end its window. Its text is the node whose program runs, `where` its lines."""
+
+    def __init__(self, node: str, where: str) -> None:
+        super().__init__(node)
+        self.where = where
 
 
 class _Said(NamedTuple):
@@ -496,7 +505,7 @@ class ForkedPrograms:
         """
         while not self._answer.poll(LOOK_S * 1000):
             if self._patience.is_over(self.pid):
-                raise StalledError(self._running.read())
+                raise StalledError(self._running.read(), self._stack())
         try:
             said: _Said = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError):
@@ -508,6 +517,14 @@ class ForkedPrograms:
         if isinstance(said.answer, BaseException):
             raise said.answer
         return said.answer
+
+    def _stack(self) -> str:
+        """Return the lines of the program that does not answer; "" if it computes in C."""
+        os.kill(self.pid, signal.SIGUSR1)
+        with suppress(EOFError, OSError):
+            if self._answer.poll(STACK_S * 1000) and (said := self._connection.recv_bytes()).startswith(_STACK):
+                return said.removeprefix(_STACK).decode(errors="replace")
+        return ""
 
     def _raise_ended(self) -> NoReturn:
         _, status = os.waitpid(self.pid, 0)
@@ -561,7 +578,8 @@ class Pipes(LocalProcesses):
             except StalledError as stalled:
                 self.is_cut_short = True
                 error = f"no yield within {self._limit_s:g} s of wall clock"
-                self._emulation.folder.event(self._now_ns, EventKind.stalled, str(stalled), error=error)
+                told = {"error": error, "where": stalled.where}
+                self._emulation.folder.event(self._now_ns, EventKind.stalled, str(stalled), **told)
                 raise KeyboardInterrupt from None
             self._heard = deque(Heard(process_id, each) for process_id, each in answers.items() if each is not None)
             if self.is_ending:
@@ -643,6 +661,7 @@ def _be(
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGUSR1, lambda _, frame: connection.send_bytes(_STACK + _stack_of(frame)))
         signal_at_parent_death(signal.SIGKILL)
         detach()
         gc.freeze()
@@ -679,6 +698,14 @@ def _run(connection: Connection, welcomes: Sequence[wire.Welcome], programs: Pro
     except BaseException as error:
         _flush_files()
         say(error if isinstance(error, VnetError) else RuntimeError(error_line(error)))
+
+
+def _stack_of(frame: FrameType | None) -> bytes:
+    """Return the lines of the program that runs, the innermost last, as a traceback has them."""
+    calls = traceback.extract_stack(frame)
+    ours = [number for number, call in enumerate(calls, 1) if call.filename == __file__]
+    own = [call for call in calls[max(ours, default=0) :] if not call.filename.startswith(NOT_THE_PROGRAM)]
+    return "".join(traceback.format_list(own or calls)[-MOST_CALLS:]).encode(errors="replace")
 
 
 def _flush_files() -> None:
