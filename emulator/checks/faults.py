@@ -357,16 +357,29 @@ def check_pause_respected(recorded: RecordedRun) -> Finding:
     speaking = np.zeros(len(recorded.trace), dtype=bool)
     spans = []
     for planned in pauses:
-        still = recorded.acting(planned, recorded.sent_ns, -recorded.guard_ns)
-        speaking |= planned.nodes[recorded.sender] & still
-        spans += [(node, planned.start_ns, planned.end_ns) for node in np.flatnonzero(planned.nodes).tolist()]
+        for from_ns, until_ns in _outside_restarts(recorded, planned):
+            since = recorded.sent_ns >= from_ns + recorded.guard_ns
+            still = since & (recorded.sent_ns < until_ns - recorded.guard_ns)
+            speaking |= planned.nodes[recorded.sender] & still
+            spans += [(node, from_ns, until_ns) for node in np.flatnonzero(planned.nodes).tolist()]
     reports = _reports_within(recorded, spans)
     broken = int(speaking.sum()) + len(reports)
     broken_text = f"{counted(int(speaking.sum()), 'frame')} and {counted(len(reports), 'report')} of paused nodes"
-    paused = {span[0] for span in spans}
-    text = f"{counted(len(paused), 'node was', 'nodes were')} paused, and sent and reported nothing"
+    paused = int(np.any([planned.nodes for planned in pauses], axis=0).sum())
+    text = f"{counted(paused, 'node was', 'nodes were')} paused, and sent and reported nothing"
     rows = recorded.rows(speaking) + reports
     return result(broken, text, broken_text, rows, spoke=int(speaking.sum()), reports=len(reports))
+
+
+def _outside_restarts(recorded: RecordedRun, planned: PlannedFault) -> list[tuple[int, int]]:
+    """Return the parts [from, until) of a fault in which no restart kept the emulator from the processes."""
+    parts = [(planned.start_ns, planned.end_ns)]
+    for start_ns, end_ns in recorded.restarts:
+        around = [
+            ((from_ns, min(until_ns, start_ns)), (max(from_ns, end_ns), until_ns)) for from_ns, until_ns in parts
+        ]
+        parts = [part for pair in around for part in pair if part[0] < part[1]]
+    return parts
 
 
 def _reports_within(recorded: RecordedRun, spans: Iterable[tuple[int, int, int]]) -> list[dict[str, Any]]:

@@ -260,7 +260,7 @@ CHECKS: list[Check] = [
     Check(
         check_pause_respected,
         FAULTS,
-        "A paused vehicle sends and reports nothing.",
+        "A paused vehicle sends and reports nothing. In real time a restart of emulator or router holds pauses up.",
         invalid="a frame or a report",
         unknown=BEHIND,
         not_applicable="no vehicle was paused",
@@ -316,11 +316,11 @@ CHECKS: list[Check] = [
     Check(
         check_liveness,
         REPORTS,
-        "Once no fault acts any more, each vehicle that is up reports at least once a second, or in two periods, "
-        "or within twice its program's usual time between reports, two seconds or four periods at most. A process "
-        "that starts in real time has 5 s; without faults, so has every program at first and after it enters. A "
-        "program that never reported is not expected to, unless a fault took its vehicle and the program reports "
-        "elsewhere.",
+        "Once no fault acts any more, and restarts are over, each vehicle that is up reports at least once a "
+        "second, or in two periods, or within twice its program's usual time between reports, two seconds or "
+        "four periods at most. A process that starts in real time has 5 s; without faults, so has every program "
+        "at first and after it enters. A program that never reported is not expected to, unless a fault took "
+        "its vehicle and the program reports elsewhere.",
         invalid="a longer silence",
         unknown=BEHIND,
         not_applicable="no program reports so often, or less than a second is left",
@@ -346,7 +346,8 @@ CHECKS: list[Check] = [
     Check(
         check_transport,
         MACHINE,
-        "No message between agents and emulator went missing.",
+        "No message between agents and emulator went missing, but for those sent during a restart of emulator or "
+        "router.",
         unknown="a gap in sequence numbers, or a delivery that never arrived",
         without_positions=WithoutPositions.JUDGE,
         subject=Subject.MACHINE,
@@ -416,7 +417,8 @@ CHECKS: list[Check] = [
         check_kept_up,
         MACHINE,
         "In real time, at most 0.1 % of deliveries are over 20 ms late: the lower end of the 95 % confidence "
-        "interval of their share (Clopper and Pearson) is not above it.",
+        "interval of their share (Clopper and Pearson) is not above it. Of what a restart of emulator or "
+        "router holds back only the time after that counts.",
         unknown="more are, or none was timed",
         not_applicable="lockstep: nothing can be late",
         without_positions=WithoutPositions.JUDGE,

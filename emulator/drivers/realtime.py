@@ -8,8 +8,8 @@ from __future__ import annotations
 import asyncio
 import importlib
 import time
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -60,6 +60,12 @@ class RealTime:
         self._frames_seq = dict.fromkeys(self._nodes, 0)
         self._unacknowledged: dict[str, dict[int, _Sent]] = {process_id: {} for process_id in self._nodes}
         self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
+        self._corrections: defaultdict[tuple[str, int], list[int]] = defaultdict(lambda: [0] * wire.LATENESS_BINS)
+        """Corrections of that, for what restarts have held back."""
+        self._holds: list[tuple[int, int]] = []
+        """Spans in which a planned restart has held everything back."""
+        self._held_since_ns: int | None = None
+        self._heard_ns = dict.fromkeys(self._nodes, 0)
         self._late_in: Counter[int] = Counter()  # how many deliveries were late, by the second that reported them
         self._present = {
             process_id for process_id, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)
@@ -131,20 +137,24 @@ class RealTime:
         """Take a process's traffic and acknowledgements. Raises ProtocolError if it speaks for others."""
         check_ownership(self._nodes[process_id], message.traffic)
         expected = self._frames_seq[process_id]
-        if message.seq != expected:
+        was_held = self._held_ns(self._heard_ns[process_id], now_ns) > 0  # what is missing was lost in a restart
+        self._heard_ns[process_id] = now_ns
+        if message.seq != expected and not was_held:
             self.gaps += 1
         if message.seq > expected:
             self._lost[process_id].append((expected, message.seq - 1))
         self._frames_seq[process_id] = message.seq + 1
+        process = process_id, self._emulation.incarnation[process_id]
         for seq, arrived_ns in message.late:
             sent = self._unacknowledged[process_id].get(seq, _NOTHING_SENT)
             self._delay(sent.deliveries, min(arrived_ns, now_ns))
-        self._acknowledge(process_id, message)
+            self._correct(process, sent.deliveries, arrived_ns)
+        self._acknowledge(process_id, message, was_held)
         if message.lateness is not None:
-            process = process_id, self._emulation.incarnation[process_id]
-            before = _late(self._lateness.get(process, ()))
-            self._late_in[now_ns // NS_PER_S] += _late(message.lateness.counts) - before
-            self._lateness[process] = message.lateness.counts
+            corrected = zip(message.lateness.counts, self._corrections[process], strict=True)
+            counts = [max(count + correction, 0) for count, correction in corrected]
+            self._late_in[now_ns // NS_PER_S] += _late(counts) - _late(self._lateness.get(process, ()))
+            self._lateness[process] = counts
         if message.final:
             self._awaited.discard(process_id)
         if now_ns < self._emulation.duration_ns:
@@ -164,15 +174,15 @@ class RealTime:
         """The processes that have not sent their last message, and are neither dead nor taken by a fault."""
         return frozenset(self._awaited)
 
-    def _acknowledge(self, process_id: str, message: wire.Frames) -> None:
+    def _acknowledge(self, process_id: str, message: wire.Frames, was_held: bool) -> None:
         waiting = self._unacknowledged[process_id]
         if message.unseen:
-            self.gaps += 1
+            self.gaps += not was_held
             own = self._nodes[process_id]
             unseen = [(ref.node, ref.number) for ref in message.unseen if ref.node in own]
             self._news.repeat(self._shown[key][1] for key in unseen if key in self._shown)
         for first, last in message.missed:
-            self.gaps += 1
+            self.gaps += not was_held
             for seq in [seq for seq in waiting if first <= seq <= last]:
                 missed = waiting.pop(seq)
                 self._lose(missed.deliveries)
@@ -186,6 +196,14 @@ class RealTime:
         for delivery in deliveries:
             if arrived_ns - delivery.packet.received_ns >= wire.LATENESS_LIMIT_NS:
                 self._emulation.engine.delay(delivery, arrived_ns)
+
+    def _correct(self, process: tuple[str, int], deliveries: Sequence[Delivery], arrived_ns: int) -> None:
+        """Count only the part of the lateness of a batch that no restart has caused."""
+        for delivery in deliveries:
+            late_ns = arrived_ns - delivery.packet.received_ns
+            if held_ns := self._held_ns(delivery.packet.received_ns, arrived_ns):
+                self._corrections[process][wire.lateness_bin(late_ns)] -= 1
+                self._corrections[process][wire.lateness_bin(late_ns - held_ns)] += 1
 
     def _lose(self, deliveries: Sequence[Delivery]) -> None:
         for delivery in deliveries:
@@ -214,6 +232,26 @@ class RealTime:
         """Return what is to be done to processes by now."""
         actions, self._actions = self._actions, []
         return actions
+
+    @property
+    def is_held(self) -> bool:
+        """True while a planned restart holds everything back."""
+        return self._held_since_ns is not None
+
+    def hold(self, now_ns: int) -> None:
+        """Take note that a planned restart holds everything back from now on."""
+        self._held_since_ns = now_ns if self._held_since_ns is None else self._held_since_ns
+
+    def release(self, now_ns: int) -> None:
+        """Take note that everything has gone out that a restart has held back."""
+        assert self._held_since_ns is not None
+        self._holds.append((self._held_since_ns, now_ns))
+        self._held_since_ns = None
+
+    def _held_ns(self, from_ns: int, until_ns: int) -> int:
+        """Nanoseconds of a span in which restarts have held everything back."""
+        holds = self._holds if self._held_since_ns is None else [*self._holds, (self._held_since_ns, until_ns)]
+        return sum(max(min(until_ns, end_ns) - max(from_ns, start_ns), 0) for start_ns, end_ns in holds)
 
     def _change_by(self, now_ns: int) -> None:
         """Begin and end the faults that are due: messages that have waited must meet those of their time."""
@@ -245,6 +283,7 @@ class RealTime:
         self._taken_ns = max(self._taken_ns, now_ns)
         self._emulation.come_back(self._nodes[process_id], now_ns)
         self._batch_seq[process_id] = self._frames_seq[process_id] = 0
+        self._heard_ns[process_id] = now_ns
         self._lost[process_id] = []
         self._unacknowledged[process_id].clear()
         self._present.add(process_id)
@@ -345,18 +384,28 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
 
 async def run_in_real_time(realtime: RealTime, processes: Processes) -> None:
     """Start all processes at one instant, send what is due and take what comes, until the end."""
-    for process_id, batch in realtime.start(time.monotonic_ns() + wire.HEAD_START_NS).items():
-        processes.send(process_id, batch)
+    _send(processes, realtime.start(time.monotonic_ns() + wire.HEAD_START_NS))
     await asyncio.sleep(wire.HEAD_START_NS / NS_PER_S)
     while not realtime.is_over:
+        catches_up = realtime.is_held
         batches = realtime.due(realtime.now_ns)
         for actions in realtime.take_actions():
+            if actions.restarts:
+                realtime.hold(realtime.now_ns)
+                catches_up = False
             await processes.act(actions)
-        for process_id, batch in batches.items():
-            processes.send(process_id, batch)
+        _send(processes, batches)
+        if catches_up:  # what came during a restart goes out in the round after it
+            realtime.release(realtime.now_ns)
         for process_id in processes.returned():
             processes.send(process_id, realtime.returned(realtime.now_ns, process_id))
-        await take_what_comes(realtime, processes, max(realtime.wait_s, LEAST_WAIT_S))
+        wait_s = LEAST_WAIT_S if realtime.is_held else max(realtime.wait_s, LEAST_WAIT_S)
+        await take_what_comes(realtime, processes, wait_s)
+
+
+def _send(processes: Processes, batches: Mapping[str, wire.Batch]) -> None:
+    for process_id, batch in batches.items():
+        processes.send(process_id, batch)
 
 
 async def take_what_comes(realtime: RealTime, processes: Processes, timeout_s: float) -> None:

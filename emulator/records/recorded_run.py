@@ -56,7 +56,7 @@ from emulator.records.tables import (
     open_table,
 )
 from emulator.records.verdicts import MOST_ROWS, Record, read_record
-from emulator.scenario.faults import ProcessFault, Range, SenderFault, Swizzle
+from emulator.scenario.faults import Infrastructure, ProcessFault, Range, SenderFault, Swizzle
 from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import Links
@@ -699,9 +699,20 @@ class RecordedRun:
         return np.asarray(self.outcome_is(*decided_at(Stage.SENDER)) | self.dropped_by_sender)
 
     @cached_property
+    def restarts(self) -> list[tuple[int, int]]:
+        """Spans [from, until) of restarts of emulator or router, which are longer than planned in real time."""
+        spans = []
+        for kind in {planned.fault.kind for planned in self.plan if isinstance(planned.fault, Infrastructure)}:
+            starts_ns = sorted(planned.start_ns for planned in self.plan if planned.fault.kind == kind)
+            ends_ns = [event.time_ns for event in self.event(f"{kind}ed")]  # one after another
+            spans += list(zip(starts_ns, ends_ns, strict=False))
+        return sorted(spans)
+
+    @cached_property
     def last_heal_ns(self) -> int:
         """From when on no fault acts any more; 0 without faults."""
-        return max((planned.end_ns for planned in self.plan), default=0)
+        ends_ns = [end_ns for _, end_ns in self.restarts]
+        return max([planned.end_ns for planned in self.plan] + ends_ns, default=0)
 
 
 class OpenedRun(RecordedRun):

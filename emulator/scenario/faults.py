@@ -741,7 +741,8 @@ class CustomSender(OwnRule, SenderFault):
 class EmulatorRestart(Infrastructure):
     """The emulator's router and sessions close and come back; agents are told first.
 
-    In lockstep no emulated time passes meanwhile.
+    In lockstep no emulated time passes meanwhile. In real time what is due meanwhile comes late, and what agents
+    send is lost; neither counts against the machine.
     """
 
     kind: Literal["emulator_restart"]

@@ -492,6 +492,36 @@ def test_a_node_that_falls_silent_after_the_last_fault_is_found(kind: str) -> No
     assert checked(silent, "liveness").figures["rows"][0]["node"] == node
 
 
+def restarted(recorded: RecordedRun, seconds: float, until_s: float) -> RecordedRun:
+    """Return the files with a restart of the emulator in their plan, and with its end in the events."""
+    restart = parse_fault({"kind": "emulator_restart", "at_s": seconds})
+    faults = (*recorded.scenario.fault, restart)
+    ended = Event(round(until_s * 1e9), "emulator_restarted", None, {"down_s": 1.0})
+    scenario = recorded.scenario.model_copy(update={"fault": faults})
+    return replace(recorded, scenario=scenario, events=[*recorded.events, ended])
+
+
+@pytest.mark.parametrize(("until_s", "expected"), [(4.0, Verdict.VALID), (2.5, Verdict.INVALID)])
+def test_a_silence_is_the_restarts_only_as_long_as_that_takes(until_s: float, expected: Verdict) -> None:
+    """In real time it is over when all have answered, and not when its plan says."""
+    recorded = simulated()
+    states = recorded.states.to_pylist()
+    silent = without_reports(recorded, "v03", 2.0)
+    both = zip(states, silent.states.to_pylist(), strict=True)
+    rows = [row if row["time_ns"] >= 3.9e9 else without for row, without in both]
+    back = replace(recorded, states=pa.Table.from_pylist(rows, schema=recorded.states.schema))
+    assert verdict(restarted(back, 2.0, until_s), "liveness") is expected
+    assert verdict(restarted(silent, 2.0, until_s), "liveness") is Verdict.INVALID
+
+
+def test_a_pause_that_a_restart_holds_up_is_judged_around_it() -> None:
+    """In real time a process that should pause cannot be told while the emulator restarts."""
+    early = shifted(with_fault("pause"), -0.5)  # from 1.5 s on, and they did from 2 s on
+    assert verdict(restarted(early, 1.4, 2.0), "pause_respected") is Verdict.VALID
+    assert verdict(restarted(early, 1.4, 1.7), "pause_respected") is Verdict.INVALID
+    assert verdict(restarted(early, 1.7, 2.0), "pause_respected") is Verdict.INVALID
+
+
 def test_a_short_silence_and_a_death_are_no_lack_of_liveness() -> None:
     recorded = with_fault("loss")
     assert not_valid(without_reports(recorded, "v03", 5.1)) == {}

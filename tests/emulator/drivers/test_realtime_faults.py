@@ -1,17 +1,22 @@
 """Faults on the wall clock, without one: what the pacing tells the driver and the processes."""
 
+import asyncio
+import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.realtime import RealTime
+from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.processes import Heard, Processes
+from emulator.drivers.realtime import RealTime, run_in_real_time
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import ScenarioError
 from vnet.radio import SentFrame
+from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 from vnet.transport.wire import MessageRef, SentMessage, arrived_in_full
 
@@ -269,3 +274,107 @@ def test_messages_are_taken_at_the_instants_at_which_they_came_and_never_before_
     assert [realtime.taken_ns(came_ms * MS) // MS for came_ms in (3, 5, 4)] == [3, 5, 5]
     realtime.due(20 * MS)
     assert [realtime.taken_ns(came_ms * MS) // MS for came_ms in (12, 21)] == [20, 21]
+
+
+def late_batch(realtime: RealTime, sent_ms: int, due_ms: int) -> tuple[wire.Batch, wire.Receipts]:
+    """Have v01 send, take what is due at another instant, and return the batch of v02 with its receipts."""
+    realtime.receive(sent_ms * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v01", b"x")])))
+    receipts = wire.Receipts()
+    receipts.take(wire.Batch((), 0), 0)
+    return realtime.due(due_ms * MS)["v02"], receipts
+
+
+def late_count(realtime: RealTime, emulation: Emulation) -> tuple[int, int]:
+    realtime.finish()
+    (event,) = [event for event in emulation.folder.events if event.kind == "late_deliveries"]
+    return event.details["count"], event.details["total"]
+
+
+@pytest.mark.parametrize(
+    ("held_ms", "arrived_ms", "count"),
+    [((12, 900), 905, 0), ((12, 900), 940, 1), ((12, 400), 905, 1), ((950, 990), 905, 1), (None, 905, 1)],
+    ids=["by the restart alone", "and by the machine", "long after it", "before it", "without one"],
+)
+def test_only_lateness_beyond_that_of_a_restart_counts(
+    held_ms: tuple[int, int] | None, arrived_ms: int, count: int
+) -> None:
+    realtime, emulation = started()
+    batch, receipts = late_batch(realtime, 10, 60)
+    if held_ms is not None:
+        realtime.hold(held_ms[0] * MS)
+        realtime.release(held_ms[1] * MS)
+    receipts.take(batch, arrived_ms * MS)
+    realtime.receive(1000 * MS, "v02", receipts.frames(b"n", wire.Traffic()))
+    (row,) = [row for row in emulation.engine.trace.to_table().to_pylist() if row["receiver"] == "v02"]
+    assert row["arrival_ns"] == arrived_ms * MS, "the trace says what has happened"
+    assert late_count(realtime, emulation) == (count, 1)
+
+
+def test_messages_lost_in_a_restart_are_no_gaps_of_the_machine() -> None:
+    realtime, _ = started()
+    frames = [wire.Frames(b"n", seq, 1, [], wire.Traffic()) for seq in range(9)]
+    realtime.receive(100 * MS, "v01", frames[0])
+    realtime.hold(150 * MS)
+    realtime.receive(850 * MS, "v01", frames[3])
+    realtime.release(900 * MS)
+    assert realtime.gaps == 0
+    assert realtime.due(901 * MS)["v01"].lost == [(1, 2)], "its process is told all the same"
+    realtime.receive(910 * MS, "v01", frames[5])
+    assert realtime.gaps == 0, "the connection has come back meanwhile"
+    realtime.receive(950 * MS, "v01", frames[7])
+    assert realtime.gaps == 1
+
+
+class _Restarting(Processes):
+    """Processes whose restart takes time of the clock, as does what is sent within `slow_ms`."""
+
+    def __init__(self, slow_ms: range) -> None:
+        self.now_ns = 0
+        self._slow_ms = slow_ms
+        self._receipts = {node: wire.Receipts() for node in IDS}
+        self._heard: list[Heard] = []
+
+    async def act(self, actions: ProcessActions) -> None:
+        for _ in actions.restarts:
+            for node in IDS:  # a program that sends by a timer of its own
+                self._say(node, self.now_ns + 300 * MS, [SentFrame(node, b"x")])
+            self.now_ns += 700 * MS
+
+    def send(self, process_id: str, message: wire.Grant | wire.Batch, mail: Mail | None = None) -> None:
+        assert isinstance(message, wire.Batch)
+        if self.now_ns // MS in self._slow_ms:
+            self.now_ns += 30 * MS
+        self._receipts[process_id].take(message, self.now_ns)
+        self._say(process_id, self.now_ns, [SentFrame(process_id, b"x")] if message.fixes else [])
+
+    def _say(self, process_id: str, now_ns: int, frames: list[SentFrame]) -> None:
+        self._heard.append(Heard(process_id, self._receipts[process_id].frames(b"n", wire.Traffic(frames)), now_ns))
+
+    async def receive(self, timeout_s: float = math.inf) -> Heard | None:
+        if self._heard:
+            return self._heard.pop(0)
+        self.now_ns += math.ceil(timeout_s * 1e9)
+        return None
+
+
+@pytest.mark.parametrize("kind", ["emulator_restart", "router_restart"])
+@pytest.mark.parametrize(
+    ("slow_ms", "least"),
+    [(range(0), 0), (range(1101, 1102), 0), (range(1602, 1610), 1)],
+    ids=["fast", "slow in catching up", "slow later"],
+)
+def test_a_run_in_real_time_keeps_up_whatever_a_restart_holds_back(
+    kind: str, slow_ms: range, least: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = scenario_of([{"kind": kind, "at_s": 0.401}], "agents.beacon:main", run={"pacing": "realtime"})
+    emulation = emulation_of(plan)
+    realtime = RealTime(emulation, [[node] for node in IDS])
+    processes = _Restarting(slow_ms)
+    monkeypatch.setattr("emulator.drivers.realtime.time", SimpleNamespace(monotonic_ns=lambda: processes.now_ns))
+    monkeypatch.setattr(wire, "HEAD_START_NS", 0)
+    asyncio.run(run_in_real_time(realtime, processes))
+    count, total = late_count(realtime, emulation)
+    assert total > 100 and (count >= least if least else count == 0)
+    rows = emulation.engine.trace.to_table().to_pylist()
+    late_ns = [row["late_ns"] for row in rows if row["sent_ns"] == 701 * MS and row["outcome"] == "delivered"]
+    assert late_ns and min(late_ns) > 350 * MS, "the trace says what has happened"
