@@ -621,12 +621,16 @@ class Emulation:
         """Take a node down whose process has ended without being told to."""
         self._program_over(time_ns, node, EventKind.died, details)
 
-    def give_up_starts(self, time_ns: int) -> None:
-        """Take nodes for dead that were started longer ago than `run.join_timeout_s`, and are not up."""
-        patience_s = self.scenario.run.join_timeout_s
+    def give_up_starts(self, time_ns: int) -> list[str]:
+        """Take nodes for dead that are not up within `run.join_timeout_s` of their start; return those."""
+        patience_s, given_up = self.scenario.run.join_timeout_s, []
         for node in self.presence.starting():
-            if time_ns - self._started_ns[node] >= patience_s * NS_PER_S:
-                self.died(time_ns, node, how=f"not up within run.join_timeout_s = {patience_s:g}")
+            until_ns = self._started_ns[node] + round(patience_s * NS_PER_S)
+            if until_ns <= time_ns and self.presence.end(node):
+                how = f"not up within run.join_timeout_s = {patience_s:g}"
+                self.folder.event(until_ns, EventKind.died, node, how=how)
+                given_up.append(node)
+        return given_up
 
     def _program_over(self, time_ns: int, node: str, kind: EventKind, details: dict[str, Any]) -> None:
         if self.presence.end(node):

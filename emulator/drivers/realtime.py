@@ -290,6 +290,12 @@ class RealTime:
         self._awaited.add(process_id)
         return self._batch(process_id, origin_ns=self._origin_ns, start_ns=now_ns)
 
+    def give_up_starts(self, now_ns: int) -> None:
+        """Take programs for dead that have not come up again in time, and have their processes ended."""
+        if given_up := self._emulation.give_up_starts(now_ns):
+            stop = dict.fromkeys(given_up, True)
+            self._actions.append(ProcessActions(now_ns, stop, [], set(self._paused), [], []))
+
     def _collect(self, time_ns: int) -> None:
         """Take what arrives, and the fixes that are due, by then."""
         self._collected_ns = time_ns
@@ -399,6 +405,7 @@ async def run_in_real_time(realtime: RealTime, processes: Processes) -> None:
             realtime.release(realtime.now_ns)
         for process_id in processes.returned():
             processes.send(process_id, realtime.returned(realtime.now_ns, process_id))
+        realtime.give_up_starts(realtime.now_ns)  # those not among them, however late they have been taken
         wait_s = LEAST_WAIT_S if realtime.is_held else max(realtime.wait_s, LEAST_WAIT_S)
         await take_what_comes(realtime, processes, wait_s)
 

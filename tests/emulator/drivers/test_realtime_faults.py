@@ -193,9 +193,28 @@ def test_a_program_that_does_not_come_up_again_has_died(is_told: bool) -> None:
         realtime.died(1200 * MS, "v02", how="exit status 9")
     realtime.finish()
     (death,) = [event for event in emulation.folder.events if event.kind == "died"]
-    assert death.node == "v02" and death.details["how"] == (
-        "exit status 9" if is_told else "not up within run.join_timeout_s = 0.5"
+    assert death.node == "v02" and (death.time_ns, death.details["how"]) == (
+        (1200 * MS, "exit status 9") if is_told else (1500 * MS, "not up within run.join_timeout_s = 0.5")
     )
+
+
+def test_a_program_that_does_not_come_up_again_is_ended_once_its_time_is_over() -> None:
+    run = {"pacing": "realtime", "join_timeout_s": 0.5}
+    faults = [fault("kill", 0.5, 0.5), fault("pause", 0.5, 2.0, nodes=["v03"])]
+    emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run=run))
+    realtime = RealTime(emulation, [[node] for node in IDS])
+    realtime.start(0)
+    realtime.due(1000 * MS)
+    realtime.take_actions()
+    realtime.give_up_starts(1499 * MS)
+    assert realtime.take_actions() == [] and emulation.presence.starting() == ["v02"]
+    for time_ms in (1510, 1600):
+        realtime.give_up_starts(time_ms * MS)
+    (ended,) = realtime.take_actions()
+    assert (ended.stop, ended.start, ended.paused) == ({"v02": True}, [], {"v03"})
+    (death,) = [event for event in emulation.folder.events if event.kind == "died"]
+    assert (death.node, death.time_ns) == ("v02", 1500 * MS)
+    assert not emulation.welcome("v02", b"n").runs
 
 
 def test_a_fault_that_programs_cannot_have_is_refused_as_it_is_injected() -> None:
@@ -326,15 +345,21 @@ def test_messages_lost_in_a_restart_are_no_gaps_of_the_machine() -> None:
 
 
 class _Restarting(Processes):
-    """Processes whose restart takes time of the clock, as does what is sent within `slow_ms`."""
+    """Processes whose restart takes time of the clock, as does what is sent within `slow_ms`.
 
-    def __init__(self, slow_ms: range) -> None:
+    That of v02 is ready again at `ready_ms`, if ever.
+    """
+
+    def __init__(self, slow_ms: range, ready_ms: int | None = None) -> None:
         self.now_ns = 0
+        self._ready_ms = ready_ms
+        self.stopped: list[str] = []
         self._slow_ms = slow_ms
         self._receipts = {node: wire.Receipts() for node in IDS}
         self._heard: list[Heard] = []
 
     async def act(self, actions: ProcessActions) -> None:
+        self.stopped += actions.stop
         for _ in actions.restarts:
             for node in IDS:  # a program that sends by a timer of its own
                 self._say(node, self.now_ns + 300 * MS, [SentFrame(node, b"x")])
@@ -346,6 +371,12 @@ class _Restarting(Processes):
             self.now_ns += 30 * MS
         self._receipts[process_id].take(message, self.now_ns)
         self._say(process_id, self.now_ns, [SentFrame(process_id, b"x")] if message.fixes else [])
+
+    def returned(self) -> list[str]:
+        if self._ready_ms is None or self.now_ns < self._ready_ms * MS:
+            return []
+        self._ready_ms = None
+        return ["v02"]
 
     def _say(self, process_id: str, now_ns: int, frames: list[SentFrame]) -> None:
         self._heard.append(Heard(process_id, self._receipts[process_id].frames(b"n", wire.Traffic(frames)), now_ns))
@@ -378,3 +409,21 @@ def test_a_run_in_real_time_keeps_up_whatever_a_restart_holds_back(
     rows = emulation.engine.trace.to_table().to_pylist()
     late_ns = [row["late_ns"] for row in rows if row["sent_ns"] == 701 * MS and row["outcome"] == "delivered"]
     assert late_ns and min(late_ns) > 350 * MS, "the trace says what has happened"
+
+
+@pytest.mark.parametrize(("ready_ms", "died_ms"), [(None, [1500]), (1450, [])])
+def test_a_program_that_was_back_in_time_lives_although_the_emulator_was_busy(
+    ready_ms: int | None, died_ms: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = {"pacing": "realtime", "join_timeout_s": 0.5}
+    faults = [fault("kill", 0.5, 0.5), {"kind": "emulator_restart", "at_s": 1.02 if died_ms == [] else 0.2}]
+    emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run=run))
+    realtime = RealTime(emulation, [[node] for node in IDS])
+    processes = _Restarting(range(0), ready_ms)
+    monkeypatch.setattr("emulator.drivers.realtime.time", SimpleNamespace(monotonic_ns=lambda: processes.now_ns))
+    monkeypatch.setattr(wire, "HEAD_START_NS", 0)
+    asyncio.run(run_in_real_time(realtime, processes))
+    realtime.finish()
+    assert [event.time_ns // MS for event in emulation.folder.events if event.kind == "died"] == died_ms
+    assert emulation.up["v02"] is (died_ms == [])
+    assert processes.stopped == ["v02"] * (1 + len(died_ms))
