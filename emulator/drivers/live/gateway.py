@@ -42,6 +42,10 @@ MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
 ECHO_S = 2.0
 """Seconds after a token was taken back in which Zenoh's echoes of it are not taken for a program's own."""
+ANY_HOST = ("0.0.0.0", "::")
+"""Hosts of endpoints that listen at each address: the system says at which one commands connect."""
+OTHER_HOST = (62, 64)
+"""OpenSSL's codes (X509_V_ERR_…_MISMATCH) of a certificate for other hosts, by name and by address."""
 REMOTE = zenoh.Locality.REMOTE
 
 T = TypeVar("T")
@@ -319,7 +323,8 @@ def check_trust(settings: ZenohSessions) -> None:
     if settings.certificate is None or settings.private_key is None:
         return
     router, command = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    command.check_hostname = False
+    host = settings.listen.partition("/")[2].rpartition(":")[0].strip("[]")
+    command.check_hostname, command.hostname_checks_common_name = host not in ANY_HOST, False
     command.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # as Zenoh, which takes any certificate for an authority
     try:
         router.load_cert_chain(settings.certificate, settings.private_key, password="")
@@ -328,17 +333,29 @@ def check_trust(settings: ZenohSessions) -> None:
             f"program.zenoh: private_key = {shown(str(settings.private_key))} is encrypted, or not that of "
             f"certificate = {shown(str(settings.certificate))}: {error}"
         ) from None
+    named = f"program.zenoh: certificate = {shown(str(settings.certificate))}"
     try:
         command.load_verify_locations(settings.authority)
         up, down = ssl.MemoryBIO(), ssl.MemoryBIO()
-        for side in (command.wrap_bio(down, up), router.wrap_bio(up, down, server_side=True)) * 2:
+        asking = command.wrap_bio(down, up, server_hostname=host)
+        for side in (asking, router.wrap_bio(up, down, server_side=True)) * 2:
             with suppress(ssl.SSLWantReadError):
                 side.do_handshake()
     except OSError as error:  # also of files that are none
+        if getattr(error, "verify_code", 0) in OTHER_HOST:
+            raise ProgramError(
+                f"{named}: its subjectAltName lacks {shown(host)}, the host of listen = {shown(settings.listen)}"
+            ) from None
         raise ProgramError(
-            f"program.zenoh: certificate = {shown(str(settings.certificate))} with its private_key is none that "
-            f"authority = {shown(str(settings.authority))} has issued: {getattr(error, 'verify_message', error)}"
+            f"{named} with its private_key is none that authority = {shown(str(settings.authority))} has issued: "
+            f"{getattr(error, 'verify_message', error)}"
         ) from None
+    except ValueError:  # the host is none: Zenoh does say so
+        return
+    shown_to_commands = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    shown_to_commands.load_verify_locations(cadata=asking.getpeercert(binary_form=True))
+    if shown_to_commands.cert_store_stats()["x509_ca"]:  # OpenSSL takes it
+        raise ProgramError(f"{named} is an authority's (CA:TRUE): Zenoh takes none for an endpoint, only CA:FALSE")
 
 
 def _keep_publisher(sample: zenoh.Sample | None) -> None:

@@ -3,18 +3,25 @@
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
+from datetime import datetime
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import (
     BestAvailableEncryption,
     Encoding,
+    NoEncryption,
     PrivateFormat,
     load_pem_private_key,
 )
+from cryptography.x509.oid import NameOID
 
 from emulator.drivers.live.gateway import Gateway, check_trust, read_users
 from emulator.scenario.program import ZenohSessions
@@ -445,6 +452,53 @@ def test_an_encrypted_private_key_is_named_and_no_password_is_asked_for(tmp_path
     settings = ZenohSessions(listen="tls/127.0.0.1:0", **{name: tmp_path / name for name in files})
     with pytest.raises(ProgramError, match="private_key' is encrypted"):
         check_trust(settings)
+
+
+def self_signed(folder: Path, names: list[x509.GeneralName], is_authority: bool, listen: str) -> ZenohSessions:
+    """Settings with a certificate that is its own authority, as `openssl req -x509` makes them."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
+    builder = x509.CertificateBuilder(name, name, key.public_key(), 1)
+    builder = builder.not_valid_before(datetime(2020, 1, 1)).not_valid_after(datetime(2049, 1, 1))
+    builder = builder.add_extension(x509.BasicConstraints(is_authority, None), critical=True)
+    if names:
+        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    certificate = builder.sign(key, hashes.SHA256()).public_bytes(Encoding.PEM)
+    (folder / "cert.pem").write_bytes(certificate)
+    plain = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    (folder / "key.pem").write_bytes(plain)
+    cert = folder / "cert.pem"
+    return ZenohSessions(listen=listen, certificate=cert, private_key=folder / "key.pem", authority=cert)
+
+
+LOCALHOST = x509.DNSName("localhost")
+LOOPBACK = [x509.IPAddress(ip_address(address)) for address in ("127.0.0.1", "::1")]
+
+
+@pytest.mark.parametrize(
+    ("names", "is_authority", "listen", "says"),
+    [
+        ([*LOOPBACK, LOCALHOST], True, "tls/127.0.0.1:0", "an authority's .CA:TRUE.: Zenoh takes none"),
+        ([LOCALHOST], False, "tls/127.0.0.1:0", "its subjectAltName lacks '127.0.0.1', the host of listen = 'tls/"),
+        (LOOPBACK, False, "quic/localhost:7450", "its subjectAltName lacks 'localhost'"),
+        ([], False, "tls/localhost:0", "its subjectAltName lacks 'localhost'"),
+    ],
+    ids=["authority", "no address", "no name", "common name alone"],
+)
+def test_a_certificate_that_zenoh_does_not_take_for_an_endpoint_is_named(
+    tmp_path: Path, names: list[x509.GeneralName], is_authority: bool, listen: str, says: str
+) -> None:
+    settings = self_signed(tmp_path, names, is_authority, listen)
+    with pytest.raises(ProgramError, match=f"^program.zenoh: certificate = '{settings.certificate}'.* {says}"):
+        check_trust(settings)
+
+
+@pytest.mark.parametrize(
+    "listen", ["tls/127.0.0.1:0", "quic/[::1]:7450", "tls/localhost:0", "tls/[::]:0", "tls/.:0"]
+)
+def test_a_certificate_that_names_its_host_is_trusted(tmp_path: Path, listen: str) -> None:
+    """At which address of all commands connect is not known yet, and a host that is none is Zenoh's to tell."""
+    check_trust(self_signed(tmp_path, [*LOOPBACK, LOCALHOST], False, listen))
 
 
 @pytest.mark.parametrize(
