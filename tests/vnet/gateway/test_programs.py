@@ -820,8 +820,11 @@ def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) 
             except ZError as error:
                 say(error)
         queryable = session.declare_queryable("q", answer)
-        querier = other.declare_querier("q")
+        querier, told = other.declare_querier("q"), other.declare_querier("q")
         say(len(list(querier.get())), len(list(other.declare_querier("q").get())))
+        told.declare_matching_listener(lambda status: None)
+        replies, told = told.get(), None
+        say(len(list(replies)), len(list(session.get("q", RingChannel(3)))), "for a reader that waits")
         cache()
         say(len(list(other.get("c/@adv/**", consolidation=ConsolidationMode.NONE))))
         ring = session.declare_subscriber("r", RingChannel(2))
@@ -839,8 +842,35 @@ def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) 
         "session closed",
         "channel is empty and closed",
         "1 0",
+        "0 1 for a reader that waits",
         "0",
         "The ringbuffer has been deleted",
+    ]
+
+
+def test_a_session_in_a_cycle_ends_as_it_is_collected_and_leaves_others_alone(drive: Drive) -> None:
+    run = drive(
+        """
+        import gc, time, zenoh
+        class Agent:
+            def __init__(self):
+                self.me, self.session = self, zenoh.open(zenoh.Config())
+                self.token = self.session.liveliness().declare_token("agent/first")
+        session = zenoh.open(zenoh.Config())
+        tell = lambda sample: print(sample.key_expr, sample.kind)
+        watching = session.liveliness().declare_subscriber("agent/*", tell)
+        Agent()
+        time.sleep(0.1)
+        gc.collect()
+        time.sleep(0.1)
+        later = session.liveliness().declare_token("agent/later")
+        time.sleep(0.1)
+        """
+    )
+    assert log(run)[:-1] == [
+        "agent/first SampleKind.PUT",
+        "agent/first SampleKind.DELETE",
+        "agent/later SampleKind.PUT",
     ]
 
 

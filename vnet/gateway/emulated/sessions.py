@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextvars import Context, copy_context
 from functools import partial, partialmethod
 from itertools import count
 from typing import Any, Literal
@@ -38,6 +39,7 @@ from vnet.gateway.emulated.values import (
     zbytes_of,
 )
 from vnet.gateway.emulated.vehicle import Vehicle
+from vnet.runtime.outside_loop import collector
 from vnet.runtime.own_asyncio import Numbered, present_node
 
 QUERY_TIMEOUT_S = 10.0
@@ -59,6 +61,14 @@ class Ending(Numbered):
 
     _ends: dict[Callable[[], object], None] | None = None
     """Called at its end, in this order; None unless it is open or declared."""
+    _context: Context
+    """That of the program, in which it ends if the garbage collector finds it."""
+
+    def __new__(cls, *args: Any, **options: Any) -> Any:
+        """Return one that has noted whose it is."""
+        made = super().__new__(cls)
+        made._context = copy_context()
+        return made
 
     def __enter__(self) -> Any:
         return self
@@ -86,7 +96,13 @@ class Ending(Numbered):
     def discard(self) -> None:
         """End it as the program discards it; what a killed one leaves is collected outside of any loop."""
         if asyncio._get_running_loop() is not None:
-            self.end()
+            if collector.runs:  # on nobody's behalf
+                self._context.run(self._let_go)
+            else:
+                self._let_go()
+
+    def _let_go(self) -> None:
+        self.end()
 
 
 class Declared(Ending):
@@ -286,20 +302,20 @@ class MatchingListener(Listening):
 
     def __init__(self, owner: Sending, handler: Any = None) -> None:
         super().__init__(handler, owner.session.outlet)
-        self._owner, self._matching = owner, False
+        # Not the owner, which is undeclared as the program discards it.
+        self._on_matching, self._matches, self._matching = owner.session.vehicle.on_matching, owner.matches, False
         self._ends = {owner.until_undeclared(self._stop): None}
-        owner.session.vehicle.on_matching.append(self._look)
+        self._on_matching.append(self._look)
         self._look()
 
     def _stop(self) -> None:
-        self._owner.session.vehicle.on_matching.remove(self._look)
+        self._on_matching.remove(self._look)
         self._sink.close()
 
     def _look(self) -> None:
-        status = self._owner.matching_status
-        if status.matching != self._matching:
-            self._matching = status.matching
-            self._sink.push(status)
+        if (matching := self._matches()) != self._matching:
+            self._matching = matching
+            self._sink.push(MatchingStatus(matching))
 
 
 class Sending(Declared):
@@ -307,7 +323,7 @@ class Sending(Declared):
 
     key_expr: zenoh.KeyExpr
     id: EntityGlobalId
-    _matches: Callable[[], bool]
+    matches: Callable[[], bool]
     """Returns whether anybody may take its samples, or may answer."""
 
     def __init__(self, session: Session, key: Any) -> None:
@@ -336,7 +352,7 @@ class Sending(Declared):
     @property
     def matching_status(self) -> MatchingStatus:
         """True for `matching` if there may be anybody at the other end."""
-        return MatchingStatus(self._matches())
+        return MatchingStatus(self.matches())
 
     declare_matching_listener = partialmethod(MatchingListener)
 
@@ -366,7 +382,7 @@ class Publisher(Sending):
         }
         check({**self._qos, "reliability": reliability})
         super().__init__(session, key_expr)
-        self._matches = partial(session.vehicle.matches_subscriber, self.key_expr)
+        self.matches = partial(session.vehicle.matches_subscriber, self.key_expr)
         self.encoding = encoding_of(encoding)
         self.congestion_control = congestion_control or zenoh.CongestionControl.DEFAULT
         self.priority = priority or zenoh.Priority.DEFAULT
@@ -407,7 +423,7 @@ class Querier(Sending):
     ) -> None:
         super().__init__(session, key_expr)
         all_complete = target == zenoh.QueryTarget.ALL_COMPLETE
-        self._matches = partial(session.vehicle.matches_queryable, self.key_expr, all_complete)
+        self.matches = partial(session.vehicle.matches_queryable, self.key_expr, all_complete)
         self.accept_replies = accept_replies or zenoh.ReplyKeyExpr.DEFAULT
         self._options = {**options, "target": target, "accept_replies": accept_replies}
         check(self._options)
@@ -472,12 +488,12 @@ class Session(Ending):
         self.stamps = bool(enabled.get(mode) if isinstance(enabled, dict) else enabled)
         """True if its samples have timestamps of its own."""
 
-    info = property(SessionInfo)
+    info = property(lambda self: SessionInfo(self.inner))
     id = property(lambda self: EntityGlobalId(self._zid, 0))
 
     def of_program(self) -> Session:
         """Return the session as its program has it: closed once the program lets go of it, as at Zenoh."""
-        held = Session.__new__(Session)
+        held: Session = Session.__new__(Session)
         held.__dict__ = self.__dict__
         return held
 
@@ -498,10 +514,8 @@ class Session(Ending):
             super().end()
             give_way()  # to what is called in answer
 
-    def discard(self) -> None:
-        """As `Ending.discard`; a finalizer cannot give way."""
-        if asyncio._get_running_loop() is not None:
-            super().end()
+    def _let_go(self) -> None:
+        super().end()  # a finalizer cannot give way
 
     close = end
 
@@ -622,7 +636,7 @@ class Session(Ending):
 
     def liveliness(self) -> Liveliness:
         """Return what has tokens."""
-        return Liveliness(self)
+        return Liveliness(self.inner)
 
 
 class Scout(Listening):

@@ -424,6 +424,7 @@ class Handler(_Queue):
         super().__init__(inf if self._is_ring else max(channel.capacity, 1), intake)
         self._items = deque(maxlen=channel.capacity if self._is_ring else None)
         self._waiting = Waiting()
+        self._readers = 0
 
     def __class_getitem__(cls, item: object) -> type[Handler]:
         return cls
@@ -440,7 +441,11 @@ class Handler(_Queue):
         """Return the next item; block until there is one. Raises ZError if there will be none."""
         while not self._items:
             self._check_open()
-            self._waiting.wait()
+            self._readers += 1
+            try:
+                self._waiting.wait()
+            finally:
+                self._readers -= 1
         return self._next()
 
     def _check_open(self) -> None:
@@ -466,12 +471,14 @@ class Handler(_Queue):
             self._waiting.wake()
 
     def close(self) -> None:
-        """Add no more; what a ring has is lost with its writer, as at Zenoh."""
+        """Add no more; what a ring has is lost with its writer, as at Zenoh, but for readers that wait for it."""
         self._closed = True
-        if self._is_ring:
-            self._items.clear()
         self._waiting.wake_all()
         self._freed()
+        if self._is_ring and self._readers and (loop := asyncio._get_running_loop()) is not None:
+            loop.call_soon(self._items.clear)  # they have been woken before
+        elif self._is_ring:
+            self._items.clear()
 
 
 class CallbackSink(_Queue):
