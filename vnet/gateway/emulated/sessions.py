@@ -13,7 +13,7 @@ import msgspec
 import zenoh
 
 from vnet.gateway.emulated.queries import ANY_KEY, Asking, Entity
-from vnet.gateway.emulated.strands import give_way, go_no_further_if_ended, look
+from vnet.gateway.emulated.strands import give_way, go_no_further_if_ended, is_ended, look
 from vnet.gateway.emulated.values import (
     DELETE,
     NO_ENCODING,
@@ -94,8 +94,8 @@ class Ending(Numbered):
             end()
 
     def discard(self) -> None:
-        """End it as the program discards it; what a killed one leaves is collected outside of any loop."""
-        if asyncio._get_running_loop() is not None:
+        """End it as the program discards it; what an ended one leaves stays."""
+        if asyncio._get_running_loop() is not None and not is_ended():
             if collector.runs:  # on nobody's behalf
                 self._context.run(self._let_go)
             else:
@@ -291,7 +291,7 @@ class Liveliness:
             cancellation_token.add(sink)
         for token in self._session.vehicle.tokens(key_of(key_expr)):
             sink.push(Reply(token_sample(token, alive=True)))
-        sink.close()
+        asyncio.get_running_loop().call_soon(sink.close)  # once it can be read: a ring is lost with its end
         return seen
 
 

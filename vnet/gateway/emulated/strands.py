@@ -200,6 +200,12 @@ def current_strand() -> Strand | None:
     return strand if isinstance(strand, Strand) else None
 
 
+def is_ended() -> bool:
+    """Return whether the present strand has been ended, and only unwinds."""
+    strand = current_strand()
+    return strand is not None and strand.is_ended
+
+
 def set_generator_hooks(*hooks: Any, **named: Any) -> None:
     """Do as `sys.set_asyncgen_hooks` for the present strand."""
     sys.set_asyncgen_hooks(*hooks, **named)
@@ -285,7 +291,7 @@ def give_way() -> None:
     """Let what is due run before the present strand goes on, unless it is ended."""
     strand = current_strand()
     if strand is not None and not strand.is_ended:
-        sleep(0.0)
+        block_on(asyncio.sleep(0))
 
 
 class Waiting:
