@@ -386,10 +386,13 @@ def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Driv
         with ProcessPoolExecutor(2) as pool:
             jobs = [pool.submit(work, 4)]
             print(list(pool.map(work, range(3))), [job.result() for job in as_completed(jobs)])
-        with multiprocessing.Pool(2) as pool, multiprocessing.get_context("spawn").Pool(2) as other:
+        multiprocessing.set_start_method("spawn")
+        with multiprocessing.Pool(2) as pool, multiprocessing.get_context().get_context("fork").Pool(2) as other:
             print(pool.map(lambda number: work(number), [5]), other.map(work, [6]))
-        """
+        """,
+        vehicles=2,
     )
+    assert log(run, "v02")[-2] == "[25] [36]", "each has a start method of its own"
     lines = [line for line in log(run)[:-1] if "child processes" not in line]
     assert lines == ["(9, True, False, True) 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]", "[25] [36]"]
 

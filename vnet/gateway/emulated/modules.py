@@ -386,17 +386,28 @@ class ProgramModules:
         return facade(import_shared(name), {each.rpartition(".")[2]: partial(self.load, each) for each in own})
 
     def _multiprocessing(self) -> ModuleType:
-        package = self._package("multiprocessing")
+        package, chosen = self._package("multiprocessing"), ""
 
         def new_pool(*args: Any, **options: Any) -> Any:
             return vars(self.load("multiprocessing.pool"))["Pool"](*args, **options)
 
         def get_context(method: str | None = None) -> Any:
-            context = copy(multiprocessing.get_context(method))
-            vars(context)["Pool"] = new_pool
+            context = copy(multiprocessing.get_context(method or chosen or None))
+            vars(context).update(Pool=new_pool, get_context=get_context)
             return context
 
-        vars(package).update(Pool=new_pool, get_context=get_context)
+        def set_start_method(method: str | None, force: bool = False) -> None:
+            nonlocal chosen
+            if chosen and not force:
+                raise RuntimeError("context has already been set")
+            chosen = method or ""
+            vars(package)["Process"] = get_context().Process
+
+        def get_start_method(allow_none: bool = False) -> str | None:
+            return chosen or (None if allow_none else multiprocessing.get_context().get_start_method())
+
+        own = get_context, set_start_method, get_start_method
+        vars(package).update({each.__name__: each for each in own}, Pool=new_pool)
         return package
 
     def _uvloop(self) -> ModuleType:
