@@ -25,6 +25,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection, Coroutine, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -507,7 +508,9 @@ class ForkedPrograms:
             if self._patience.is_over(self.pid):
                 raise StalledError(self._running.read(), self._stack())
         try:
-            said: _Said = pickle.loads(self._connection.recv_bytes())
+            while (content := self._connection.recv_bytes()).startswith(_STACK):
+                pass  # somebody else has asked
+            said: _Said = pickle.loads(content)
         except (EOFError, OSError):
             self._raise_ended()
         self.owes = False
@@ -661,7 +664,7 @@ def _be(
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.signal(signal.SIGUSR1, lambda _, frame: connection.send_bytes(_STACK + _stack_of(frame)))
+        signal.signal(signal.SIGUSR1, partial(_tell_stack, connection, os.getpid()))
         signal_at_parent_death(signal.SIGKILL)
         detach()
         gc.freeze()
@@ -700,12 +703,15 @@ def _run(connection: Connection, welcomes: Sequence[wire.Welcome], programs: Pro
         say(error if isinstance(error, VnetError) else RuntimeError(error_line(error)))
 
 
-def _stack_of(frame: FrameType | None) -> bytes:
-    """Return the lines of the program that runs, the innermost last, as a traceback has them."""
+def _tell_stack(connection: Connection, pid: int, _: int, frame: FrameType | None) -> None:
+    """Say the lines of the program that runs, the innermost last, as a traceback has them."""
+    if os.getpid() != pid:
+        return  # a child of the program's
     calls = traceback.extract_stack(frame)
     ours = [number for number, call in enumerate(calls, 1) if call.filename == __file__]
     own = [call for call in calls[max(ours, default=0) :] if not call.filename.startswith(NOT_THE_PROGRAM)]
-    return "".join(traceback.format_list(own or calls)[-MOST_CALLS:]).encode(errors="replace")
+    lines = "".join(traceback.format_list(own or calls)[-MOST_CALLS:])
+    connection.send_bytes(_STACK + lines.encode(errors="replace"))
 
 
 def _flush_files() -> None:
