@@ -828,6 +828,12 @@ def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) 
         told.declare_matching_listener(lambda status: None)
         replies, told = told.get(), None
         say(len(list(replies)), len(list(session.get("q", RingChannel(3)))), "for a reader that waits")
+        held = [zenoh.open(Config())]
+        held[0].declare_queryable("late", lambda query: (time.sleep(0.1), query.reply("late", "x")))
+        replies = other.get("late", allowed_destination=Locality.REMOTE)
+        time.sleep(0.05)
+        held.clear()
+        say(len(list(replies)), "of who has ended")
         cache()
         say(len(list(other.get("c/@adv/**", consolidation=ConsolidationMode.NONE))))
         ring = session.declare_subscriber("r", RingChannel(2))
@@ -846,6 +852,7 @@ def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) 
         "channel is empty and closed",
         "1 0",
         "0 1 for a reader that waits",
+        "0 of who has ended",
         "0",
         "The ringbuffer has been deleted",
     ]

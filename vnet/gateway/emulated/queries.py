@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import msgspec
@@ -122,6 +123,9 @@ class Asking:
 
     def put_to(self, entity: Entity) -> None:
         """Have a queryable take the query."""
+        if entity.session.is_closed():
+            self.done(entity.session)
+            return
         query = Query(self, entity)
         if not self.is_over:
             (entity.sink.push if entity.session is self.session else entity.arrive)(query)
@@ -193,12 +197,13 @@ def _is_not_older(sample: Sample, before: Sample | ReplyError) -> bool:
 
 
 class Query:
-    """A query at a queryable; it is concluded once it is dropped, or discarded."""
+    """A query at a queryable; it is concluded once it is dropped, or discarded, or its session closed."""
 
     timestamp_stack = None
 
     def __init__(self, asking: Asking, entity: Entity) -> None:
         self._asking, self._entity, self._is_open = asking, entity, True
+        self._conclude = entity.session.until_end(partial(asking.done, entity.session))
 
     def __enter__(self) -> Query:
         return self
@@ -268,10 +273,11 @@ class Query:
     def _answer(self, result: Sample | ReplyError) -> None:
         if not self._is_open:
             raise zenoh.ZError("Dropped query")
-        self._asking.reply(Reply(result, self._entity.id), self._entity.session)
+        if not self._entity.session.is_closed():
+            self._asking.reply(Reply(result, self._entity.id), self._entity.session)
 
     def drop(self) -> None:
         """Conclude it: no more replies come from here."""
         if self._is_open:
             self._is_open = False
-            self._asking.done(self._entity.session)
+            self._conclude()
