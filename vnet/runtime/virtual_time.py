@@ -236,7 +236,8 @@ class VirtualTimeLoop(SkewedLoop):
         self._asked_at_once: WeakKeyDictionary[Node, tuple[int, int, int]] = WeakKeyDictionary()
         self._rounds = 0
         self._now_ns = 0
-        self._ending = False
+        self.is_ending = False
+        """True once the run is over, and programs only end."""
         self._jobs: list[tuple[Job[Any], Future]] = []
         self._timers = count()
         self._meter: CpuMeter | None = None
@@ -446,7 +447,7 @@ class VirtualTimeLoop(SkewedLoop):
 
     def finish(self, main: Coroutine[Any, Any, None]) -> None:
         """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
-        self._ending = True
+        self.is_ending = True
         if self._ordered is not None:
             self._ordered.decides = False
         self._rounds = 0
@@ -469,7 +470,7 @@ class VirtualTimeLoop(SkewedLoop):
             return poll(0)
         if self._jobs:
             return self._wait_for_jobs(poll)
-        if self._ending:
+        if self.is_ending:
             raise LoopAbandonedError("a task still waits after the run has ended")
         next_timer_ns = self._next_timer_ns()
         if next_timer_ns == self._now_ns:  # a timer closer than the clock's resolution: due already

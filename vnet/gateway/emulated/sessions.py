@@ -13,7 +13,7 @@ import msgspec
 import zenoh
 
 from vnet.gateway.emulated.queries import ANY_KEY, Asking, Entity
-from vnet.gateway.emulated.strands import give_way, go_no_further_if_ended, is_ended, look
+from vnet.gateway.emulated.strands import give_way, go_no_further_if_ended, look
 from vnet.gateway.emulated.values import (
     DELETE,
     NO_ENCODING,
@@ -41,6 +41,7 @@ from vnet.gateway.emulated.values import (
 from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.runtime.outside_loop import collector
 from vnet.runtime.own_asyncio import Numbered, present_node
+from vnet.runtime.virtual_time import VirtualTimeLoop
 
 QUERY_TIMEOUT_S = 10.0
 """Zenoh's own `queries_default_timeout`."""
@@ -94,8 +95,9 @@ class Ending(Numbered):
             end()
 
     def discard(self) -> None:
-        """End it as the program discards it; what an ended one leaves stays."""
-        if asyncio._get_running_loop() is not None and not is_ended():
+        """End it as the program discards it; what a kill or the end of the run leaves ends without a word."""
+        loop = asyncio._get_running_loop()
+        if isinstance(loop, VirtualTimeLoop) and not loop.is_ending:
             if collector.runs:  # on nobody's behalf
                 self._context.run(self._let_go)
             else:

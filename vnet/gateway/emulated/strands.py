@@ -200,12 +200,6 @@ def current_strand() -> Strand | None:
     return strand if isinstance(strand, Strand) else None
 
 
-def is_ended() -> bool:
-    """Return whether the present strand has been ended, and only unwinds."""
-    strand = current_strand()
-    return strand is not None and strand.is_ended
-
-
 def set_generator_hooks(*hooks: Any, **named: Any) -> None:
     """Do as `sys.set_asyncgen_hooks` for the present strand."""
     sys.set_asyncgen_hooks(*hooks, **named)
