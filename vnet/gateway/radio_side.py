@@ -79,18 +79,16 @@ class RadioSide(ABC, Generic[Q]):
         An advanced subscriber holds samples back while it asks all caches for history. One that asks a single
         cache meanwhile, and waits for longer, would drop them (zenoh-ext 1.10): such queries end with the first.
         """
-        number, loop = next(self._query_numbers), asyncio.get_running_loop()
+        number = next(self._query_numbers)
         self._queries[number] = query
-        crossing = crossing_query(number, query)
-        key = zenoh.KeyExpr(crossing.selector.partition("?")[0])
-        asks_all = str(key).endswith(ALL_CACHES)
-        open_now = () if asks_all else (numbers for keys, numbers in self._histories if keys.includes(key))
-        if (numbers := next(iter(open_now), None)) is None:
-            numbers = []
-            loop.call_later(self._query_s, self._end, numbers)
-        if asks_all:
-            self._histories.append((key, numbers))
-        numbers.append(number)
+        crossing, numbers = crossing_query(number, query), [number]
+        key = crossing.selector.partition("?")[0]
+        if key.endswith(ALL_CACHES):
+            self._histories.append((zenoh.KeyExpr(key), numbers))
+        elif others := next((others for keys, others in self._histories if keys.includes(key)), None):
+            others.append(number)
+            return crossing
+        asyncio.get_running_loop().call_later(self._query_s, self._end, numbers)
         return crossing
 
     def _end(self, numbers: list[int]) -> None:

@@ -229,8 +229,7 @@ class LivelinessToken(Declared):
     """A token."""
 
     def __init__(self, session: Session, key: Any) -> None:
-        entity = Entity("token", session.inner, session.new_id(), key_of(key))
-        self._ends = {session.inner.declare(entity): None}
+        self._ends = {session.declare(Entity("token", session, session.new_id(), key_of(key))): None}
 
     def __del__(self) -> None:
         self.discard()
@@ -539,7 +538,7 @@ class Session(Ending):
     def declare(self, entity: Entity) -> Callable[[], None]:
         """Declare an entity until the session is closed; return what undeclares it before."""
         self.vehicle.declare(entity)
-        return self.inner.until_end(partial(self.vehicle.undeclare, entity))
+        return self.until_end(partial(self.vehicle.undeclare, entity))
 
     def undeclare(self, obj: Any) -> None:
         """Undeclare a key expression, which is none the less valid."""
