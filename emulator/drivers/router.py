@@ -9,7 +9,6 @@ import contextlib
 import signal
 import socket
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -49,12 +48,11 @@ class SeparateRouter:
 
 def main(config: str) -> None:
     """Be the router until SIGTERM, or until the emulator is gone."""
-    over = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: over.set())
+    told = {signal.SIGTERM, signal.SIGINT}
+    signal.pthread_sigmask(signal.SIG_BLOCK, told)  # a handler could interrupt itself: a parent's end tells often
     signal_at_parent_death(signal.SIGTERM)
     with zenoh.open(zenoh.Config.from_file(config)):
-        over.wait()
+        signal.sigwait(told)
         end_within()
 
 

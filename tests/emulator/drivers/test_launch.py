@@ -1,12 +1,14 @@
 """Processes that a run starts: where they stand among the others of the machine."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from emulator.drivers import launch
 from emulator.drivers.launch import Launcher
+from emulator.drivers.router import ROUTER, SeparateRouter
 from tests.support.processes import has_ended
 from vnet.transport.access import Access
 
@@ -45,6 +47,17 @@ def test_an_end_is_overdue_unless_the_process_wants_to_run_at_each_look(
     monkeypatch.setattr(launch, "cpu_time_ns", lambda _: 0)
     ends = launcher.stop(0.01)
     assert [end.how for end in ends.values()] == (["did not end within 0.01 s"] if is_told else [])
+
+
+def test_a_router_ends_however_often_it_is_told(tmp_path: Path) -> None:
+    """The kernel signals once for each thread of a killed emulator that becomes its parent in turn."""
+    launcher = Launcher(tmp_path)
+    SeparateRouter(Access.create("r", [["v01"]]), tmp_path / "access").start(launcher)
+    ended = launcher.ended()
+    while not ended:  # it ends by itself within a minute, or never
+        launcher.signal(ROUTER, signal.SIGTERM)
+        ended = launcher.ended()
+    assert ended[ROUTER].status == 0
 
 
 FORKS = "import os, sys, time; child = os.fork(); child or time.sleep(600); print(child, flush=True)"
