@@ -608,6 +608,19 @@ def test_a_status_that_is_a_crash_has_the_line_that_gave_it(drive: Drive) -> Non
     assert crash["error"].endswith("ended with 3") and 'program0.py", line 3' in crash["where"]
 
 
+def test_the_way_to_a_failed_import_is_the_programs_own(drive: Drive) -> None:
+    run = drive(
+        """
+        import pathlib
+        pathlib.Path(__file__).with_name("part.py").write_text("import nothing_there")
+        import part
+        """
+    )
+    (crash,) = events(run, "crashed")
+    places = [line for line in crash["where"].splitlines() if line.startswith("  File")]
+    assert [line.rpartition("/")[2].partition('"')[0] for line in places[-2:]] == ["program0.py", "part.py"]
+
+
 @pytest.mark.slow
 def test_programs_that_open_no_session_are_named(drive: Drive) -> None:
     run = drive(

@@ -455,3 +455,22 @@ def test_a_sample_that_cannot_arrive_is_told(drive: Drive) -> None:
             time.sleep(1)
         """
     assert "which cannot arrive: radio.queue_frames = 64" in log(drive(program))[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("keys", "key", "told"),
+    [(["car/**"], "car/@v0/x", True), (["car/@v0/**"], "car/@v0/x", False), (["car/**"], "bus/@v0/x", False)],
+)
+def test_a_key_that_wildcards_seem_to_include_is_told_once(
+    drive: Drive, keys: list[str], key: str, told: bool
+) -> None:
+    """Wildcards stand for no part that begins with @: programs whose keys have one sent nothing, without a word."""
+    program = f"""
+        import time, zenoh
+        with zenoh.open(zenoh.Config()) as session:
+            for number in range(3):
+                session.put(f"{key}/{{number}}", b"")
+            time.sleep(1)
+        """
+    assert sum("stays in the vehicle" in line for line in log(drive(program, radio={"keys": keys}))) == told

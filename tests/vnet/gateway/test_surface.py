@@ -212,3 +212,18 @@ def test_arguments_are_refused_as_by_zenoh_itself(drive: Drive) -> None:
     )
     run = drive(f"{NAMES}{opened}{attempts()}print(*answers, sep='\\n')")
     assert log(run)[:-1] == there["answers"] != []
+
+
+def test_an_option_that_is_refused_is_refused_by_its_name(drive: Drive) -> None:
+    run = drive(
+        """
+        import zenoh
+        session = zenoh.open(zenoh.Config())
+        points = zenoh.TimestampInstrumentationBuilder().set_send(True).build()
+        try:
+            session.put("a", b"", timestamp_instrumentation=points)
+        except zenoh.ZError as error:
+            print(error)
+        """
+    )
+    assert log(run)[0].startswith("timestamp_instrumentation is not available on virtual time")

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import ModuleType, TracebackType
+from types import FrameType, ModuleType, TracebackType
 from typing import Any
 
 import zenoh
@@ -26,7 +26,7 @@ from vnet.gateway.emulated.modules import ENDPOINT, ProgramModules, is_program
 from vnet.gateway.emulated.process import children_outside
 from vnet.gateway.emulated.shown import facade
 from vnet.gateway.emulated.strands import go_no_further_if_ended
-from vnet.gateway.emulated.values import Intake, Outlet, refused
+from vnet.gateway.emulated.values import NO_STACK, Intake, Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.gateway.ros2 import Ros2
 from vnet.node import Node
@@ -34,10 +34,9 @@ from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
 
 _NO_TRANSPORT = "sessions of the emulator have no transport"
-_NO_STACK = "a frame of the radio carries no stack of timestamps"
 REFUSED = {
     **dict.fromkeys(["Link", "LinkEvent", "LinkEventsListener"], _NO_TRANSPORT),
-    **dict.fromkeys(["TimestampContext", "TimestampStack", "TimestampStackRecord"], _NO_STACK),
+    **dict.fromkeys(["TimestampContext", "TimestampStack", "TimestampStackRecord"], NO_STACK),
     **dict.fromkeys(["Transport", "TransportEvent", "TransportEventsListener"], _NO_TRANSPORT),
 }
 """Names of Zenoh that virtual time does not have, and why."""
@@ -135,11 +134,20 @@ async def main(node: Node) -> None:
 
 
 def _of_program(trace: TracebackType | None) -> TracebackType | None:
-    """Return what of a traceback is the program's, all of it if nothing is."""
+    """Return what of a traceback is the program's, without the import system's; all of it if nothing is."""
     inner = trace
     while inner is not None and inner.tb_frame.f_globals.get("__name__", "").startswith("vnet."):
         inner = inner.tb_next
+    last = inner
+    while last is not None:
+        while last.tb_next is not None and _is_import(last.tb_next.tb_frame):
+            last.tb_next = last.tb_next.tb_next
+        last = last.tb_next
     return inner or trace
+
+
+def _is_import(frame: FrameType) -> bool:
+    return frame.f_globals.get("__name__") in ("importlib._bootstrap", ProgramModules.__module__)
 
 
 async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:

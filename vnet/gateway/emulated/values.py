@@ -13,7 +13,7 @@ from functools import lru_cache
 from math import inf, isfinite
 from operator import index
 from pathlib import Path
-from types import NoneType, UnionType
+from types import UnionType
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import msgspec
@@ -200,6 +200,9 @@ class Config(metaclass=_StandIn):
         return zenoh.Config.from_file(path)
 
 
+NO_STACK = "a frame of the radio carries no stack of timestamps"
+
+
 def refused(name: str, reason: str) -> type:
     """Return what stands for a name that virtual time does not have."""
 
@@ -222,6 +225,10 @@ def _count(value: int) -> None:
         raise OverflowError("can't convert int to unsigned")
 
 
+def _no_instrumentation(value: object) -> NoReturn:
+    raise zenoh.ZError(f"timestamp_instrumentation is not available on virtual time: {NO_STACK}")
+
+
 BOOL = bool | np.bool_
 KINDS: dict[str, type | UnionType | Callable[[Any], object]] = {
     **dict.fromkeys(["allowed_origin", "allowed_destination"], zenoh.Locality),
@@ -241,7 +248,7 @@ KINDS: dict[str, type | UnionType | Callable[[Any], object]] = {
     "source_info": SourceInfo,
     "target": zenoh.QueryTarget,
     "timestamp": zenoh.Timestamp,
-    "timestamp_instrumentation": NoneType,  # its type is refused
+    "timestamp_instrumentation": _no_instrumentation,
 }
 """Type of each option, or check of one that is a number."""
 

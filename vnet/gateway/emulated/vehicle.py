@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from vnet.errors import VnetError
+from vnet.errors import VnetError, shown
 from vnet.gateway.emulated.modules import EPOCH_NS
 from vnet.gateway.emulated.queries import ALL_REPLIES, Asking, Entity
 from vnet.gateway.emulated.values import (
@@ -75,9 +75,20 @@ class Vehicle(RadioSide[Asking]):
         self._subscribers_of = lru_cache(MOST_KEYS)(self._find_subscribers)
         self._session_numbers = count(1)
         self._stamped_ns = 0
+        self._is_verbatim_told = False
         self._hears, self._locates = asyncio.Event(), asyncio.Event()
         self.on_matching: list[Callable[[], None]] = []
         """Called when subscribers or queryables come or go."""
+
+    def _crosses(self, key: str) -> bool:
+        crosses = super()._crosses(key)
+        if not crosses and not self._is_verbatim_told and not key.startswith("@/"):  # which is Zenoh's own
+            unmarked = f"/{key}".replace("/@", "/_")[1:]
+            if unmarked != key and super()._crosses(unmarked):
+                self._is_verbatim_told = True
+                reason = "wildcards of radio.keys stand for no part that begins with @, which must be named"
+                self.node.log(f"{shown(key)} stays in the vehicle: {reason}", "warning")
+        return crosses
 
     def new_zid(self) -> ZenohId:
         """Return the id of a further session."""
