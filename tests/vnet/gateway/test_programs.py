@@ -608,11 +608,12 @@ def test_a_status_that_is_a_crash_has_the_line_that_gave_it(drive: Drive) -> Non
     assert crash["error"].endswith("ended with 3") and 'program0.py", line 3' in crash["where"]
 
 
-def test_the_way_to_a_failed_import_is_the_programs_own(drive: Drive) -> None:
+@pytest.mark.parametrize("broken", ["import nothing_there", "class : pass"])
+def test_the_way_to_a_failed_import_is_the_programs_own(drive: Drive, broken: str) -> None:
     run = drive(
-        """
+        f"""
         import pathlib
-        pathlib.Path(__file__).with_name("part.py").write_text("import nothing_there")
+        pathlib.Path(__file__).with_name("part.py").write_text("{broken}")
         import part
         """
     )

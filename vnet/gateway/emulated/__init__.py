@@ -147,7 +147,8 @@ def _of_program(trace: TracebackType | None) -> TracebackType | None:
 
 
 def _is_import(frame: FrameType) -> bool:
-    return frame.f_globals.get("__name__") in ("importlib._bootstrap", ProgramModules.__module__)
+    module = str(frame.f_globals.get("__name__"))
+    return module == ProgramModules.__module__ or module.startswith("importlib._bootstrap")
 
 
 async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
