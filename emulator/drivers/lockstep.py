@@ -243,17 +243,19 @@ class Lockstep:
         """Return the next instant at which a process has something to do, or the end of the run.
 
         The radio comes as far as this instant, and no further: arrivals depend on what others send before, and so
-        far nobody will but for those whom an arrival wakes.
+        far nobody will but for those whom an arrival, of a frame or by wire, wakes.
         """
         emulation = self._emulation
         told_ns = self._steps[0][0] if self._steps else None
         next_ns = min(ns for ns in (emulation.duration_ns, self._next_planned_ns(), told_ns) if ns is not None)
-        until_ns = [next_ns, emulation.next_change_ns(), emulation.next_control_ns(), self.horizon_ns]
+        changes_ns = emulation.next_change_ns(), emulation.next_control_ns()
+        until_ns = [next_ns, self._news.next_ns(), *changes_ns, self.horizon_ns]
         listening = np.flatnonzero(self._listens)
         emulation.engine.look_ahead(min(time_ns for time_ns in until_ns if time_ns is not None), listening)
         if len(listening):
             next_ns = min(next_ns, int(emulation.engine.next_arrivals_ns()[listening].min()))
-        return max(min(next_ns, self._news.next_ns() or next_ns), self.now_ns)
+        news_ns = self._news.next_ns()  # by now also the results of what the radio has done
+        return max(next_ns if news_ns is None else min(next_ns, news_ns), self.now_ns)
 
     def _hold(self, next_ns: int) -> bool:
         """Return whether what comes next lies beyond the horizon; all before it is then done and recorded."""

@@ -36,6 +36,8 @@ async def improvises(node: Node) -> None:
                 "packet", packet.sender, packet.sent_ns, packet.received_ns, packet.payload, packet.snr_db
             )
             draw = node.rng.random()
+            if node.backbone is not None and draw < 0.5:
+                await node.backbone.broadcast(said)
             if draw < 0.2:
                 await node.radio.broadcast(said + filling)
             elif draw < 0.3:
@@ -66,6 +68,12 @@ async def improvises(node: Node) -> None:
                 diary.note("nothing")
                 await asyncio.sleep(0.02)
 
+    async def relays() -> None:
+        assert node.backbone is not None
+        async for message in node.backbone:
+            said = diary.note("wire", message.sender, message.sent_ns, message.payload)
+            await node.radio.broadcast(said + filling)
+
     async def locates() -> None:
         async for fix in node.gnss:
             said = diary.note("fix", fix.time_ns, fix.position_m.tolist())
@@ -85,10 +93,11 @@ async def improvises(node: Node) -> None:
     asyncio.get_running_loop().call_later(0.01, strike, 1)
     hear = {"awaits": answers, "polls": looks_seldom, "limits": listens_with_a_limit}
     names = list(hear)
-    chosen = names[int(node.id.strip("v")) % 3]
+    chosen = names[int(node.id.lstrip("vrsu")) % 3]
     life_s = float(node.rng.uniform(0.2, 3.0))
     async with asyncio.timeout(life_s if node.rng.random() < 0.3 else None):  # one in three crashes by TimeoutError
-        tasks = [asyncio.create_task(hear[chosen]()), asyncio.create_task(locates())]
+        more = [] if node.backbone is None else [relays()]
+        tasks = [asyncio.create_task(each) for each in (hear[chosen](), locates(), *more)]
         ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         assert ended
         await tasks[1]
@@ -189,3 +198,18 @@ async def races(node: Node) -> None:
         timer = asyncio.create_task(asyncio.sleep(after_s))
         await node.radio.receive()
         assert timer.done() == (after_s < 0.002)
+
+
+async def wakes_a_unit(node: Node) -> None:
+    """The first unit says a word by wire and sends ten frames; the second sends one when the word arrives."""
+    if node.backbone is None:
+        return
+    if node.id == "rsu01":
+        await asyncio.sleep(0.1)
+        await node.backbone.broadcast(b"go")
+        await asyncio.sleep(0.0045)
+        for _ in range(10):
+            await node.radio.broadcast(bytes(300))
+    else:
+        await node.backbone.receive()
+        await node.radio.broadcast(b"now")

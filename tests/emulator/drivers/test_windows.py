@@ -17,6 +17,7 @@ from emulator.testing.strategies import faults as schedules
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
 from vnet.transport import wire
+from vnet.units import NS_PER_S
 
 pytestmark = pytest.mark.slow
 
@@ -36,6 +37,7 @@ MEDIUM: dict[str, Any] = {
     "mac": {"access_category": "BE"},
 }
 """A shared medium. At 3 Mbit/s some vehicles fill it: frames wait for each other, collide and are held back."""
+STILL_AIR = {"loss": 0.0, "jitter_ms": 0.0, "access_jitter_ms": 0.0}
 
 
 def fingerprint(emulation: Emulation) -> Fingerprint:
@@ -84,7 +86,8 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         "nodes_per_process": draw(st.sampled_from([1, 3, 1000])),
     }
     network = {"layout": "dense"}
-    scenario = scenario_of([], IMPROVISES, vehicles, run=run, radio=radio, network=network)
+    units = [{"position_m": [500.0 * n, 0.0]} for n in range(draw(st.sampled_from([0, 2])))]
+    scenario = scenario_of([], IMPROVISES, vehicles, run=run, radio=radio, network=network, roadside=units)
     drawn = draw(schedules(scenario, most=3))
     return scenario.model_copy(update={"fault": drawn})
 
@@ -112,6 +115,17 @@ def test_a_medium_under_heavy_load_is_the_same_with_and_without_windows() -> Non
     assert same(fingerprint(simulated(scenario, True)), fingerprint(reference))
 
 
+def test_a_unit_that_hears_by_wire_transmits_at_once_on_a_shared_medium() -> None:
+    """The radio once ran past the arrival, so that frames which were queued then went before."""
+    units = [{"position_m": [100.0 * n, 0.0]} for n in range(2)]
+    radio = {**STILL_AIR, "mac": {"access_category": "BK"}, "latency_ms": 10.0}
+    scenario = scenario_of([], "tests.support.window_programs:wakes_a_unit", 1, radio=radio, roadside=units)
+    reference = simulated(scenario, False)
+    assert same(fingerprint(simulated(scenario, True)), fingerprint(reference))
+    woken, *_ = [row for row in reference.engine.trace.to_table().to_pylist() if row["sender"] == "rsu02"]
+    assert woken["arrival_ns"] < 0.117 * NS_PER_S, "behind at most one frame, not ten"
+
+
 @settings(max_examples=2, deadline=None)
 @given(latency_ms=st.sampled_from([0.001, 2.0, 250.0]), seed=st.integers(0, 1000), data=st.data())
 def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
@@ -133,8 +147,6 @@ def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
 
 
 # Packets that the process has, but whose receiver has not run since they arrived.
-
-STILL_AIR = {"loss": 0.0, "jitter_ms": 0.0, "access_jitter_ms": 0.0}
 
 
 @pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
