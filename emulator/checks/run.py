@@ -126,6 +126,8 @@ def check_progress(recorded: RecordedRun) -> Finding:
         return unknown(text, **{"node": event.node, **event.details})
     if exceeded := recorded.event(EventKind.memory_exceeded):
         return unknown(memory_exceeded(exceeded[0]), node=exceeded[0].node)
+    if gone := recorded.event(EventKind.router_ended):
+        return unknown(f"the separate router ended at {gone[0].time_ns / 1e9:.3f} s: {gone[0].details['how']}")
     if interrupted := recorded.event(EventKind.interrupted):
         return unknown(f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
     if not recorded.event(EventKind.ended):

@@ -176,6 +176,8 @@ class EventKind(StrEnum):
     memory_exceeded = (
         "memory_exceeded", "process", "nodes memory_mb limit_mb",
         "its private memory exceeded `run.memory_limit_mb`, which ended the run", FAILURE, CUTS_RUN)
+    router_ended = (
+        "router_ended", "", "how", "the separate router's process ended, which ended the run", FAILURE, CUTS_RUN)
     transport_gap = "transport_gap", "", "count", "real time: how often something went missing on the way", WARNING
     late_deliveries = (
         "late_deliveries", "", "total count p50_ms p99_ms max_ms worst worst_s", "real time: all deliveries, those "

@@ -61,13 +61,18 @@ def processes_of(folder: Path) -> dict[int, str]:
     found = {}
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            log = str((process / "fd" / "1").readlink())
+            log = log_of(int(process.name))
             state = (process / "stat").read_text().rpartition(")")[2].split()[0]
         except OSError:
             continue
         if log.startswith(str(folder)) and state != "Z":
             found[int(process.name)] = state
     return found
+
+
+def log_of(pid: int) -> str:
+    """The file to which a process writes."""
+    return str(Path(f"/proc/{pid}/fd/1").readlink())
 
 
 def wait_until_all_are_gone(folder: Path) -> None:
@@ -166,6 +171,23 @@ def test_a_killed_lockstep_run_leaves_no_process_and_no_router(tmp_path: Path) -
         wait_until(lambda: len(processes_of(folder)) == 4, process)  # three agents and the router
         process.kill()
         wait_until_all_are_gone(folder)
+
+
+@pytest.mark.parametrize("pacing", ["lockstep", "realtime"])
+def test_a_router_that_somebody_kills_ends_the_run_as_unknown(tmp_path: Path, pacing: str) -> None:
+    """The machine's fault, not that of the vehicles, which were told as dead."""
+    scenario = write(tmp_path, [], run={"duration_s": 7200, "pacing": pacing})
+    folder = tmp_path / "run"
+    with started(scenario, folder, "--router", "separate", "--no-report", after="started") as process:
+        (router,) = [pid for pid in processes_of(folder) if log_of(pid).endswith("/router.log")]
+        os.kill(router, signal.SIGKILL)
+        process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 3
+    assert processes_of(folder) == {}
+    verdict = json.loads((folder / "verdict.json").read_text())
+    assert verdict["verdict"] == "unknown"
+    assert "router" in next(check["text"] for check in verdict["checks"] if check["name"] == "progress")
+    assert events_of(folder, "died") == []
 
 
 def test_in_real_time_processes_are_killed_restarted_and_paused_and_none_is_left(tmp_path: Path) -> None:

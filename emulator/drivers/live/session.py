@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import zenoh
@@ -182,7 +183,7 @@ class LiveSession:
             gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
             started_s = time.monotonic()
             self._processes.attachment.publish("scene", self._messages.scene())
-            await self._within_memory(self._drive(groups))
+            await self._while_it_can(self._drive(groups))
             completed = True
         except Stalled:
             self._emulation.finish(self._time_ns())
@@ -215,15 +216,20 @@ class LiveSession:
         with preempting_nobody():
             await run_in_lockstep(lockstep, processes, self._before_horizon)
 
-    async def _within_memory(self, running: Coroutine[Any, Any, None]) -> None:
-        """Await the run; raise Stalled, with an event, as soon as a process exceeds `run.memory_limit_mb`."""
+    async def _while_it_can(self, running: Coroutine[Any, Any, None]) -> None:
+        """Await the run; raise Stalled, with an event, once a process exceeds its memory or the router is gone."""
         limit_mb = self._emulation.scenario.run.memory_limit_mb
-        if limit_mb is None:
-            return await running
         run, nodes = asyncio.ensure_future(running), frozenset(self._emulation.world.node_ids)
-        exceeded = self._processes.over_memory
+        exceeded, router_gone = self._processes.over_memory, self._processes.supervisor.router_gone
+        ends: list[asyncio.Future[Any]] = [run, router_gone]
+        look_s = None if limit_mb is None else MEMORY_LOOK_S
+        while_both_go_on = partial(asyncio.wait, ends, timeout=look_s, return_when=asyncio.FIRST_COMPLETED)
         try:
-            while not (await asyncio.wait([run], timeout=MEMORY_LOOK_S))[0]:
+            while run not in (await while_both_go_on())[0]:
+                if router_gone.done():
+                    self._emulation.folder.event(self._time_ns(), EventKind.router_ended, how=router_gone.result())
+                    raise Stalled
+                assert limit_mb is not None, "who waits without end waits for something"
                 if self._fleet is not None:
                     self._fleet.look(self._time_ns())
                 pids = {name: pid for name, pid in self._launcher.pids.items() if name in nodes}

@@ -19,6 +19,7 @@ from emulator.drivers.attachment import Attachment, LiveOptions
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import Membership
 from emulator.drivers.launch import AgentProcesses, Exit, Launcher
+from emulator.drivers.router import ROUTER
 from emulator.drivers.signals import gets_signals, signals_handled
 from emulator.records.events import EventKind
 from vnet.errors import VnetError
@@ -127,6 +128,8 @@ class Supervisor:
         self._to_pause: Collection[str] = ()
         self._ending: set[asyncio.Task[None]] = set()
         self.failure: VnetError | None = None
+        self.router_gone: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        """The end of the separate router, in words; without a router no run goes on."""
         self.reconnecting = False
         """True while the emulator itself is disconnected: lost connections then mean nothing."""
         self._all_told_to_end = False
@@ -297,7 +300,9 @@ class Supervisor:
         is_host = name in map(host_user, self._options.access.hosts)
         if not told_to_end:
             self._ends.pop(name, None)
-        if not self._attachment.knows(name) and not is_host:
+        if name == ROUTER and not self.router_gone.done():
+            self.router_gone.set_result(how.how)
+        elif not self._attachment.knows(name) and not is_host:
             self._folder.event(self._time_ns(), EventKind.observer_ended, name, how=how.how)
         elif not self._processes:
             last = (how.log_tail.splitlines() or ["its log is empty"])[-1]
