@@ -621,11 +621,15 @@ class Emulation:
         """Take a node down whose process has ended without being told to."""
         self._program_over(time_ns, node, EventKind.died, details)
 
-    def give_up_starts(self, time_ns: int) -> list[str]:
-        """Take nodes for dead that are not up within `run.join_timeout_s` of their start; return those."""
+    def give_up_starts(self, time_ns: int, held_ns: Callable[[int, int], int]) -> list[str]:
+        """Take nodes for dead that are not up within `run.join_timeout_s` of their start; return those.
+
+        `held_ns` tells how long restarts of the emulator have held back what happens in a span.
+        """
         patience_s, given_up = self.scenario.run.join_timeout_s, []
         for node in self.presence.starting():
-            until_ns = self._started_ns[node] + round(patience_s * NS_PER_S)
+            started_ns = self._started_ns[node]
+            until_ns = started_ns + round(patience_s * NS_PER_S) + held_ns(started_ns, time_ns)
             if until_ns <= time_ns and self.presence.end(node):
                 how = f"not up within run.join_timeout_s = {patience_s:g}"
                 self.folder.event(until_ns, EventKind.died, node, how=how)

@@ -292,7 +292,7 @@ class RealTime:
 
     def give_up_starts(self, now_ns: int) -> None:
         """Take programs for dead that have not come up again in time, and have their processes ended."""
-        if given_up := self._emulation.give_up_starts(now_ns):
+        if given_up := self._emulation.give_up_starts(now_ns, self._held_ns):
             stop = dict.fromkeys(given_up, True)
             self._actions.append(ProcessActions(now_ns, stop, [], set(self._paused), [], []))
 
@@ -342,7 +342,7 @@ class RealTime:
 
     def finish(self) -> None:
         """End of the run: what nobody acknowledged is lost in transport; say how late deliveries were."""
-        self._emulation.give_up_starts(self._emulation.duration_ns)
+        self._emulation.give_up_starts(self._emulation.duration_ns, self._held_ns)
         self._emulation.finish(self._emulation.duration_ns)
         for waiting in self._unacknowledged.values():
             for sent in waiting.values():

@@ -411,12 +411,16 @@ def test_a_run_in_real_time_keeps_up_whatever_a_restart_holds_back(
     assert late_ns and min(late_ns) > 350 * MS, "the trace says what has happened"
 
 
-@pytest.mark.parametrize(("ready_ms", "died_ms"), [(None, [1500]), (1450, [])])
-def test_a_program_that_was_back_in_time_lives_although_the_emulator_was_busy(
-    ready_ms: int | None, died_ms: list[int], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("restart_s", "ready_ms", "died_ms"),
+    [(0.2, None, [1500]), (1.02, 1450, []), (1.02, 2190, []), (0.95, 2140, []), (0.95, None, [2150])],
+)
+def test_a_restart_takes_no_time_from_a_program_that_starts(
+    restart_s: float, ready_ms: int | None, died_ms: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """It starts at 1 s, and the restart takes 0.7 s."""
     run = {"pacing": "realtime", "join_timeout_s": 0.5}
-    faults = [fault("kill", 0.5, 0.5), {"kind": "emulator_restart", "at_s": 1.02 if died_ms == [] else 0.2}]
+    faults = [fault("kill", 0.5, 0.5), {"kind": "emulator_restart", "at_s": restart_s}]
     emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run=run))
     realtime = RealTime(emulation, [[node] for node in IDS])
     processes = _Restarting(range(0), ready_ms)
