@@ -357,11 +357,11 @@ def check_pause_respected(recorded: RecordedRun) -> Finding:
     speaking = np.zeros(len(recorded.trace), dtype=bool)
     spans = []
     for planned in pauses:
-        for from_ns, until_ns in _outside_restarts(recorded, planned):
-            since = recorded.sent_ns >= from_ns + recorded.guard_ns
-            still = since & (recorded.sent_ns < until_ns - recorded.guard_ns)
-            speaking |= planned.nodes[recorded.sender] & still
-            spans += [(node, from_ns, until_ns) for node in np.flatnonzero(planned.nodes).tolist()]
+        from_ns = _stopped_ns(recorded, planned)
+        since = recorded.sent_ns >= from_ns + recorded.guard_ns
+        still = since & (recorded.sent_ns < planned.end_ns - recorded.guard_ns)
+        speaking |= planned.nodes[recorded.sender] & still
+        spans += [(node, from_ns, planned.end_ns) for node in np.flatnonzero(planned.nodes).tolist()]
     reports = _reports_within(recorded, spans)
     broken = int(speaking.sum()) + len(reports)
     broken_text = f"{counted(int(speaking.sum()), 'frame')} and {counted(len(reports), 'report')} of paused nodes"
@@ -371,15 +371,10 @@ def check_pause_respected(recorded: RecordedRun) -> Finding:
     return result(broken, text, broken_text, rows, spoke=int(speaking.sum()), reports=len(reports))
 
 
-def _outside_restarts(recorded: RecordedRun, planned: PlannedFault) -> list[tuple[int, int]]:
-    """Return the parts [from, until) of a fault in which no restart kept the emulator from the processes."""
-    parts = [(planned.start_ns, planned.end_ns)]
-    for start_ns, end_ns in recorded.restarts:
-        around = [
-            ((from_ns, min(until_ns, start_ns)), (max(from_ns, end_ns), until_ns)) for from_ns, until_ns in parts
-        ]
-        parts = [part for pair in around for part in pair if part[0] < part[1]]
-    return parts
+def _stopped_ns(recorded: RecordedRun, planned: PlannedFault) -> int:
+    """Return when a pause stopped its processes: once the restart was over within which it was to begin, if any."""
+    held_until_ns = [end_ns for start_ns, end_ns in recorded.holding_restarts if start_ns < planned.start_ns]
+    return max([planned.start_ns, *held_until_ns])
 
 
 def _reports_within(recorded: RecordedRun, spans: Iterable[tuple[int, int, int]]) -> list[dict[str, Any]]:

@@ -260,7 +260,8 @@ CHECKS: list[Check] = [
     Check(
         check_pause_respected,
         FAULTS,
-        "A paused vehicle sends and reports nothing. In real time a restart of emulator or router holds pauses up.",
+        "A paused vehicle sends and reports nothing. In real time a pause that is to begin within a restart of the "
+        "emulator, or of a router that is not a vehicle's own, begins after it.",
         invalid="a frame or a report",
         unknown=BEHIND,
         not_applicable="no vehicle was paused",

@@ -56,7 +56,7 @@ from emulator.records.tables import (
     open_table,
 )
 from emulator.records.verdicts import MOST_ROWS, Record, read_record
-from emulator.scenario.faults import Infrastructure, ProcessFault, Range, SenderFault, Swizzle
+from emulator.scenario.faults import EmulatorRestart, Infrastructure, ProcessFault, Range, SenderFault, Swizzle
 from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import Links
@@ -701,8 +701,16 @@ class RecordedRun:
     @cached_property
     def restarts(self) -> list[tuple[int, int]]:
         """Spans [from, until) of restarts of emulator or router, which are longer than planned in real time."""
+        return self._restarts_of(Infrastructure)
+
+    @cached_property
+    def holding_restarts(self) -> list[tuple[int, int]]:
+        """Those within which the emulator reaches no process: while routers of Zenoh programs restart, it does."""
+        return self._restarts_of(EmulatorRestart) if self.scenario.has_gateways else self.restarts
+
+    def _restarts_of(self, family: type[Infrastructure]) -> list[tuple[int, int]]:
         spans = []
-        for kind in {planned.fault.kind for planned in self.plan if isinstance(planned.fault, Infrastructure)}:
+        for kind in {planned.fault.kind for planned in self.plan if isinstance(planned.fault, family)}:
             starts_ns = sorted(planned.start_ns for planned in self.plan if planned.fault.kind == kind)
             ends_ns = [event.time_ns for event in self.event(f"{kind}ed")]  # one after another
             spans += list(zip(starts_ns, ends_ns, strict=False))

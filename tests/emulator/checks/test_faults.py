@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator.checks.faults import _wrong_fixes
+from emulator.checks.faults import _wrong_fixes, check_pause_respected
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
 from emulator.records.events import Event
 from emulator.records.tables import STATES
@@ -492,11 +492,11 @@ def test_a_node_that_falls_silent_after_the_last_fault_is_found(kind: str) -> No
     assert checked(silent, "liveness").figures["rows"][0]["node"] == node
 
 
-def restarted(recorded: RecordedRun, seconds: float, until_s: float) -> RecordedRun:
-    """Return the files with a restart of the emulator in their plan, and with its end in the events."""
-    restart = parse_fault({"kind": "emulator_restart", "at_s": seconds})
+def restarted(recorded: RecordedRun, seconds: float, until_s: float, kind: str = "emulator_restart") -> RecordedRun:
+    """Return the files with a restart in their plan, and with its end in the events."""
+    restart = parse_fault({"kind": kind, "at_s": seconds})
     faults = (*recorded.scenario.fault, restart)
-    ended = Event(round(until_s * 1e9), "emulator_restarted", None, {"down_s": 1.0})
+    ended = Event(round(until_s * 1e9), f"{kind}ed", None, {"down_s": 1.0})
     scenario = recorded.scenario.model_copy(update={"fault": faults})
     return replace(recorded, scenario=scenario, events=[*recorded.events, ended])
 
@@ -520,6 +520,25 @@ def test_a_pause_that_a_restart_holds_up_is_judged_around_it() -> None:
     assert verdict(restarted(early, 1.4, 2.0), "pause_respected") is Verdict.VALID
     assert verdict(restarted(early, 1.4, 1.7), "pause_respected") is Verdict.INVALID
     assert verdict(restarted(early, 1.7, 2.0), "pause_respected") is Verdict.INVALID
+    assert verdict(restarted(early, 1.5, 2.0), "pause_respected") is Verdict.INVALID, "the pause comes first"
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("emulator_restart", Verdict.VALID), ("router_restart", Verdict.INVALID)]
+)
+def test_a_restart_of_the_routers_of_vehicles_holds_no_pause_up(kind: str, expected: Verdict) -> None:
+    early = shifted(with_fault("pause"), -0.5)  # from 1.5 s on, and they did from 2 s on
+    held = restarted(early, 1.4, 2.0, kind)
+    assert verdict(held, "pause_respected") is Verdict.VALID
+    scenario = held.scenario
+    zenoh = scenario.model_copy(
+        update={
+            "run": scenario.run.model_copy(update={"pacing": "realtime"}),
+            "program": scenario.program.model_copy(update={"kind": "zenoh"}),
+        }
+    )
+    found = check_pause_respected(replace(held, scenario=zenoh))
+    assert isinstance(found, CheckResult) and found.verdict is expected
 
 
 def test_a_short_silence_and_a_death_are_no_lack_of_liveness() -> None:
