@@ -100,6 +100,8 @@ class Attachment:
         self._set_aside: deque[Item] = deque()
         self.on_message: Callable[[bytes], None] = no_wake
         self.time_ns: Callable[[], int | None] = no_time
+        self.frames_seq: int | None = None
+        """Real time: number of `Frames` that have been said."""
         self.orphan_timeout_s = 5.0
         self._patience_until = 0.0
         self._malformed = 0
@@ -134,7 +136,7 @@ class Attachment:
     def _on_rx(self, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
         if payload == _WHERE:  # the program's thread may be stuck: this one answers
-            self.say(wire.StackDump(self.nonce, self._stack(), self.time_ns()))
+            self.say(wire.StackDump(self.nonce, self._stack(), self.time_ns(), self.frames_seq))
             return
         self.inbox.put((payload, time.monotonic_ns()))
         self.on_message(payload)
@@ -578,6 +580,7 @@ class _RealTimeAgent:
             self._orphan_timer = None
             if present:
                 self._attachment.found()
+                self._schedule_flush()  # the emulator waits for a message of a process that was paused meanwhile
         if not present:
             patience_s = self._attachment.patience_s
             self._orphan_timer = self._loop.call_later(patience_s, self._orphaned, patience_s)
@@ -643,6 +646,7 @@ class _RealTimeAgent:
         seq = self._receipts.seq
         self._sends.update(((each.node, each.number), seq) for each in traffic.frames if each.to is not None)
         self._attachment.say(self._receipts.frames(self._attachment.nonce, traffic, final, self._take_overdue()))
+        self._attachment.frames_seq = self._receipts.seq
         self._attachment.publish(traffic)
 
     async def _acknowledge(self) -> None:

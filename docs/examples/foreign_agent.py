@@ -68,7 +68,7 @@ class Agent:
 
     def __init__(self, session: zenoh.Session, run: str, node: str) -> None:
         key = f"vnet/{run}/node/{node}"
-        self.node, self.nonce = node, secrets.token_bytes(16)
+        self.node, self.nonce, self.frames_said = node, secrets.token_bytes(16), 0
         self.orphan_timeout_s, self.patience_until_s, self.lost_s = 5.0, 0.0, math.inf
         self.inbox: queue.SimpleQueue[tuple[list[Any], int]] = queue.SimpleQueue()
         block = zenoh.CongestionControl.BLOCK
@@ -82,7 +82,7 @@ class Agent:
         """Queue a message with the instant of its arrival."""
         message = unpack(sample.payload.to_bytes())
         if message == ["StackRequest"]:  # answered here: the main thread may be busy
-            self.say("StackDump", self.nonce, "", None)
+            self.say("StackDump", self.nonce, "", None, self.frames_said)
         elif isinstance(message, list) and message:  # anything else is malformed, and dropped
             self.inbox.put((message, time.monotonic_ns()))
 
@@ -136,14 +136,14 @@ class Agent:
 
     def run_realtime(self, vehicle: Vehicle, same_machine: bool) -> None:
         """Send frames at each fix, acknowledge batches at least once a second, and mark the last message."""
-        seq, expected, origin_ns, said_s = 0, 0, 0, math.inf  # nothing is said before batch 0
+        expected, origin_ns, said_s = 0, 0, math.inf  # nothing is said before batch 0
         missed, lateness = list[list[int]](), [0] * LATENESS_BINS
         while True:
             traffic: list[Any] = [[], [], []]
             try:
                 message, arrived_ns = self.next(min(said_s + SIGN_OF_LIFE_S - time.monotonic(), 60.0))
             except EndOfRun:
-                return self.say("Frames", self.nonce, seq, expected, missed, traffic, [lateness], True)
+                return self.say("Frames", self.nonce, self.frames_said, expected, missed, traffic, [lateness], True)
             if message[0] == "Batch":
                 _, fixes, batch, packets, start_origin_ns, start_ns, held, clocks, *_ = message
                 if start_origin_ns is not None:
@@ -157,8 +157,8 @@ class Agent:
                     lateness[min(max(LIMIT_BIN + math.floor(4 * math.log2(late)), 0), LATENESS_BINS - 1)] += 1
                 traffic = vehicle.step(now_ns, packets, fixes, clocks)
             if traffic[0] or time.monotonic() - said_s >= SIGN_OF_LIFE_S:
-                self.say("Frames", self.nonce, seq, expected, missed, traffic, [lateness], False)
-                seq, missed, said_s = seq + 1, [], time.monotonic()
+                self.say("Frames", self.nonce, self.frames_said, expected, missed, traffic, [lateness], False)
+                self.frames_said, missed, said_s = self.frames_said + 1, [], time.monotonic()
 
 
 def client_config(endpoint: str, credentials: dict[str, Any]) -> zenoh.Config:

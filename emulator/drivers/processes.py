@@ -21,11 +21,11 @@ from vnet.transport.wire import SentMessage
 class Heard(NamedTuple):
     """A message of a process, and when it came on the monotonic clock, in ns, where that matters.
 
-    A `SentMessage` has come later than the frames that refer to it (real time).
+    In real time a `SentMessage` has come later than the frames that refer to it, and a `StackDump` after a restart.
     """
 
     process_id: str
-    message: wire.Yield | wire.Frames | SentMessage
+    message: wire.Yield | wire.Frames | wire.StackDump | SentMessage
     arrived_ns: int = 0
 
 

@@ -9,7 +9,7 @@ import asyncio
 import importlib
 import time
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -35,12 +35,13 @@ WORST_SECONDS = 20
 class _Sent(NamedTuple):
     """Contents of a batch that are dealt with if its process has missed it."""
 
+    time_ns: int
     deliveries: list[Delivery]
     news: list[NewsItem]
     lost: list[tuple[int, int]]
 
 
-_NOTHING_SENT = _Sent([], [], [])
+_NOTHING_SENT = _Sent(0, [], [], [])
 
 
 class RealTime:
@@ -65,7 +66,8 @@ class RealTime:
         self._holds: list[tuple[int, int]] = []
         """Spans in which a planned restart has held everything back."""
         self._held_since_ns: int | None = None
-        self._heard_ns = dict.fromkeys(self._nodes, 0)
+        self._cut_off: set[str] = set()
+        """Processes whose next message shows what a restart has lost; those paused in it get nothing until then."""
         self._late_in: Counter[int] = Counter()  # how many deliveries were late, by the second that reported them
         self._present = {
             process_id for process_id, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)
@@ -137,9 +139,10 @@ class RealTime:
         """Take a process's traffic and acknowledgements. Raises ProtocolError if it speaks for others."""
         check_ownership(self._nodes[process_id], message.traffic)
         expected = self._frames_seq[process_id]
-        was_held = self._held_ns(self._heard_ns[process_id], now_ns) > 0  # what is missing was lost in a restart
-        self._heard_ns[process_id] = now_ns
-        if message.seq != expected and not was_held:
+        is_back = process_id in self._cut_off and process_id not in self._paused
+        if is_back:
+            self._cut_off.discard(process_id)
+        if message.seq != expected and not is_back and not self._all_held([now_ns]):  # else a restart has lost them
             self.gaps += 1
         if message.seq > expected:
             self._lost[process_id].append((expected, message.seq - 1))
@@ -149,7 +152,7 @@ class RealTime:
             sent = self._unacknowledged[process_id].get(seq, _NOTHING_SENT)
             self._delay(sent.deliveries, min(arrived_ns, now_ns))
             self._correct(process, sent.deliveries, arrived_ns)
-        self._acknowledge(process_id, message, was_held)
+        self._acknowledge(process_id, message)
         if message.lateness is not None:
             corrected = zip(message.lateness.counts, self._corrections[process], strict=True)
             counts = [max(count + correction, 0) for count, correction in corrected]
@@ -163,6 +166,18 @@ class RealTime:
         else:
             self._emulation.take_final(self._emulation.duration_ns, [message.traffic])
 
+    def take_answer(self, process_id: str, answer: wire.StackDump) -> None:
+        """Take the answer of a process after a restart, which has lost what is missing before its `seq`."""
+        if not self.is_held:
+            return
+        self._cut_off.discard(process_id)
+        expected = self._frames_seq[process_id]
+        if answer.seq is None:
+            self._cut_off.add(process_id)
+        elif answer.seq > expected:
+            self._lost[process_id].append((expected, answer.seq - 1))
+            self._frames_seq[process_id] = answer.seq
+
     def take_messages(self, now_ns: int, messages: Sequence[SentMessage]) -> None:
         """Take messages of the backbone that have come later than the frames that refer to them."""
         if now_ns < self._emulation.duration_ns:
@@ -174,17 +189,18 @@ class RealTime:
         """The processes that have not sent their last message, and are neither dead nor taken by a fault."""
         return frozenset(self._awaited)
 
-    def _acknowledge(self, process_id: str, message: wire.Frames, was_held: bool) -> None:
+    def _acknowledge(self, process_id: str, message: wire.Frames) -> None:
         waiting = self._unacknowledged[process_id]
         if message.unseen:
-            self.gaps += not was_held
             own = self._nodes[process_id]
             unseen = [(ref.node, ref.number) for ref in message.unseen if ref.node in own]
-            self._news.repeat(self._shown[key][1] for key in unseen if key in self._shown)
+            shown = [self._shown[key] for key in unseen if key in self._shown]
+            self.gaps += not self._all_held(time_ns for time_ns, _ in shown)
+            self._news.repeat(each for _, each in shown)
         for first, last in message.missed:
-            self.gaps += not was_held
-            for seq in [seq for seq in waiting if first <= seq <= last]:
-                missed = waiting.pop(seq)
+            all_missed = [waiting.pop(seq) for seq in list(waiting) if first <= seq <= last]
+            self.gaps += not self._all_held(missed.time_ns for missed in all_missed)
+            for missed in all_missed:
                 self._lose(missed.deliveries)
                 self._news.repeat(missed.news)
                 self._lost[process_id] += missed.lost
@@ -213,7 +229,7 @@ class RealTime:
         """Return what has become due by `now_ns`, by process."""
         self._change_by(now_ns)
         self._collect(now_ns)
-        ready = self._present - self._paused
+        ready = self._present - self._paused - (self._cut_off & self._was_paused)
         informed = {self._process_of[node] for node, _ in self._news.firsts()}
         return {
             process_id: self._batch(process_id)
@@ -238,9 +254,10 @@ class RealTime:
         """True while a planned restart holds everything back."""
         return self._held_since_ns is not None
 
-    def hold(self, now_ns: int) -> None:
-        """Take note that a planned restart holds everything back from now on."""
+    def hold(self, now_ns: int, paused: Collection[str] = ()) -> None:
+        """Take note that a planned restart holds everything back from now on; `paused` nodes find it over later."""
         self._held_since_ns = now_ns if self._held_since_ns is None else self._held_since_ns
+        self._cut_off |= {self._process_of[node] for node in paused} & self._present
 
     def release(self, now_ns: int) -> None:
         """Take note that everything has gone out that a restart has held back."""
@@ -252,6 +269,11 @@ class RealTime:
         """Nanoseconds of a span in which restarts have held everything back."""
         holds = self._holds if self._held_since_ns is None else [*self._holds, (self._held_since_ns, until_ns)]
         return sum(max(min(until_ns, end_ns) - max(from_ns, start_ns), 0) for start_ns, end_ns in holds)
+
+    def _all_held(self, sent_ns: Iterable[int]) -> bool:
+        """Return whether all that was sent at these times, and something was, went out while a restart held it."""
+        times_ns = list(sent_ns)
+        return bool(times_ns) and all(self._held_ns(time_ns, time_ns + 1) for time_ns in times_ns)
 
     def _change_by(self, now_ns: int) -> None:
         """Begin and end the faults that are due: messages that have waited must meet those of their time."""
@@ -283,7 +305,7 @@ class RealTime:
         self._taken_ns = max(self._taken_ns, now_ns)
         self._emulation.come_back(self._nodes[process_id], now_ns)
         self._batch_seq[process_id] = self._frames_seq[process_id] = 0
-        self._heard_ns[process_id] = now_ns
+        self._cut_off.discard(process_id)
         self._lost[process_id] = []
         self._unacknowledged[process_id].clear()
         self._present.add(process_id)
@@ -328,7 +350,7 @@ class RealTime:
             self._shown[message.node, message.number] = self._collected_ns, message
         while self._shown and (first := next(iter(self._shown.items())))[1][0] < self._collected_ns - KEPT_NS:
             del self._shown[first[0]]
-        self._unacknowledged[process_id][seq] = _Sent(deliveries, [*results, *messages], lost)
+        self._unacknowledged[process_id][seq] = _Sent(self._collected_ns, deliveries, [*results, *messages], lost)
         return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages, lost)
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:
@@ -394,10 +416,11 @@ async def run_in_real_time(realtime: RealTime, processes: Processes) -> None:
     await asyncio.sleep(wire.HEAD_START_NS / NS_PER_S)
     while not realtime.is_over:
         catches_up = realtime.is_held
-        batches = realtime.due(realtime.now_ns)
+        now_ns = realtime.now_ns
+        batches = realtime.due(now_ns)
         for actions in realtime.take_actions():
             if actions.restarts:
-                realtime.hold(realtime.now_ns)
+                realtime.hold(now_ns, actions.paused)
                 catches_up = False
             await processes.act(actions)
         _send(processes, batches)
@@ -423,6 +446,8 @@ async def take_what_comes(realtime: RealTime, processes: Processes, timeout_s: f
         try:
             if isinstance(heard.message, SentMessage):
                 realtime.take_messages(now_ns, [heard.message])
+            elif isinstance(heard.message, wire.StackDump):
+                realtime.take_answer(heard.process_id, heard.message)
             else:
                 assert isinstance(heard.message, wire.Frames)
                 realtime.receive(now_ns, heard.process_id, heard.message)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from agents.host import UNSEEN_NS, Attachment, _RealTimeAgent
+from agents.host import UNSEEN_NS, Attachment, Found, Lost, _RealTimeAgent
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import TransportError
 from vnet.transport import wire
@@ -93,6 +93,27 @@ def test_in_real_time_a_result_wakes_the_program_that_awaits_it() -> None:
         assert await sending == (False, 0)
 
     asyncio.run(awaits_a_result())
+
+
+def test_in_real_time_an_agent_speaks_as_soon_as_the_emulator_is_back_and_says_how_much_it_has_sent() -> None:
+    """It may have been paused: the emulator waits for it."""
+    welcome = emulation_of(scenario_of((), "agents.beacon:main")).welcome("v01", b"n")
+    attached, said = attachment(), list[Any]()
+    attached._publishers = {"v01": SimpleNamespace(put=lambda data: said.append(wire.decode_tx(data)))}  # type: ignore[dict-item]
+    sample: Any = SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: wire.encode(wire.StackRequest())))
+
+    async def loses_the_emulator() -> None:
+        agent = _RealTimeAgent(attached, [welcome], {}, None)
+        agent._loop, agent._started = asyncio.get_running_loop(), True  # type: ignore[assignment]
+        for state in (Lost, Found):
+            attached.inbox.put(state)
+        agent._drain()
+        await asyncio.sleep(0)
+        attached._on_rx(sample)
+
+    asyncio.run(loses_the_emulator())
+    frames, answer = said
+    assert (frames.seq, answer.seq) == (0, 1)
 
 
 def test_a_message_of_the_backbone_that_has_come_while_the_program_computed_is_not_asked_for_again() -> None:

@@ -190,6 +190,20 @@ def test_a_router_that_somebody_kills_ends_the_run_as_unknown(tmp_path: Path, pa
     assert events_of(folder, "died") == []
 
 
+@pytest.mark.slow
+def test_in_real_time_who_is_paused_in_a_restart_of_the_emulator_loses_nothing_to_the_machine(
+    vnet: Vnet, tmp_path: Path
+) -> None:
+    faults = [
+        {"kind": "pause", "at_s": 0.4, "duration_s": 0.8, "nodes": {"ids": ["v02"]}},
+        {"kind": "emulator_restart", "at_s": 0.6, "down_s": 0.1},
+    ]
+    done = vnet("run", write(tmp_path, faults, run={"pacing": "realtime", "duration_s": 4.0}))
+    assert done.verdict["verdict"] != "invalid", done.stdout
+    assert done.check("transport")["verdict"] == "valid"
+    assert max(row["sent_ns"] for row in done.trace() if row["sender"] == "v02") > 1.2e9
+
+
 def test_in_real_time_processes_are_killed_restarted_and_paused_and_none_is_left(tmp_path: Path) -> None:
     faults = [
         {"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"ids": ["v01"]}},

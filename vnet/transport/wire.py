@@ -335,11 +335,15 @@ class Final(Message, frozen=True):
 
 
 class StackDump(Message, frozen=True):
-    """The answer to `StackRequest`: the stacks of the process's program threads, and in lockstep its instant."""
+    """The answer to `StackRequest`: the stacks of the process's program threads, and in lockstep its instant.
+
+    In real time `seq` is the number of the next `Frames`: who answers after a restart has sent the ones before it.
+    """
 
     nonce: bytes
     text: str
     time_ns: TimeNs | None = None
+    seq: Count | None = None
 
 
 class Welcome(Message, frozen=True):

@@ -225,6 +225,9 @@ class LiveProcesses(Processes):
                 self._take_final(node, message)
             case wire.StackDump():
                 self._stacks[node] = message
+                if self._expected is wire.Frames:
+                    self._heard.append(Heard(node, message, self._arrived_ns))
+                    self.changes.set()
             case _:
                 raise ProtocolError(f"an unexpected {type(message).__name__}")
 

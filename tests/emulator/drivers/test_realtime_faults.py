@@ -335,13 +335,73 @@ def test_messages_lost_in_a_restart_are_no_gaps_of_the_machine() -> None:
     realtime.receive(100 * MS, "v01", frames[0])
     realtime.hold(150 * MS)
     realtime.receive(850 * MS, "v01", frames[3])
+    realtime.take_answer("v01", wire.StackDump(b"n", "", seq=5))
     realtime.release(900 * MS)
-    assert realtime.gaps == 0
-    assert realtime.due(901 * MS)["v01"].lost == [(1, 2)], "its process is told all the same"
+    assert realtime.due(901 * MS)["v01"].lost == [(1, 2), (4, 4)], "its process is told all the same"
     realtime.receive(910 * MS, "v01", frames[5])
-    assert realtime.gaps == 0, "the connection has come back meanwhile"
+    assert realtime.gaps == 0
     realtime.receive(950 * MS, "v01", frames[7])
     assert realtime.gaps == 1
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_messages_lost_in_a_silence_longer_than_a_restart_are_gaps(answered: bool) -> None:
+    realtime, _ = started()
+    realtime.receive(100 * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic()))
+    realtime.hold(150 * MS)
+    if answered:
+        realtime.take_answer("v01", wire.StackDump(b"n", "", seq=2))
+    realtime.release(160 * MS)
+    realtime.take_answer("v01", wire.StackDump(b"n", "", seq=60))  # nothing is to be answered any more
+    realtime.receive(1500 * MS, "v01", wire.Frames(b"n", 60, 1, [], wire.Traffic()))
+    assert realtime.gaps == 1
+
+
+def test_who_does_not_say_what_it_has_sent_is_excused_by_its_answer_for_one_message() -> None:
+    realtime, _ = started()
+    realtime.hold(150 * MS)
+    realtime.take_answer("v01", wire.StackDump(b"n", ""))
+    realtime.release(160 * MS)
+    for seq, gaps in ((3, 0), (5, 1)):
+        realtime.receive(200 * MS, "v01", wire.Frames(b"n", seq, 1, [], wire.Traffic()))
+        assert realtime.gaps == gaps
+
+
+@pytest.mark.parametrize(("due_ms", "gaps"), [(60, 1), (160, 0), (260, 1)], ids=["before", "within", "after"])
+def test_a_missed_batch_is_a_gap_unless_it_went_out_within_a_restart(due_ms: int, gaps: int) -> None:
+    realtime, _ = started()
+    realtime.receive(10 * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v01", b"x")])))
+    if due_ms > 150:
+        realtime.hold(150 * MS)
+    if due_ms > 200:
+        realtime.release(200 * MS)
+    seq = realtime.due(due_ms * MS)["v02"].seq
+    if due_ms < 150:
+        realtime.hold(150 * MS)
+    if due_ms < 200:
+        realtime.release(200 * MS)
+    realtime.receive(300 * MS, "v02", wire.Frames(b"n", 0, seq + 1, [(seq, seq)], wire.Traffic()))
+    assert realtime.gaps == gaps
+
+
+def test_who_was_paused_in_a_restart_is_sent_nothing_until_it_has_found_the_emulator_again() -> None:
+    realtime, emulation = started(fault("pause", 0.1, 0.4))
+    realtime.due(100 * MS)
+    realtime.receive(110 * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v01", b"x")])))
+    (pause,) = realtime.take_actions()
+    realtime.hold(200 * MS, pause.paused)
+    realtime.receive(210 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic()))  # it came before the pause
+    realtime.release(400 * MS)
+    assert "v02" not in realtime.due(510 * MS)
+    realtime.receive(900 * MS, "v02", wire.Frames(b"n", 4, 1, [], wire.Traffic()))
+    batch = realtime.due(901 * MS)["v02"]
+    assert batch.held and [packet.sender for packet in batch.packets] == ["v01"]
+    assert batch.lost == [(1, 3)], "those that it sent before it had found the emulator"
+    assert realtime.gaps == 0
+    missed = [(batch.seq, batch.seq)]
+    realtime.receive(1000 * MS, "v02", wire.Frames(b"n", 6, batch.seq + 1, missed, wire.Traffic()))
+    assert realtime.gaps == 2, "what is lost from then on is the machine's"
+    assert emulation.engine.counts[Outcome.transport] == 1
 
 
 class _Restarting(Processes):

@@ -92,7 +92,7 @@ agent_messages = st.one_of(
         st.lists(st.tuples(times, times), max_size=2),
     ),
     st.builds(wire.Final, st.binary(), traffic),
-    st.builds(wire.StackDump, st.binary(), names, st.none() | times),
+    st.builds(wire.StackDump, st.binary(), names, st.none() | times, st.none() | times),
 )
 emulator_messages = st.one_of(
     st.builds(

@@ -360,6 +360,26 @@ async def test_real_time_sends_what_is_due_to_its_end() -> None:
     assert play.stage.events("died", "stalled", "refused") == []
 
 
+@pytest.mark.parametrize(("said", "gaps"), [(2, 0), (1, 1), (None, 0)])
+@in_virtual_time
+async def test_in_real_time_the_answer_to_a_restart_tells_what_that_has_lost(said: int | None, gaps: int) -> None:
+    """Two messages of v03 have not come when one does, long after the restart."""
+
+    def answer(node: str, message: Any) -> wire.AgentMessage | None:
+        if isinstance(message, wire.StackRequest):
+            return wire.StackDump(b"1", "", seq=said if node == "v03" else 0)
+        if node != "v03":
+            return None
+        is_late = isinstance(message, wire.Batch) and [fix.time_ns for fix in message.fixes] == [1000 * MS]
+        return wire.Frames(b"1", 2, 1, [], wire.Traffic()) if is_late else None
+
+    run = {"duration_s": 1.2, "settle_s": 0.1}
+    play = Play("realtime", answer, run=run, faults=[fault("emulator_restart", 0.1, 0.1, down_s=0.01)])
+    await play.run()
+    assert play.stage.events("emulator_restarted", "refused") == [("emulator_restarted", None)]
+    assert isinstance(play.pacing, RealTime) and play.pacing.gaps == gaps
+
+
 @in_virtual_time
 async def test_in_real_time_a_death_is_told_at_once_and_nobody_waits_for_last_words_of_the_dead() -> None:
     def answer(node: str, message: Any) -> wire.AgentMessage | None:
