@@ -372,7 +372,7 @@ def check_pause_respected(recorded: RecordedRun) -> Finding:
 
 
 def _stopped_ns(recorded: RecordedRun, planned: PlannedFault) -> int:
-    """Return when a pause stopped its processes: once the restart was over within which it was to begin, if any."""
+    """Return when a fault stopped its processes: once the restart was over within which it was to begin, if any."""
     held_until_ns = [end_ns for start_ns, end_ns in recorded.holding_restarts if start_ns < planned.start_ns]
     return max([planned.start_ns, *held_until_ns])
 
@@ -642,9 +642,11 @@ def _silenced(recorded: RecordedRun, planned: PlannedFault) -> int:
     """Count the nodes that sent or reported before but not during the fault, or that missed frames by it."""
     start_ns = recorded.period_starts_ns()
     end_ns = start_ns + recorded.scenario.period_ns
-    before, during = end_ns <= planned.start_ns, (start_ns >= planned.start_ns) & (end_ns <= planned.end_ns)
+    from_ns = _stopped_ns(recorded, planned)
+    before, during = end_ns <= planned.start_ns, (start_ns >= from_ns) & (end_ns <= planned.end_ns)
     sends_before = recorded.sent_ns < planned.start_ns
     sends_during = recorded.acting(planned, recorded.sent_ns, -recorded.guard_ns)
+    sends_during &= recorded.sent_ns >= from_ns + recorded.guard_ns
     ends = isinstance(planned.fault, ProcessFault) and planned.fault.ends
     count = 0
     for node in np.flatnonzero(planned.nodes).tolist():

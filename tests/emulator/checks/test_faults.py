@@ -518,6 +518,8 @@ def test_a_pause_that_a_restart_holds_up_is_judged_around_it() -> None:
     """In real time a process that should pause cannot be told while the emulator restarts."""
     early = shifted(with_fault("pause"), -0.5)  # from 1.5 s on, and they did from 2 s on
     assert verdict(restarted(early, 1.4, 2.0), "pause_respected") is Verdict.VALID
+    assert verdict(restarted(early, 1.4, 2.0), "effect:pause-0") is Verdict.VALID
+    assert verdict(restarted(early, 1.4, 1.7), "effect:pause-0") is Verdict.UNKNOWN
     assert verdict(restarted(early, 1.4, 1.7), "pause_respected") is Verdict.INVALID
     assert verdict(restarted(early, 1.7, 2.0), "pause_respected") is Verdict.INVALID
     assert verdict(restarted(early, 1.5, 2.0), "pause_respected") is Verdict.INVALID, "the pause comes first"
