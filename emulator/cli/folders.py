@@ -6,6 +6,7 @@ import sys
 import webbrowser
 from collections.abc import Callable
 from importlib import import_module
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -86,14 +87,14 @@ def trace(
         content = _raw if decode is None else _decoded_by(_load(decode))
         end_ns = None if end is None else round(end * NS_PER_S)
         rows = (_row(entry, content) for entry in frame_log(recorded, node, round(start * NS_PER_S), end_ns))
-        console = SafeConsole()
+        console, first = SafeConsole(), list(islice(rows, 1))  # before anything is printed, if there is no trace
         if not console.is_terminal:
             print("\t".join(COLUMNS))
-            for row in rows:
+            for row in chain(first, rows):
                 print("\t".join(printable(cell, LONGEST_CELL) for cell in row))
             return
         table = Table(*COLUMNS, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for row in rows:
+        for row in chain(first, rows):
             table.add_row(*map(Text, row))
         console.print(table)
 

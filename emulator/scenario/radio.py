@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from emulator.scenario.network import OriginDeg
 from emulator.scenario.sections import Section, Switch, must_grow, must_not_grow
+from vnet.errors import counted
 from vnet.units import NS_PER_MS
 
 QPSK_07_SINR_DB = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 20.0, 20.001)
@@ -322,7 +323,10 @@ class Fading(Section):
     @model_validator(mode="after")
     def _a_shape_for_each_stretch(self) -> Fading:
         if len(self.m) != len(self.until_m) + 1:
-            raise ValueError(f"{len(self.m)} shapes m need {len(self.m) - 1} distances until_m between them")
+            raise ValueError(
+                f"m has {counted(len(self.m), 'shape')}, and until_m {counted(len(self.until_m), 'distance')}: "
+                "one shape more than distances is needed"
+            )
         must_grow("until_m", self.until_m)
         return self
 

@@ -72,6 +72,10 @@ def load_program(entry: str) -> Program:
         raise _load_error(entry, f"{found} has no {name!r}{did_you_mean(name, _programs_of(module))}", module_name)
     if not inspect.iscoroutinefunction(program):
         raise _load_error(entry, f"is not an async function: async def {name}(node)", module_name)
+    try:
+        inspect.signature(program).bind(None)
+    except TypeError as error:
+        raise _load_error(entry, f"called with the node: {error}; async def {name}(node)", module_name) from None
     own_asyncio.use_stand_ins(program)
     return program  # type: ignore[no-any-return]
 

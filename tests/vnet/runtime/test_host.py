@@ -407,6 +407,7 @@ def test_nodes_draw_from_seeds_of_their_own() -> None:
         ("no.such.module:main", "cannot import: ModuleNotFoundError"),
         ("agents.beacon:nothing", "has no 'nothing'"),
         ("agents.beacon:encode", "is not an async function"),
+        ("vnet.gateway.emulated:run_program", "called with the node"),
         ("agents.liar:main", "'agents.liar:main': renamed; use agents.cooperative.attacker:main"),
     ],
 )
