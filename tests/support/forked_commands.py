@@ -13,6 +13,7 @@ import contextlib
 import ctypes
 import functools
 import gc
+import importlib
 import json
 import os
 import pkgutil
@@ -37,6 +38,8 @@ AGENT = [*PYTHON, "agents.cli"]
 MODULE = [*PYTHON, "runpy"]
 WORKER = "emulator.cells.worker"
 CHECK = "agents.program_check"
+LIBRARIES = {".figure": "scipy.stats", "pytest": "hypothesis"}
+"""Libraries that modules use whose name ends so: the first takes as long to import as vnet does."""
 _LENGTH = 2**20
 _NUMBER = "%-20d"
 
@@ -149,6 +152,14 @@ def _address() -> bytes:
     return address
 
 
+def _import_for(words: Sequence[str]) -> None:
+    """Import once for all that are like it what a module takes long to import."""
+    for end, library in LIBRARIES.items():
+        if words[0] == MODULE[-1] and words[1].endswith(end) and library not in sys.modules:
+            importlib.import_module(library)
+            gc.freeze()
+
+
 def serve(requests: socket.socket, alive: socket.socket) -> str:
     """Fork a process for each request until `alive` is closed.
 
@@ -167,6 +178,8 @@ def serve(requests: socket.socket, alive: socket.socket) -> str:
             os._exit(0)
         with requests.accept()[0] as client:
             data, descriptors, _, _ = socket.recv_fds(client, _LENGTH, 8)
+        if data:
+            _import_for(json.loads(data)["words"])
         if data and not os.fork():
             break
         for descriptor in descriptors:
@@ -238,8 +251,13 @@ if __name__ == "__main__":
     import matplotlib.figure
     import pyarrow
     import pytest  # noqa: F401  # what pages run as well
+    import scipy.linalg
+    import scipy.sparse.csgraph
+    import scipy.spatial
+    import scipy.special  # noqa: F401  # what maps, radios and cooperative vehicles use
 
     import agents.cli
+    import agents.cooperative.program
     import agents.host
     import agents.program_check
     import emulator.cells.sweep
