@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 import emulator
-from docs.examples.three_radios import figure, figures
+from docs.examples.three_radios import figures
 from tests.support.paths import ROOT
 
 EXAMPLE = ROOT / "docs" / "examples" / "three_radios"
@@ -19,6 +19,8 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_sweep_has_the_figures_of_near_receptions_of_each_radio(tmp_path: Path) -> None:
+    from docs.examples.three_radios import figure  # imports scipy.stats, which takes most of a second
+
     changes = {"radio.shadowing.sigma_db": 0.0, "radio.path_loss.tx_power_dbm": 30.0}
     vary: dict[str, list[Any]] = {
         "radio.mac": RADIOS,

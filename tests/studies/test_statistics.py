@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy  # its stats are imported when they are first used
 
 from studies.reports import holm, interval_95, paired_tests, shown_interval
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 def test_an_interval_is_students() -> None:
     values = [0.2, 0.25, 0.22, 0.31]
     mean, half_width = interval_95(values)
-    low, high = stats.t.interval(0.95, 3, np.mean(values), stats.sem(values))
+    low, high = scipy.stats.t.interval(0.95, 3, np.mean(values), scipy.stats.sem(values))
     assert (mean - half_width, mean + half_width) == pytest.approx((low, high))
     assert shown_interval([*values, None]) == f"{mean:.3f} ± {half_width:.3f}"
 
@@ -40,7 +40,7 @@ def test_paired_tests_are_those_of_scipy() -> None:
         {"worse": (worse.tolist(), reference.tolist()), "same": (same.tolist(), reference.tolist())}
     )
     for test, values in zip(tests, (worse, same), strict=True):
-        assert test.p == pytest.approx(float(stats.ttest_rel(values, reference).pvalue))
+        assert test.p == pytest.approx(float(scipy.stats.ttest_rel(values, reference).pvalue))
         assert test.pairs == 10
     assert tests[0].adjusted_p == pytest.approx(2 * tests[0].p)
     assert tests[0].shown[1] == "< 0.001"

@@ -6,14 +6,16 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from distributed import Client, LocalCluster
 
 import emulator
 from emulator.cells import cells
 from emulator.cells.cells import WALL_CLOCK, open_executor
+
+if TYPE_CHECKING:
+    from distributed import LocalCluster
 
 pytestmark = pytest.mark.slow
 
@@ -28,6 +30,8 @@ VARY: dict[str, list[Any]] = {"radio.loss": [0, 0.5]}
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[LocalCluster]:
     """A scheduler, and two workers that are started again if they end."""
+    from distributed import LocalCluster  # slow to import, and but one worker of pytest needs it
+
     options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**options, host="127.0.0.1", local_directory=str(tmp_path), silence_logs=50) as started:
         yield started
@@ -36,6 +40,8 @@ def cluster(tmp_path: Path) -> Iterator[LocalCluster]:
 def test_a_worker_that_is_killed_loses_nothing(
     cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from distributed import Client
+
     keep, killed = cells.keep, list[int]()
 
     def keep_and_kill_once(*arguments: Any) -> None:

@@ -7,8 +7,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import nbclient
-import nbformat
 import pytest
 
 import emulator
@@ -41,6 +39,9 @@ def test_run_has_a_process_for_each_vehicle_inside_a_running_event_loop(tmp_path
 
 def test_a_notebook_runs_programs_and_shows_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a kernel of its own: its loop runs while cells do, and its hash seed is drawn."""
+    import nbclient  # slow to import, and but one worker of pytest needs it
+    import nbformat
+
     monkeypatch.delenv("PYTHONHASHSEED", raising=False)
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))

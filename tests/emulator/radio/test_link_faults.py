@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+import scipy  # scipy.stats is imported when it is first used
 
 from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, S, digest, fault, link
 
@@ -83,9 +83,9 @@ def test_loss_lies_in_its_binomial_band_and_is_told_from_the_radios() -> None:
     air.chat(400)
     rows = [row for row in air.rows() if row["sender"] in ("v0", "v1")]
     counts = Counter(row["outcome"] for row in rows)
-    low, high = binom.interval(0.9999, len(rows), 0.3)
+    low, high = scipy.stats.binom.interval(0.9999, len(rows), 0.3)
     assert low <= counts["fault"] <= high
-    low, high = binom.interval(0.9999, len(rows) - counts["fault"], 0.2)
+    low, high = scipy.stats.binom.interval(0.9999, len(rows) - counts["fault"], 0.2)
     assert low <= counts["lost"] <= high
     assert all(row["cause"] == ("loss-0" if row["outcome"] == "fault" else "") for row in rows)
 
@@ -112,7 +112,7 @@ def test_bursts_have_the_stationary_rate_and_geometric_lengths() -> None:
         assert abs(lengths.mean() - 1 / leave) < 0.6
         for k in range(1, 6):
             share = (1 - leave) ** (k - 1)
-            low, high = binom.interval(0.99999, len(lengths), share)
+            low, high = scipy.stats.binom.interval(0.99999, len(lengths), share)
             assert low <= np.sum(lengths >= k) <= high, k
     assert abs(np.corrcoef(lost["v1"], lost["v2"])[0, 1]) < 0.15
 
@@ -122,7 +122,7 @@ def test_a_good_link_and_a_bad_one_lose_with_their_own_probabilities() -> None:
     always_bad = FaultyEngine([fault("burst_loss", enter=1.0, leave=1e-9, loss_bad=0.7)], count=2)
     for air, share in ((never_bad, 0.4), (always_bad, 0.7)):
         air.chat(1000)
-        low, high = binom.interval(0.9999, 2000, share)
+        low, high = scipy.stats.binom.interval(0.9999, 2000, share)
         assert low <= sum(row["outcome"] == "fault" for row in air.rows()) <= high
 
 
@@ -152,7 +152,7 @@ def test_jitter_is_uniform_up_to_its_limit() -> None:
 def test_reordering_holds_some_back_so_that_later_frames_overtake_them() -> None:
     ms = later([fault("reorder", probability=0.2, delay_ms=250)])
     assert set(ms.tolist()) == {0.0, 250.0}
-    low, high = binom.interval(0.9999, len(ms), 0.2)
+    low, high = scipy.stats.binom.interval(0.9999, len(ms), 0.2)
     assert low <= np.sum(ms > 0) <= high
     air = FaultyEngine([fault("reorder", probability=0.2, delay_ms=250)])
     air.chat(30)
@@ -170,7 +170,7 @@ def test_duplicates_are_rows_of_their_own_that_name_their_cause() -> None:
     first = {(*link(row), row["seq"]): row for row in rows if row["copy"] == 0}
     assert by_copy[0] == 100 * 5 * 4
     assert by_copy[1] == by_copy[2] == by_copy[3]
-    low, high = binom.interval(0.9999, 400, 0.3)
+    low, high = scipy.stats.binom.interval(0.9999, 400, 0.3)
     assert low <= by_copy[1] <= high
     for row in rows:
         if row["copy"]:
@@ -199,7 +199,7 @@ def test_a_corrupt_pair_differs_in_exactly_so_many_bytes(flips: int, size: int) 
         assert row["payload_digest"] == digest(packet.payload)
         assert row["cause"] in ("", "corrupt-0")
         changed += differ > 0
-    low, high = binom.interval(0.9999, 240, 0.4)
+    low, high = scipy.stats.binom.interval(0.9999, 240, 0.4)
     assert low <= changed <= high
     assert len({d.packet.payload for d in air.delivered if d.packet.sent_ns == 0}) > 1 or size == 1
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy  # its stats are imported when they are first used
 
 from emulator.records.distributions import (
     binomial_interval,
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("probability", [0.0, 1e-6, 0.05, 0.3, 0.5, 0.999, 1.0])
 def test_binomial_intervals(trials: int, probability: float) -> None:
     for share in (0.5, 0.99, 0.999):
-        expected = tuple(int(edge) for edge in stats.binom.interval(share, trials, probability))
+        expected = tuple(int(edge) for edge in scipy.stats.binom.interval(share, trials, probability))
         assert binomial_interval(share, trials, probability) == expected
 
 
@@ -28,21 +28,22 @@ def test_binomial_intervals(trials: int, probability: float) -> None:
 def test_the_chi_squared_distribution_to_nine_digits(degrees: int) -> None:
     probabilities = [1e-9, 0.001, 0.025, 0.3, 0.5, 0.975, 0.999, 1 - 1e-5]
     quantiles = [chi2_quantile(probability, degrees) for probability in probabilities]
-    assert quantiles == pytest.approx(stats.chi2.ppf(probabilities, degrees), rel=1e-9)
+    assert quantiles == pytest.approx(scipy.stats.chi2.ppf(probabilities, degrees), rel=1e-9)
     values = [0.0, *quantiles, quantiles[-1] * 1.5 + 10, np.inf]
     assert [chi2_sf(v, degrees) for v in values] == pytest.approx(
-        stats.chi2.sf(values, degrees), rel=1e-8, abs=1e-300
+        scipy.stats.chi2.sf(values, degrees), rel=1e-8, abs=1e-300
     )
-    assert [chi2_cdf(v, degrees) for v in values] == pytest.approx(stats.chi2.cdf(values, degrees), rel=1e-8)
+    assert [chi2_cdf(v, degrees) for v in values] == pytest.approx(scipy.stats.chi2.cdf(values, degrees), rel=1e-8)
 
 
 @pytest.mark.parametrize(("count", "total"), [(0, 10), (1, 776), (776, 776), (9, 5000), (2_000, 1_000_000)])
 def test_the_lowest_share_is_that_of_clopper_and_pearson(count: int, total: int) -> None:
-    interval = stats.binomtest(count, total).proportion_ci(0.95, method="exact")
+    interval = scipy.stats.binomtest(count, total).proportion_ci(0.95, method="exact")
     assert lowest_share(count, total) == pytest.approx(interval.low, rel=1e-9)
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 4, 9, 30, 999])
 @pytest.mark.parametrize("probability", [0.5, 0.9, 0.975, 0.9995])
 def test_students_distribution(degrees: int, probability: float) -> None:
-    assert student_quantile(probability, degrees) == pytest.approx(stats.t.ppf(probability, degrees), abs=1e-9)
+    expected = scipy.stats.t.ppf(probability, degrees)
+    assert student_quantile(probability, degrees) == pytest.approx(expected, abs=1e-9)
