@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import re
 import textwrap
@@ -46,6 +47,7 @@ def docstring(thing: object) -> str:
     return text
 
 
+@functools.cache  # most classes derive from others, whose files are parsed for each of them otherwise
 def attribute_docstrings(of: type) -> dict[str, str]:
     """The docstrings below the attributes of a class, by name, as Python itself does not keep them."""
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(of))).body
