@@ -1,5 +1,6 @@
 """vnet without a clone: a wheel is built, installed into an environment of its own, and used in an empty folder."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -14,6 +15,22 @@ import pytest
 from tests.support.paths import ROOT
 
 Command = Callable[..., str]
+SEVERAL = """
+import json, os, sys
+from contextlib import redirect_stdout
+from io import StringIO
+os.environ["PYTHONHASHSEED"] = "0"  # otherwise a simulation starts the interpreter again
+from emulator.cli.application import build_app
+from emulator.terminal.console import run_app
+
+app, told = build_app(), []
+for line in sys.argv[1:]:
+    with redirect_stdout(StringIO()) as printed:
+        assert run_app(app, line.split()) == 0, line
+    told.append(printed.getvalue())
+print(json.dumps(told))
+"""
+"""Runs command lines of vnet in one interpreter; prints what each prints."""
 
 
 def clean_environment() -> dict[str, str]:
@@ -43,7 +60,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)
     python = folder / "venv" / "bin" / "python"
     (wheel,) = folder.glob("*.whl")
-    run_pip("--python", python, "install", "--no-deps", "--no-index", "--ignore-installed", wheel)
+    run_pip("--python", python, "install", "--no-deps", "--no-index", "--ignore-installed", "--no-compile", wheel)
     (site,) = (folder / "venv" / "lib").glob("python*/site-packages")
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     return folder / "venv" / "bin"
@@ -92,13 +109,18 @@ def test_a_new_project_runs_and_its_tests_pass(command: Command) -> None:
 
 def test_pages_and_examples_come_with_the_wheel(command: Command, environment: Path) -> None:
     pages = [path for path in (ROOT / "docs").rglob("*.md") if "examples" not in path.parts]
-    assert len(command("vnet", "docs").splitlines()) == len(pages)
-    assert command("vnet", "docs", "tutorial") == (ROOT / "docs" / "tutorial.md").read_text()
-    assert Path(command("vnet", "docs", "--path").strip()).is_relative_to(environment.parent)
-    command("vnet", "new", "--example", "platoon")
-    assert "verdict: valid" in command(
-        "vnet", "simulate", "platoon/platoon.toml", "--duration", "6", "--quiet", "--no-report"
+    lines = (
+        "docs",
+        "docs tutorial",
+        "docs --path",
+        "new --example platoon",
+        "simulate platoon/platoon.toml --duration 6 --quiet --no-report",
     )
+    listed, tutorial, path, _, simulated = json.loads(command("python", "-c", SEVERAL, *lines))
+    assert len(listed.splitlines()) == len(pages)
+    assert tutorial == (ROOT / "docs" / "tutorial.md").read_text()
+    assert Path(path.strip()).is_relative_to(environment.parent)
+    assert "verdict: valid" in simulated
 
 
 def test_the_wheel_has_no_studies_and_says_in_one_line_where_they_are(environment: Path, tmp_path: Path) -> None:
