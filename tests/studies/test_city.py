@@ -61,6 +61,7 @@ def test_every_mechanism_drives_once_and_leaves_a_table_and_pictures(
     assert rows["optimized"]["position_rmse_m"] > 0
     for name in ("city_against_time.png", "city_errors.png"):
         assert (files / "out" / name).read_bytes().startswith(b"\x89PNG")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)  # nobody looks at it again
     monkeypatch.setattr("emulator.cells.cells.each_done", lambda missing, *_: iter([1 / 0] if missing else []))
     assert run_small(monkeypatch, files) == text, "what is finished is not run again"
 

@@ -231,6 +231,7 @@ def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Pa
     assert share is not None and f"{100 * share:.2f}" in page.text
 
 
+@pytest.mark.usefixtures("no_charts")
 def test_simulate_writes_the_report_and_a_failure_leaves_the_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
