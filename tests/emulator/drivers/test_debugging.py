@@ -1,6 +1,7 @@
 """A debugger stops in one vehicle's program, and the trace is the same as without."""
 
 import asyncio
+import bdb
 import io
 import signal
 import sys
@@ -81,6 +82,7 @@ def debug(monkeypatch: pytest.MonkeyPatch) -> Debug:
         program: str | Scenario, target: str, *commands: str, faults: Sequence[dict[str, Any]] = ()
     ) -> tuple[Emulation, list[str], bool]:
         said = io.StringIO()
+        bdb.Breakpoint.clearBreakpoints()  # Python numbers them throughout a process
 
         def debugger(target: DebugTarget, on_quit: Callable[[], None]) -> NodeDebugger:
             entered = io.StringIO("".join(f"{command}\n" for command in commands))
