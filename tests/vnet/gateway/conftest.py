@@ -42,6 +42,11 @@ def log(run: Run, node: str = "v01") -> list[str]:
     return [line for line in lines if not line.endswith("has opened no Zenoh session")]
 
 
+def printed(run: Run, node: str = "v01") -> list[str]:
+    """Return the same, but for the line that says that its programs have ended."""
+    return [line for line in log(run, node) if line != f"{node} finished"]
+
+
 def events(run: Run, kind: str) -> list[dict[str, Any]]:
     """Return the events of a kind, as they are written."""
     lines = (run.folder / "events.jsonl").read_text().splitlines()

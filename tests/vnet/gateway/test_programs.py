@@ -14,7 +14,7 @@ import pytest
 from emulator.checks.judge import check_run
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
-from tests.vnet.gateway.conftest import Drive, events, log
+from tests.vnet.gateway.conftest import Drive, events, log, printed
 from vnet.gateway import client_config
 from vnet.gateway.emulated.modules import CLIENT_CONFIG, ENDPOINT
 from vnet.gateway.emulated.shown import hide, show
@@ -129,7 +129,7 @@ def test_configuration_is_where_a_gateway_gives_it(drive: Drive) -> None:
             print("refused")
         """
     )
-    assert log(run)[:-1] == [f'"client" ["{ENDPOINT}"]'] * 3 + ["refused"]
+    assert printed(run) == [f'"client" ["{ENDPOINT}"]'] * 3 + ["refused"]
     assert json.loads(CLIENT_CONFIG.read_text()) == client_config(ENDPOINT)
 
 
@@ -269,7 +269,7 @@ def test_alarms_ring_by_emulated_time_and_end_a_wait(drive: Drive) -> None:
             print(f"{time.monotonic():.2f}")
         """
     )
-    assert log(run)[:-1] == ["int 0.2 0.1", "int 0.3 0.1", "0.05 1", "1.35"]
+    assert printed(run) == ["int 0.2 0.1", "int 0.3 0.1", "0.05 1", "1.35"]
 
 
 def test_a_signal_handler_runs_as_the_main_thread(drive: Drive) -> None:
@@ -327,7 +327,7 @@ def test_a_program_waits_for_signals(drive: Drive) -> None:
     )
     alarm = {signal.SIGALRM}
     assert run.verdict == "valid"
-    assert log(run)[:-1] == [
+    assert printed(run) == [
         "rang 0.1",
         "None 0.1",
         "set()",
@@ -393,7 +393,7 @@ def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Driv
         vehicles=2,
     )
     assert log(run, "v02")[-2] == "[25] [36]", "each has a start method of its own"
-    lines = [line for line in log(run)[:-1] if "child processes" not in line]
+    lines = [line for line in printed(run) if "child processes" not in line]
     assert lines == ["(9, True, False, True) 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]", "[25] [36]"]
 
 
@@ -608,6 +608,46 @@ def test_a_status_that_is_a_crash_has_the_line_that_gave_it(drive: Drive) -> Non
     assert crash["error"].endswith("ended with 3") and 'program0.py", line 3' in crash["where"]
 
 
+@pytest.mark.parametrize(
+    ("declared", "goes_on"),
+    [
+        ('session.declare_subscriber("a", print)', True),
+        ('session.declare_queryable("a", print)', True),
+        ('session.liveliness().declare_subscriber("a", print)', True),
+        ('(p := session.declare_publisher("a")).declare_matching_listener(print)', True),
+        ('session.declare_subscriber("a")', False),
+        ('session.declare_subscriber("a", zenoh.handlers.Callback(print, indirect=False))', False),
+        ('session.declare_subscriber("a", print).undeclare()', False),
+        ('session.declare_subscriber("a", print), session.close()', False),
+        ('session.get("nobody", print)', False),
+    ],
+)
+def test_a_program_goes_on_while_callbacks_are_declared(drive: Drive, declared: str, goes_on: bool) -> None:
+    """Zenoh calls each in a thread of Python that is no daemon; only to wait for calls is no deadlock."""
+    run = drive(f"import zenoh\nsession = zenoh.open(zenoh.Config())\nkept = {declared}\n", duration_s=5.0)
+    assert [event["kind"] for event in events(run, "finished")] == ["finished"] * (not goes_on)
+    assert events(run, "exception") == events(run, "crashed") == []
+
+
+def test_threads_see_the_end_of_the_main_one_before_its_callbacks_end(drive: Drive) -> None:
+    run = drive(
+        """
+        import threading, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        kept = session.declare_subscriber("a", print)
+
+        def close_at_the_end():
+            while threading.main_thread().is_alive():
+                time.sleep(0.1)
+            session.close()
+            print("closed")
+
+        threading.Thread(target=close_at_the_end, daemon=True).start()
+        """
+    )
+    assert log(run) == ["closed", "v01 finished"]
+
+
 @pytest.mark.parametrize("broken", ["import nothing_there", "class : pass"])
 def test_the_way_to_a_failed_import_is_the_programs_own(drive: Drive, broken: str) -> None:
     run = drive(
@@ -667,7 +707,7 @@ def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
         time.sleep(0.1)
         """
     )
-    assert log(run)[:-1] == [
+    assert printed(run) == [
         "32 16 True",
         "True",
         "True",
@@ -767,8 +807,8 @@ def test_what_is_closed_ends_what_waits_as_at_zenoh_itself(drive: Drive) -> None
     assert first == "0.0 dropped first listener"
     assert sorted(drops) == [f"0.5 dropped {name}" for name in ("get", "listener", "subscriber")]
     assert closed == "0.5 closed []"
-    lines = [line for line in log(run)[5:-1] if "warning: undeclare()" not in line]
-    assert len(lines) == len(log(run)) - 8, "each undeclare() under a reader is told"
+    lines = [line for line in printed(run)[5:] if "warning: undeclare()" not in line]
+    assert len(lines) == len(printed(run)) - 7, "each undeclare() under a reader is told"
     assert [line[4:] for line in lines if line[0] == "0"] == [
         *("Already borrowed", "Sample"),
         *("Already borrowed", "Query"),
@@ -861,7 +901,7 @@ def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) 
         """,
         program={"zenoh": {"query_s": 0.3}},
     )
-    assert [line.split(" ", 1)[1] for line in log(run)[:-1]] == [
+    assert [line.split(" ", 1)[1] for line in printed(run)] == [
         "session closed",
         "channel is empty and closed",
         "1 0",
@@ -891,7 +931,7 @@ def test_a_session_in_a_cycle_ends_as_it_is_collected_and_leaves_others_alone(dr
         time.sleep(0.1)
         """
     )
-    assert log(run)[:-1] == [
+    assert printed(run) == [
         "agent/first SampleKind.PUT",
         "agent/first SampleKind.DELETE",
         "agent/later SampleKind.PUT",
@@ -941,7 +981,7 @@ def test_what_takes_no_more_stops_its_session_as_at_zenoh_itself(
         """
     run = drive(dedent(SLOW) + dedent(program), duration_s=80.0, radio={"keys": ["none"]})
     more = ["0", "1"] if not slow and at_once < samples else []
-    assert log(run)[:-1] == [f"{at_once} {slow} {last_s}", *more]
+    assert printed(run) == [f"{at_once} {slow} {last_s}", *more]
 
 
 def test_who_puts_into_a_full_channel_of_the_same_session_waits(drive: Drive) -> None:
@@ -965,7 +1005,7 @@ def test_who_puts_into_a_full_channel_of_the_same_session_waits(drive: Drive) ->
         channel.undeclare()
         """)
     )
-    assert log(run)[:-1] == ["256 0", "257", "['0.2'] 0.4"]
+    assert printed(run) == ["256 0", "257", "['0.2'] 0.4"]
 
 
 def test_a_full_channel_that_is_undeclared_lets_all_go_on_that_wait(drive: Drive) -> None:
@@ -985,7 +1025,7 @@ def test_a_full_channel_that_is_undeclared_lets_all_go_on_that_wait(drive: Drive
         time.sleep(0.1)
         print(sorted(done))
         """)
-    assert log(run)[:-1] == ["[]", "[0, 1, 2]"]
+    assert printed(run) == ["[]", "[0, 1, 2]"]
 
 
 def test_a_querier_that_is_undeclared_ends_its_queries(drive: Drive) -> None:
@@ -1009,7 +1049,7 @@ def test_a_querier_that_is_undeclared_ends_its_queries(drive: Drive) -> None:
         except ValueError as error:
             print(error)
         """)
-    assert log(run)[:-1] == ["[]", "dropped 0.5", "0", "Invalid handler type int"]
+    assert printed(run) == ["[]", "dropped 0.5", "0", "Invalid handler type int"]
 
 
 def test_a_get_as_long_as_replies_are_awaited_does_not_time_out(drive: Drive) -> None:
@@ -1042,4 +1082,4 @@ def test_timers_ring_at_fractions_of_a_second_again_and_again(drive: Drive) -> N
         """,
         duration_s=6.0,
     )
-    assert log(run)[:-1] == ["rings 1.5", "rings 3.0", "[1.3, 1.5] 0 1"]
+    assert printed(run) == ["rings 1.5", "rings 3.0", "[1.3, 1.5] 0 1"]

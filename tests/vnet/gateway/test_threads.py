@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from emulator.records.tape import TAPE_FILE, described, read_tape
-from tests.vnet.gateway.conftest import Drive, events, log
+from tests.vnet.gateway.conftest import Drive, events, log, printed
 
 pytestmark = pytest.mark.slow
 
@@ -44,7 +44,7 @@ def test_threads_wait_on_emulated_time_for_queues_locks_events_and_each_other(dr
         """
     )
     assert run.verdict == "valid"
-    assert log(run)[:-1] == [
+    assert printed(run) == [
         "['MainThread', 'produce', 'consume']",
         "nothing 0.20",
         "0 0.25",
@@ -84,7 +84,7 @@ def test_conditions_barriers_semaphores_timers_locals_and_pools_work(drive: Driv
         timer.start()
         """
     )
-    assert log(run)[:-1] == ["[0, 1, 2] [0, 1, 4] False", "[0, 1, 4] 0.4", "timer"]
+    assert printed(run) == ["[0, 1, 2] [0, 1, 4] False", "[0, 1, 4] 0.4", "timer"]
 
 
 def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -> None:
@@ -129,7 +129,7 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
         """
     )
     assert signal.getsignal(signal.SIGINT) is before, "signals of the process are not the program's"
-    assert log(run)[:-1] == [
+    assert printed(run) == [
         "slept 0.05",
         "a 0 0.1",
         "b 0 0.15",
@@ -208,7 +208,7 @@ def test_joinable_threads_of_later_pythons_work(drive: Drive) -> None:
         print(round(time.monotonic(), 2), _thread._make_thread_handle(7).ident, _thread._get_main_thread_ident())
         """
     )
-    assert log(run)[:-1] == ["False 0.1", "True True 0.2", "0.5 7 1"]
+    assert printed(run) == ["False 0.1", "True True 0.2", "0.5 7 1"]
 
 
 CHANCE = """

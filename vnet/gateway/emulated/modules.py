@@ -232,6 +232,8 @@ class ProgramModules:
                 hook(type(error), error, error.__traceback__)
             raise
         self.load("threading")._shutdown()
+        if leave is None or leave.code in (None, 0):  # a failure ends it at once, as in real time
+            self.threads.await_callbacks()
         for function in reversed(self.at_exit):
             function()
         if leave is not None:

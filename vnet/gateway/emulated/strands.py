@@ -418,6 +418,9 @@ class Threads:
         self._alive = 0
         self.folder = Folder(Path.cwd())
         self._handles: list[ThreadHandle] = []
+        self.callbacks: set[object] = set()
+        """Callbacks of Zenoh that may be called again, each in a thread that is no daemon."""
+        self.callbacks_end = Waiting()
         self.main: Strand | None = None
         """The strand of the main thread."""
         self._main_task: asyncio.Task[Any] | None = None
@@ -493,6 +496,11 @@ class Threads:
         if not daemon:
             self._handles.append(handle)
         return handle
+
+    def await_callbacks(self) -> None:
+        """Block until there is no callback of Zenoh any more, as the end of a program of Python's does."""
+        while self.callbacks:
+            self.callbacks_end.wait(LONGEST_WAIT_S)  # a timer: who only waits to be called is in no deadlock
 
     def _shutdown(self) -> None:
         while self._handles:

@@ -500,6 +500,8 @@ class CallbackSink(_Queue):
         self._strand: Strand | None = None
         self.is_running = False
         self._waiting = Waiting()
+        if not self.is_direct:
+            outlet.threads.callbacks.add(self)
 
     def has_room(self) -> bool:
         """Return whether an item stops nobody."""
@@ -530,6 +532,13 @@ class CallbackSink(_Queue):
             if self._drop is not None and not self.is_running:
                 self.is_running = True
                 self._outlet.due.soon(self)
+            elif not self.is_running:
+                self._end()
+
+    def _end(self) -> None:
+        threads = self._outlet.threads
+        threads.callbacks.discard(self)
+        threads.callbacks_end.wake_all()
 
     def run(self) -> None:
         """Call the callback until it blocks; then a task goes on with it."""
@@ -552,6 +561,8 @@ class CallbackSink(_Queue):
             self.is_running = False
             self._freed()
             self._waiting.wake_all()
+            if self._closed:
+                self._end()
             idle()
 
     def _call(self, function: Callable[..., Any], *args: Any) -> None:
