@@ -300,15 +300,16 @@ class Supervisor:
         is_host = name in map(host_user, self._options.access.hosts)
         if not told_to_end:
             self._ends.pop(name, None)
-        if name == ROUTER and not self.router_gone.done():
-            self.router_gone.set_result(how.how)
-        elif not self._attachment.knows(name) and not is_host:
+        if name == ROUTER and self._processes:
+            if not self.router_gone.done():
+                self.router_gone.set_result(how.how)
+        elif not self._attachment.knows(name) and not is_host and name != ROUTER:
             self._folder.event(self._time_ns(), EventKind.observer_ended, name, how=how.how)
         elif not self._processes:
             last = (how.log_tail.splitlines() or ["its log is empty"])[-1]
             if "No module named" in last and (foreign := foreign_on_path("agents")):
                 last = f"{last}; {foreign}"
-            what = "process" if is_host else "agent"
+            what = "process" if is_host or name == ROUTER else "agent"
             self.failure = VnetError(f"{what} {name} ended before the start ({how.how}): {last}")
             self._changes.set()
         elif not is_host:  # the end of a host's connection tells its own

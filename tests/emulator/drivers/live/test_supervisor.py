@@ -203,12 +203,13 @@ async def test_a_process_that_dies_while_it_starts_is_no_longer_awaited() -> Non
     assert stage.supervisor.take_deaths() == {"v02": {"how": "exit status 1", "log_tail": "its last line"}}
 
 
+@pytest.mark.parametrize("process", ["agent v02", "process router"])
 @on_a_loop
-async def test_before_the_start_a_process_that_ends_is_why_there_is_none() -> None:
+async def test_before_the_start_a_process_that_ends_is_why_there_is_none(process: str) -> None:
     stage = Stage()
-    stage.launcher.dies(stage.supervisor, "v02", status=2)
+    stage.launcher.dies(stage.supervisor, process.split()[1], status=2)
     assert isinstance(stage.supervisor.failure, VnetError)
-    assert str(stage.supervisor.failure) == "agent v02 ended before the start (exit status 2): its last line"
+    assert str(stage.supervisor.failure) == f"{process} ended before the start (exit status 2): its last line"
 
 
 @on_a_loop
