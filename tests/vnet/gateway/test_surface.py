@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.paths import ROOT
-from tests.vnet.gateway.conftest import Drive, log, printed
+from tests.vnet.gateway.conftest import Drive, events, log, printed
 from vnet.gateway.emulated import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
@@ -227,3 +227,17 @@ def test_an_option_that_is_refused_is_refused_by_its_name(drive: Drive) -> None:
         """
     )
     assert log(run)[0].startswith("timestamp_instrumentation is not available on virtual time")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        'session.declare_querier("a", encoding="text/plain")',
+        'session.declare_querier("a").get(priority=zenoh.Priority.DATA)',
+        'session.delete("a", encoding="text/plain")',
+    ],
+)
+def test_an_option_that_zenoh_does_not_take_is_refused(drive: Drive, call: str) -> None:
+    run = drive(f"import zenoh\nsession = zenoh.open(zenoh.Config())\n{call}\n")
+    (crash,) = events(run, "crashed")
+    assert crash["error"].startswith("TypeError") and crash["error"].endswith("'")

@@ -701,3 +701,47 @@ def test_orders_name_threads_as_the_program_does(drive: Drive) -> None:
         run = drive(program, run={"order": "shuffle", "seed": seed})
         labels |= {described(each).split(": ")[1].split(" before")[0] for each in read_tape(run.folder / TAPE_FILE)}
     assert "timer of measurer" in labels
+
+
+def test_each_thread_has_the_context_that_python_gives_it(drive: Drive) -> None:
+    """An empty one: they once shared decimal's, so that the precision of one was that of all."""
+    run = drive(
+        """
+        import asyncio, contextvars, decimal, threading, time, zenoh
+        from concurrent.futures import ThreadPoolExecutor
+        told = contextvars.ContextVar("told", default="nothing")
+        session = zenoh.open(zenoh.Config())
+
+        def look(who, digits):
+            before = told.get(), decimal.getcontext().prec
+            told.set(who)
+            decimal.getcontext().prec = digits
+            time.sleep(0.2)
+            print(who, *before, told.get(), decimal.getcontext().prec)
+
+        told.set("main")
+        decimal.getcontext().prec = 10
+        subscriber = session.declare_subscriber("a", lambda sample: look("callback", 3))
+        threads = [threading.Thread(target=look, args=(f"thread {digits}", digits)) for digits in (4, 5)]
+        threads.append(threading.Timer(0.01, look, ("timer", 6)))
+        for thread in threads:
+            thread.start()
+        session.put("a", b"")
+        with ThreadPoolExecutor(1) as jobs:
+            jobs.submit(look, "job", 7).result()
+        for thread in threads:
+            thread.join()
+        print("main", told.get(), decimal.getcontext().prec)
+
+        async def asks():
+            told.set("loop")
+            loop = asyncio.get_running_loop()
+            print(await asyncio.to_thread(told.get), await loop.run_in_executor(None, told.get))
+
+        asyncio.run(asks())
+        session.close()
+        """
+    )
+    threads = [("callback", 3), ("job", 7), *((f"thread {digits}", digits) for digits in (4, 5)), ("timer", 6)]
+    seen = [f"{who} nothing 28 {who} {digits}" for who, digits in threads]
+    assert sorted(printed(run)) == sorted([*seen, "main main 10", "loop nothing"])

@@ -31,6 +31,7 @@ from vnet.gateway.emulated.values import (
     ZenohId,
     bytes_or_none,
     check,
+    check_taken,
     encoding_of,
     key_of,
     ordered,
@@ -422,6 +423,7 @@ class Querier(Sending):
         accept_replies: zenoh.ReplyKeyExpr | None = None,
         **options: Any,
     ) -> None:
+        check_taken(zenoh.Session.declare_querier, options)
         super().__init__(session, key_expr)
         all_complete = target == zenoh.QueryTarget.ALL_COMPLETE
         self.matches = partial(session.vehicle.matches_queryable, self.key_expr, all_complete)
@@ -433,6 +435,7 @@ class Querier(Sending):
 
     def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
         """Ask for replies."""
+        check_taken(zenoh.Querier.get, options)
         self.check_declared()
         selector = zenoh.Selector(self.key_expr, ordered(parameters))
         return self.session.query(self.until_undeclared, selector, handler, **self._options, **options)
@@ -558,6 +561,7 @@ class Session(Ending):
 
     def delete(self, key_expr: Any, **options: Any) -> None:
         """Delete a key."""
+        check_taken(zenoh.Session.delete, options)
         check(options)
         self.publish(DELETE, key_expr, NOTHING, **options)
 

@@ -79,6 +79,15 @@ class Folder:
         self.path = Path.cwd()
 
 
+def context_of_thread() -> Context:
+    """Return the context in which Python starts a thread: an empty one, but for vnet's own variables."""
+    started = Context()
+    for variable, value in copy_context().items():
+        if variable.name.startswith("vnet_"):
+            started.run(variable.set, value)
+    return started
+
+
 class Strand(greenlet):
     """A thread."""
 
@@ -457,7 +466,8 @@ class Threads:
         self._begin(function, self.main)
 
     def _begin(self, function: Callable[[], Any], like: Strand | None = None) -> Strand:
-        number, context = (self.new_number(), None) if like is None else (like.number, like.gr_context)
+        context = context_of_thread() if like is None else like.gr_context
+        number = self.new_number() if like is None else like.number
         strand = Strand(partial(self._run, function), number, self.folder, context)
         self._alive += 1
         running: Any = run_strand(strand)

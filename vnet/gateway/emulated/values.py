@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextvars import copy_context
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from datetime import timedelta
-from functools import lru_cache
+from functools import cache, lru_cache
+from inspect import signature
 from math import inf, isfinite
 from operator import index
 from pathlib import Path
@@ -26,6 +26,7 @@ from vnet.gateway.emulated.strands import (
     Strand,
     Threads,
     Waiting,
+    context_of_thread,
     current_strand,
     fail,
     go_on,
@@ -251,6 +252,18 @@ KINDS: dict[str, type | UnionType | Callable[[Any], object]] = {
     "timestamp_instrumentation": _no_instrumentation,
 }
 """Type of each option, or check of one that is a number."""
+
+
+@cache
+def _parameters(function: Callable[..., Any]) -> Set[str]:
+    return signature(function).parameters.keys()
+
+
+def check_taken(function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+    """Raise TypeError for an option that a function of Zenoh does not take."""
+    for name in options:
+        if name not in _parameters(function):
+            raise TypeError(f"{function.__qualname__}() got an unexpected keyword argument '{name}'")
 
 
 def check(options: Mapping[str, Any], **kinds: Any) -> None:
@@ -496,7 +509,7 @@ class CallbackSink(_Queue):
         self._callback, self._drop, self.is_direct = callback.callback, callback.drop, not callback.indirect
         self._outlet = outlet
         self._number = outlet.threads.new_number()
-        self._context = copy_context()
+        self._context = context_of_thread()
         self._strand: Strand | None = None
         self.is_running = False
         self._waiting = Waiting()
