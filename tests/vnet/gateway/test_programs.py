@@ -629,6 +629,39 @@ def test_a_program_goes_on_while_callbacks_are_declared(drive: Drive, declared: 
     assert events(run, "exception") == events(run, "crashed") == []
 
 
+def test_what_a_program_leaves_ends_with_it(drive: Drive) -> None:
+    """The vehicle's other program goes on: daemons stop where they are, no `finally` runs, sessions are closed."""
+    first = """
+        import threading, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        token = session.liveliness().declare_token("token")
+        direct = zenoh.handlers.Callback(print, lambda: print("dropped"), indirect=False)
+        subscriber = session.declare_subscriber("a", direct)
+
+        def work():
+            try:
+                while True:
+                    time.sleep(0.3)
+                    print("working")
+            finally:
+                print("finally")
+
+        threading.Thread(target=work, daemon=True).start()
+        time.sleep(0.5)
+        """
+    second = """
+        import time, zenoh
+        session = zenoh.open(zenoh.Config())
+        told = session.liveliness().declare_subscriber("token", history=True)
+        time.sleep(0.4)
+        print(told.recv().kind)
+        print(told.recv().kind, time.monotonic())
+        time.sleep(1.0)
+        session.put("a", b"nobody")
+        """
+    assert printed(drive(first, second)) == ["working", "SampleKind.PUT", "SampleKind.DELETE 0.5"]
+
+
 def test_threads_see_the_end_of_the_main_one_before_its_callbacks_end(drive: Drive) -> None:
     run = drive(
         """
@@ -639,13 +672,13 @@ def test_threads_see_the_end_of_the_main_one_before_its_callbacks_end(drive: Dri
         def close_at_the_end():
             while threading.main_thread().is_alive():
                 time.sleep(0.1)
+            print("closes")
             session.close()
-            print("closed")
 
         threading.Thread(target=close_at_the_end, daemon=True).start()
         """
     )
-    assert log(run) == ["closed", "v01 finished"]
+    assert log(run) == ["closes", "v01 finished"]
 
 
 @pytest.mark.parametrize("broken", ["import nothing_there", "class : pass"])

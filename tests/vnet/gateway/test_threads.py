@@ -745,3 +745,25 @@ def test_each_thread_has_the_context_that_python_gives_it(drive: Drive) -> None:
     threads = [("callback", 3), ("job", 7), *((f"thread {digits}", digits) for digits in (4, 5)), ("timer", 6)]
     seen = [f"{who} nothing 28 {who} {digits}" for who, digits in threads]
     assert sorted(printed(run)) == sorted([*seen, "main main 10", "loop nothing"])
+
+
+def test_a_thread_that_any_exception_ends_is_told(drive: Drive) -> None:
+    """`asyncio.run` in a thread raises CancelledError, which is no Exception."""
+    run = drive(
+        """
+        import asyncio, threading, zenoh
+
+        async def awaits():
+            task = asyncio.create_task(asyncio.sleep(1))
+            task.cancel()
+            await task
+
+        session = zenoh.open(zenoh.Config())
+        thread = threading.Thread(target=asyncio.run, args=(awaits(),))
+        thread.start()
+        thread.join()
+        session.close()
+        """
+    )
+    (told,) = events(run, "exception")
+    assert told["error"].startswith("CancelledError")

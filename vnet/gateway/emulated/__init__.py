@@ -76,8 +76,10 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
         if timestamp_callback is not None:
             raise zenoh.ZError("timestamp_callback is not available on virtual time")
         go_no_further_if_ended()
+        session = sessions.Session(vehicle, new_outlet(), config)
         program.has_session = True
-        return sessions.Session(vehicle, new_outlet(), config).of_program()
+        program.sessions = [*(each for each in program.sessions if not each.is_closed()), session]
+        return session.of_program()
 
     def scout(handler: Any = None, what: Any = None, config: zenoh.Config | None = None) -> sessions.Scout:
         return sessions.Scout(vehicle, new_outlet(), handler, what)
@@ -166,6 +168,10 @@ async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
             ended = ProgramError(f"{' '.join(words)} ended with {leave.code!r}")
             raise ended.with_traceback(leave.__traceback__) from leave
     finally:
+        if not isinstance(sys.exception(), asyncio.CancelledError):
+            modules.threads.stop_where_they_are()
+            for session in modules.sessions:
+                session.discard()
         if not modules.has_session and not isinstance(sys.exception(), Exception):
             vehicle.node.log(f"{' '.join(words)} has opened no Zenoh session", "warning")
         modules.close()

@@ -160,6 +160,8 @@ class ProgramModules:
         self.threads.on_interrupt = partial(self.process.send, signal.SIGINT)
         self.at_exit: list[Callable[[], object]] = []
         self.has_session = False
+        self.sessions: list[Any] = []
+        """The sessions that it has opened and not closed."""
         """True once the program has opened a session of Zenoh's."""
         self.path: list[str] = []
         self.argv: list[str] = []

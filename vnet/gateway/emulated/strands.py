@@ -427,6 +427,8 @@ class Threads:
         self._alive = 0
         self.folder = Folder(Path.cwd())
         self._handles: list[ThreadHandle] = []
+        self._running: dict[asyncio.Task[Any], Strand] = {}
+        self.have_stopped = False
         self.callbacks: set[object] = set()
         """Callbacks of Zenoh that may be called again, each in a thread that is no daemon."""
         self.callbacks_end = Waiting()
@@ -474,17 +476,26 @@ class Threads:
         inner = getattr(function, "func", function)
         named = getattr(getattr(inner, "__self__", None), "name", None)
         running.__qualname__ = str(named or getattr(inner, "__qualname__", "a thread"))  # as orders name its timers
-        Task(running, loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
+        task = Task(running, loop=asyncio.get_running_loop(), name=f"thread {strand.number}")
+        self._running[task] = strand
+        task.add_done_callback(self._running.pop)
         return strand
+
+    def stop_where_they_are(self) -> None:
+        """Have no thread run any more, its `finally` blocks neither, as daemons at the end of a process."""
+        self.have_stopped = True
+        for task, strand in self._running.items():
+            strand.is_gone = True
+            task.cancel()
 
     def _run(self, function: Callable[[], Any]) -> None:
         strand = current_strand()
         assert strand is not None
         try:
             function()
-        except SystemExit:
+        except (SystemExit, GreenletExit):
             pass
-        except Exception as error:
+        except BaseException as error:
             fail(error)
         finally:
             self._alive -= 1
@@ -545,10 +556,10 @@ def number_of_thread() -> int:
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:
     """Stand for `threading.excepthook`; a strand that is ended leaves no message."""
-    if isinstance(failed.exc_value, Exception):
+    if failed.exc_value is not None and not isinstance(failed.exc_value, GreenletExit):
         fail(failed.exc_value)
 
 
-def fail(error: Exception, place: str = "in a thread") -> None:
+def fail(error: BaseException, place: str = "in a thread") -> None:
     """Have the run tell of an exception that has ended a thread or a callback; the vehicle's log has its lines."""
     tell_failed_thread(present_node(), error, place)

@@ -555,6 +555,8 @@ class CallbackSink(_Queue):
 
     def run(self) -> None:
         """Call the callback until it blocks; then a task goes on with it."""
+        if self._outlet.threads.have_stopped:
+            return
         strand = self._strand
         if strand is None:
             strand = self._strand = Strand(
