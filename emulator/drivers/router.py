@@ -6,6 +6,7 @@ It is Zenoh's own router, run from Python with the configuration that `vnet acce
 from __future__ import annotations
 
 import contextlib
+import shutil
 import signal
 import socket
 import sys
@@ -48,12 +49,14 @@ class SeparateRouter:
 
 def main(config: str) -> None:
     """Be the router until SIGTERM, or until the emulator is gone."""
-    told = {signal.SIGTERM, signal.SIGINT}
+    told = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
     signal.pthread_sigmask(signal.SIG_BLOCK, told)  # a handler could interrupt itself: a parent's end tells often
-    signal_at_parent_death(signal.SIGTERM)
+    signal_at_parent_death(signal.SIGHUP)
     with zenoh.open(zenoh.Config.from_file(config)):
-        signal.sigwait(told)
+        how = signal.sigwait(told)
         end_within()
+    if how == signal.SIGHUP:  # nobody else is left to remove the passwords
+        shutil.rmtree(Path(config).parent, ignore_errors=True)
 
 
 if __name__ == "__main__":

@@ -169,8 +169,12 @@ def test_a_killed_lockstep_run_leaves_no_process_and_no_router(tmp_path: Path) -
     folder = tmp_path / "run"
     with started(scenario, folder, "--router", "separate", after="fault_ended") as process:
         wait_until(lambda: len(processes_of(folder)) == 4, process)  # three agents and the router
+        (router,) = [pid for pid in processes_of(folder) if log_of(pid).endswith("/router.log")]
+        config = Path(Path(f"/proc/{router}/cmdline").read_text().split("\0")[-2])
+        assert config.exists()
         process.kill()
         wait_until_all_are_gone(folder)
+    assert not config.parent.exists(), "nor the run's passwords"
 
 
 @pytest.mark.parametrize("pacing", ["lockstep", "realtime"])

@@ -537,8 +537,8 @@ class VirtualTimeLoop(SkewedLoop):
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise VirtualTimeError(
-            "sockets, pipes and subprocesses are not available to programs in lockstep; use node.radio, or "
-            "run the scenario with run.pacing = realtime"
+            "sockets, pipes and subprocesses of a loop are not available to programs in lockstep: vehicles talk by "
+            "radio, or the scenario runs with run.pacing = realtime"
         )
 
     def add_signal_handler(self, sig: int, callback: Callable[..., object], *args: Any) -> None:  # type: ignore[override]
