@@ -160,9 +160,9 @@ class ProgramModules:
         self.threads.on_interrupt = partial(self.process.send, signal.SIGINT)
         self.at_exit: list[Callable[[], object]] = []
         self.has_session = False
-        self.sessions: list[Any] = []
-        """The sessions that it has opened and not closed."""
         """True once the program has opened a session of Zenoh's."""
+        self.sessions: list[Any] = []
+        """Those that it has opened and not closed."""
         self.path: list[str] = []
         self.argv: list[str] = []
         own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)
