@@ -73,7 +73,10 @@ QPSK_05: dict[str, Any] = {
 
 
 def mode4_radio(setting: Setting) -> Radio:
-    """Return the radio of a setting of mode 4: noise figure 9 dB, shadowing of 3 dB, no in-band emission."""
+    """Return the radio of a setting of mode 4: noise figure 9 dB, shadowing of 3 dB, no in-band emission.
+
+    As in the published model, the shadowing of each link is independent.
+    """
     return Radio.model_validate(
         {
             "max_peers": 1_000_000,
@@ -84,7 +87,7 @@ def mode4_radio(setting: Setting) -> Radio:
                 "tx_power_dbm": setting.power_dbm,
                 "floor_dbm": -115.0,
             },
-            "shadowing": {"sigma_db": 3.0},
+            "shadowing": {"sigma_db": 3.0, "decorrelation_m": 0.5},
             "receiver": {"noise_figure_db": 9.0},
             "mac": {
                 "kind": "lte-mode4",
