@@ -37,6 +37,9 @@ from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError, VnetError
 from vnet.units import NS_PER_S
 
+CRASHES = "agents_alive", "no_exceptions"
+"""Checks that fail a test which has not asked how its run ended."""
+
 
 class RunHarness:
     """See the module's text. An async context manager: the run starts when it is entered and ends when it is left.
@@ -63,6 +66,7 @@ class RunHarness:
         self._promises: dict[str, Callable[[Run], Result]] = {}
         self._named: set[str] = set()
         """Names of the checks that the test has asked for: their failures have been told."""
+        self._ended_by_test = False
 
     # What there is to see.
 
@@ -123,9 +127,13 @@ class RunHarness:
         if kind is not None:
             await asyncio.to_thread(self.close)
             return
-        judgement = await asyncio.to_thread(self.end)
+        judgement = await asyncio.to_thread(self._judge)
         promised = {PREFIX + name for name in self._promises} - self._named
         broken = [each for each in judgement.checks if each.name in promised and _fails(each, allow_unknown=False)]
+        if not self._ended_by_test:
+            broken += [
+                each for each in judgement.checks if each.name in CRASHES and _fails(each, allow_unknown=True)
+            ]
         if broken:
             raise AssertionError(self._complaint(broken))
 
@@ -287,7 +295,14 @@ class RunHarness:
     # Its end.
 
     def end(self) -> Judgement:
-        """End the run where it stands, or once all planned faults have healed, and judge it. Again: the same."""
+        """End the run where it stands, or once all planned faults have healed, and judge it. Again: the same.
+
+        A crash, which fails a test otherwise, is then for the test to judge.
+        """
+        self._ended_by_test = True
+        return self._judge()
+
+    def _judge(self) -> Judgement:
         if self._judgement is None:
             self._finish()
             self._judgement, verdict = self._run.close()
@@ -300,7 +315,7 @@ class RunHarness:
         """End the run, if it is on, whatever state it is in, and keep what can be kept of it."""
         broken = self._run.stands.done() and self._run.stands.exception() is not None
         if self._run.started and not broken:
-            self.end()
+            self._judge()
 
     def _finish(self) -> None:
         if not self._run.started:
@@ -323,7 +338,7 @@ class RunHarness:
         measure it. Raises VnetError for a name that no check has, or if nothing measured the recovery.
         """
         __tracebackhide__ = True
-        judgement = self.end()
+        judgement = self._judge()
         left_out = {skipped.name: skipped.reason for skipped in judgement.not_exercised}
         known = {check.name: check for check in judgement.checks}
         names = tuple(PREFIX + name if PREFIX + name in {*known, *left_out} else name for name in names)

@@ -180,6 +180,27 @@ async def test_stops(vnet_emulation):
     assert verdict_of(folder)["emulated_s"] == 0.5
 
 
+def test_a_crash_fails_a_test_that_has_not_judged_it(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+CRASHED = dict(program="tests.emulator.testing.programs:impatient", vehicles=2, duration=3, settle=1)
+
+@pytest.mark.parametrize("judge", [None, lambda emu: emu.check("conservation"), lambda emu: emu.end()])
+async def test_crash(vnet_emulation, judge):
+    async with vnet_emulation(BEACON, **CRASHED) as emu:
+        await emu.run_for(1.0)
+        with emu.fault("pause", nodes=["v01"]):
+            await emu.run_for(0.5)
+        await emu.run_for(0.5)
+        if judge:
+            judge(emu)
+""",
+    )
+    result.assert_outcomes(passed=1, failed=2)
+    result.stdout.fnmatch_lines(["*agents_alive is invalid: v01 crashed*"])
+
+
 def test_plain_tests_may_use_the_fixture_and_leave_others_alone(pytester: pytest.Pytester) -> None:
     result = run_tests(
         pytester,
