@@ -546,7 +546,7 @@ def _later(count: int) -> CheckResult:
 def _(fault: ProcessFault, recorded: RecordedRun, planned: PlannedFault) -> Finding:
     count = _silenced(recorded, planned)
     text = "node neither sent nor received|nodes neither sent nor received"
-    return _found(count, text, "no node had sent or reported before and then not")
+    return _found(count, text, "no node had sent or reported before, and then not for two periods")
 
 
 @effect.register

@@ -32,7 +32,7 @@ from emulator.records.distributions import binomial_interval
 from emulator.records.events import EventKind
 from emulator.records.metrics import anees_band
 from emulator.records.period_figures import DeclaredChart
-from emulator.records.radio_metrics import BIN_M
+from emulator.records.radio_metrics import BIN_M, rows_of_pairs
 from emulator.records.tables import DRIVEN, of_vehicles
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, faults_note, time_figure
 from emulator.report.map_figures import map_charts
@@ -41,7 +41,7 @@ from emulator.report.radio_figures import ages, busy, latency, outcomes, totals
 from emulator.report.source import NothingToShow, Source, maybe
 from emulator.world.world import components
 from vnet.errors import VnetError, printable
-from vnet.types import Array
+from vnet.types import Array, IntArray
 from vnet.units import title_of
 
 MOST_LINKS = 800
@@ -59,7 +59,7 @@ _NAMED_VALUES = pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()
 def links(source: Source) -> Drawing:
     """Draw the packet delivery ratio of the links against their length: that of broadcasts."""
     count = len(source.node_ids)
-    cast = np.flatnonzero(source.attempt == 0)
+    cast = rows_of_pairs(source)
     if not len(cast):
         raise NothingToShow("no broadcast was sent to anybody in range")
     sender, receiver = source.sender[cast], source.receiver[cast]
@@ -82,12 +82,12 @@ def links(source: Source) -> Drawing:
         _draw_bins(made, distance_km, share)
     each = f"each of {len(used):,} links" if len(used) > 1 else "the one link"
     text = f"Packet delivery ratio of {each}, from one vehicle to another."
-    if len(cast) < len(source.trace):
+    if (source.attempt > 0).any():
         text += " Frames to one vehicle are not counted."
     lowest = float(share.min())
     if not physical:
         low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
-        lowest, text = min(lowest, low), text + band + _why_less(source)
+        lowest, text = min(lowest, low), text + band + _why_less(source, cast)
     farthest_km = float(distance_km.max())
     if binned:
         least, last_km = _draw_frames(made, source.radio.distances)
@@ -137,11 +137,10 @@ def _draw_frames(made: Canvas, bins: pa.Table) -> tuple[float, float]:
     return float(share.min(initial=100)), float(middle_km.max(initial=0))
 
 
-def _why_less(source: Source) -> str:
-    """The outcomes besides `lost` that lower a link's delivery ratio."""
+def _why_less(source: Source, cast: IntArray) -> str:
+    """The outcomes besides `lost` that lower a link's delivery ratio, of some rows of the trace."""
     others = (outcome.name for outcome in DRAWN if outcome not in (Outcome.delivered, Outcome.lost))
-    cast = source.attempt == 0
-    names = [name for name in others if (source.outcome_is(name) & cast).any()]
+    names = [name for name in others if source.outcome_is(name)[cast].any()]
     return f" Links below it had outcomes {', '.join(names)} as well." if names else ""
 
 

@@ -167,7 +167,8 @@ def _draw_roads(
     chosen = np.flatnonzero(near)
     if len(chosen) > MOST_ROADS:
         chosen = np.sort(chosen[np.argsort(-length_m[chosen], kind="stable")[:MOST_ROADS]])
-    _draw_lines(made, np.stack([start, end], axis=1)[chosen] * scale, GREY, 0.55, 0.8)
+    opacity = 0.55 if not endless.all() else float(np.clip(30 / max(len(chosen), 1), 0.25, 0.55))
+    _draw_lines(made, np.stack([start, end], axis=1)[chosen] * scale, GREY, opacity, 0.8)
 
 
 def _draw_buildings(made: Canvas, buildings: Buildings, scale: float) -> None:
@@ -243,7 +244,7 @@ def _draw_links(made: Canvas, source: Source, scale: float) -> str:
     shown = pair[:: max(1, -(-len(pair) // MOST_LINKS))]
     position_m = source.places.position_m(0)
     ends = np.stack([position_m[shown // count], position_m[shown % count]], axis=1)
-    _draw_lines(made, ends * scale, SKY, float(np.clip(30 / max(len(shown), 1), 0.12, 0.8)), 1.0)
+    _draw_lines(made, ends * scale, SKY, float(np.clip(30 / max(len(shown), 1), 0.35, 0.8)), 1.0)
     part = f"{len(shown):,} of the " if len(shown) < len(pair) else "the "
     return f"{part}{counted(len(pair), 'link')} that delivered frames"
 
