@@ -480,8 +480,7 @@ async def run_in_lockstep(
         await before_horizon(lockstep)
         grants = lockstep.start()
         while grants:
-            for actions in lockstep.take_actions():
-                await processes.act(actions)
+            await _act(lockstep, processes)
             for process_id, grant in grants.items():
                 processes.send(process_id, grant, lockstep.take_mail(process_id))
             await _all_yielded(lockstep, processes)
@@ -489,10 +488,17 @@ async def run_in_lockstep(
             while lockstep.held:
                 await before_horizon(lockstep)
                 grants = lockstep.step()
+        await _act(lockstep, processes)  # faults after which nobody has had anything to do
         for process_id, details in processes.ended().items():
             lockstep.died(process_id, **details)
     finally:
         lockstep.tell_deaths()
+
+
+async def _act(lockstep: Lockstep, processes: Processes) -> None:
+    """Do to the processes what faults and trips have done since the last grants."""
+    for actions in lockstep.take_actions():
+        await processes.act(actions)
 
 
 async def _all_yielded(lockstep: Lockstep, processes: Processes) -> None:

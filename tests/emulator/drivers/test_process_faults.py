@@ -63,6 +63,14 @@ async def waits_at_its_end(node: Node) -> None:
                 file.write("ends")
 
 
+async def tells_its_end(node: Node) -> None:
+    """Waits for nothing, and says how it ends."""
+    try:
+        await asyncio.Event().wait()
+    finally:
+        node.event("ends")
+
+
 async def clings_to_life(node: Node) -> None:
     """Ends only when nobody can hear it any more: catches what is to end it, and goes on."""
     while True:
@@ -207,6 +215,13 @@ def test_who_is_restarted_waits_for_nothing_more_and_keeps_what_it_has_written(r
     assert diary == {}, "no time passes in processes that end"
     written = {file.name: file.read_text() for file in emulation.folder.disks.glob("v02/log*")}
     assert written == dict.fromkeys(["log0", "log1"], "begins to end, ends")
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+@pytest.mark.parametrize("kind", ["kill", "restart"])
+def test_a_fault_after_which_nobody_has_anything_to_do_acts_all_the_same(run: Run, kind: str) -> None:
+    scenario = scenario_of([fault(kind, 2.5, 9, "v01")], f"{HERE}:tells_its_end", run={"settle_s": 0.0})
+    assert [event.node for event in run(scenario).folder.events if event.kind == "event"] == ["v02", "v03", "v04"]
 
 
 @pytest.mark.parametrize("kind", ["kill", "restart"])
