@@ -71,7 +71,11 @@ Zenoh's, so it may come a little later than the batch that refers to it."""
 
 
 class RunOverError(Exception):
-    """The emulator has said that the run is over."""
+    """The emulator has said that the run is over: in lockstep at `time_ns`, if it has said when."""
+
+    def __init__(self, reason: str, time_ns: int | None) -> None:
+        super().__init__(reason)
+        self.time_ns = time_ns
 
 
 class Lost:
@@ -270,7 +274,7 @@ class Attachment:
         if isinstance(message, wire.End) and message.nonce in (None, self.nonce):
             if message.refused:
                 raise TransportError(f"refused: {message.reason}")
-            raise RunOverError(message.reason)
+            raise RunOverError(message.reason, message.time_ns)
         return message
 
     def write_total(self) -> None:
@@ -463,10 +467,10 @@ def _run_lockstep(
         loop.start_at(next_grant())
         host.start(loop, programs)
         host.run(loop)
-    except RunOverError:
+    except RunOverError as over:
         ahead.close()
         attachment.say_so_far(host.unhandled_so_far())
-        host.close(loop)
+        host.close(loop, over.time_ns)
         attachment.say(wire.Final(attachment.nonce, host.take_final()))
     finally:
         loop.close()

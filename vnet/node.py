@@ -245,9 +245,9 @@ class Node:
         action = checked_action(self.id, self.control_ns > 0, acceleration_m_s2, lane, release)
         self._transport.send_action(action)
 
-    def disconnect(self) -> None:
-        """Disconnect the rest of the program from the world, after the vehicle's process has ended."""
-        self._transport = self.radio._transport = disconnected = _Disconnected(self.now_ns)
+    def disconnect(self, now_ns: int) -> None:
+        """Disconnect the rest of the program from the world: the vehicle's process has ended, at `now_ns`."""
+        self._transport = self.radio._transport = disconnected = _Disconnected(now_ns)
         if self.backbone is not None:
             self.backbone._transport = disconnected
 

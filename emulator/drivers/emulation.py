@@ -481,7 +481,8 @@ class Emulation:
         self._lane_map, self._boot_id = world.lane_map.to_wire(), wire.boot_id()
         self._watchers: list[Callable[[PeriodView], None]] = []
         self._period = 0
-        self._finished = False
+        self.ended_ns: int | None = None
+        """When the run was over, as soon as it is."""
         self._reports: list[Report] = []
         self._arrived: list[Deliveries] = []
         self.costs = Costs()
@@ -566,7 +567,7 @@ class Emulation:
 
         What comes after the end of the run, as processes still speak when it is interrupted, is no part of it.
         """
-        if self._finished:
+        if self.ended_ns is not None:
             return
         self.drive_to(time_ns)
         frames: dict[str, list[SentFrame]] = {}
@@ -796,8 +797,8 @@ class Emulation:
 
     def finish(self, time_ns: int) -> None:
         """End of the run at `time_ns`: close the periods and decide what is still in flight. Only once."""
-        if not self._finished:
-            self._finished = True
+        if self.ended_ns is None:
+            self.ended_ns = time_ns
             self.drive_to(time_ns)
             self.close_periods(time_ns)
             self.folder.reach(time_ns)

@@ -69,7 +69,11 @@ NONCE = b""
 
 
 class NoMoreGrantsError(Exception):
-    """The barrier has granted nothing more."""
+    """The barrier has granted nothing more: the run is over, at `time_ns` if it was not cut short."""
+
+    def __init__(self, time_ns: int | None) -> None:
+        super().__init__()
+        self.time_ns = time_ns
 
 
 Call = tuple[str, tuple[Any, ...]]
@@ -199,7 +203,7 @@ class InLoop(LocalProcesses):
         try:
             self._course.send(None)
         except StopIteration:
-            raise NoMoreGrantsError from None
+            raise NoMoreGrantsError(self._emulation.ended_ns) from None
         return self._turn
 
     def run(self, course: Coroutine[Any, Any, None]) -> None:
@@ -281,15 +285,15 @@ class HostedPrograms:
             self._host.start(self.loop, self._programs)
             self.loop.start_at(self._take(self._swap(None)))
             self._host.run(self.loop, self.only_programs_raise)
-        except NoMoreGrantsError:
-            self._close()
+        except NoMoreGrantsError as end:
+            self._close(end.time_ns)
         except KeyboardInterrupt:
             self._host.forget_interrupt()
-            self._close()
+            self._close(None)
             raise
 
-    def _close(self) -> None:
-        self._host.close(self.loop)
+    def _close(self, time_ns: int | None) -> None:
+        self._host.close(self.loop, time_ns)
         self._final = self._host.take_final()
 
     def _exchange(self, next_timer_ns: int | None) -> int:
@@ -301,9 +305,9 @@ class HostedPrograms:
     def _take(self, turn: Turn) -> int:
         calls, grant, mail = turn
         self._seq = grant.seq
-        self._host.apply_clock_error(grant.clocks, self.loop)
         for name, arguments in calls:
             getattr(self._host, name)(*arguments)
+        self._host.apply_clock_error(grant.clocks, self.loop)  # of no concern to programs that have ended before
         return self._host.open_window(grant, mail)
 
 
@@ -488,14 +492,20 @@ class ForkedPrograms:
         self._answer = select.poll()  # as `Connection.poll`, which makes one at each call
         self._answer.register(self._connection.fileno(), select.POLLIN)
 
-    def give(self, calls: Sequence[Call], grant: wire.Grant | None) -> None:
-        """Give it a window, with what is to be called before; without one the run is over.
+    def give(self, calls: Sequence[Call], grant: wire.Grant) -> None:
+        """Give it a window, with what is to be called before.
 
         A grant may have thousands of packets: it is encoded sooner than pickled. Encoded it only refers to messages
         of the backbone.
         """
+        self._tell((calls, wire.encode(replace(grant, messages=())), grant.messages))
+
+    def end(self, time_ns: int | None) -> None:
+        """Have its programs end: the run is over, at this time if it was not cut short."""
+        self._tell(time_ns)
+
+    def _tell(self, told: Any) -> None:
         self.owes = True
-        told = None if grant is None else (calls, wire.encode(replace(grant, messages=())), grant.messages)
         with suppress(OSError):  # it has ended, which `take` tells, or the error that it has raised before
             self._connection.send_bytes(pickle.dumps(told))
 
@@ -633,7 +643,7 @@ class Pipes(LocalProcesses):
         """End all processes but those that are in the midst of a window, and take what they have left to say."""
         asked = [process_id for process_id, process in self._processes.items() if not process.owes]
         for process_id in asked:
-            self._processes[process_id].give((), None)
+            self._processes[process_id].end(self._emulation.ended_ns)
         for process_id in asked:
             try:
                 self.endings.append(self._processes[process_id].take())
@@ -686,8 +696,8 @@ def _run(connection: Connection, welcomes: Sequence[wire.Welcome], programs: Pro
         if message is not None:
             say(message)
         told: Any = pickle.loads(connection.recv_bytes())
-        if told is None:
-            raise NoMoreGrantsError
+        if told is None or isinstance(told, int):
+            raise NoMoreGrantsError(told)
         calls, encoded, messages = told
         grant = wire.decode_rx(encoded)
         assert isinstance(grant, wire.Grant)

@@ -44,7 +44,7 @@ class Killed(BaseException):
 
 
 class Over(Exception):
-    """The emulator has said that the run is over."""
+    """The emulator has said that the run is over, at this time."""
 
 
 def scenario_of(faults: Sequence[dict[str, Any]], program: str, /, vehicles: int = 4, **sections: Any) -> Scenario:
@@ -94,7 +94,8 @@ def run_apart(scenario: Scenario) -> Emulation:
     try:
         asyncio.run(run_in_lockstep(lockstep, apart))
     finally:
-        finals = [traffic for process in apart.processes.values() for traffic in process.end(killed=False)]
+        over = Over(emulation.ended_ns)
+        finals = [traffic for process in apart.processes.values() for traffic in process.end(over)]
         emulation.take_final(emulation.duration_ns, finals)
     return emulation
 
@@ -119,7 +120,8 @@ class _Apart(Processes):
         for process_id, nodes in self._groups.items():
             killed = [actions.stop[node] for node in nodes if node in actions.stop]
             if killed:
-                traffic = self.processes.pop(process_id).end(killed=any(killed))
+                how = Killed() if any(killed) else Over(actions.time_ns)
+                traffic = self.processes.pop(process_id).end(how)
                 self._emulation.take_final(actions.time_ns, traffic, by_fault=True)
             if any(node in actions.start for node in nodes):
                 self.processes[process_id] = _Process(self._emulation, nodes)
@@ -138,7 +140,7 @@ class _Process:
     """One process of nodes, as a thread; see agents/host.py."""
 
     def __init__(self, emulation: Emulation, nodes: Sequence[str]) -> None:
-        self.grants: queue.SimpleQueue[list[bytes] | type[BaseException]] = queue.SimpleQueue()
+        self.grants: queue.SimpleQueue[list[bytes] | Killed | Over] = queue.SimpleQueue()
         self.yields: queue.SimpleQueue[list[bytes] | BaseException] = queue.SimpleQueue()
         encoded = [wire.encode(emulation.welcome(node, b"n")) for node in nodes]
         decoded = [wire.decode_rx(welcome) for welcome in encoded]
@@ -168,9 +170,9 @@ class _Process:
         self._arrived = [unit for unit, _ in contents]
         self.grants.put([wire.encode(split), *(wire.encode(content) for _, content in contents)])
 
-    def end(self, killed: bool) -> list[wire.Traffic]:
+    def end(self, how: Killed | Over) -> list[wire.Traffic]:
         """End it from the emulator's side, and wait until it has; returns what it said last, if it could."""
-        self.grants.put(Killed if killed else Over)
+        self.grants.put(how)
         self._thread.join(60)
         assert not self._thread.is_alive()
         return [] if self._final is None else [self._final]
@@ -185,7 +187,7 @@ class _Process:
 
     def _next_grant(self) -> int:
         item = self.grants.get()
-        if isinstance(item, type):
+        if isinstance(item, BaseException):
             raise item
         grant = wire.decode_rx(item[0])
         assert isinstance(grant, wire.Grant)
@@ -215,9 +217,9 @@ class _Process:
             loop.start_at(self._next_grant())
             self._host.start(loop, load_programs(self._welcomes))
             self._host.run(loop)
-        except Over:
+        except Over as over:
             self._ahead.close()
-            self._host.close(loop)
+            self._host.close(loop, *over.args)
             final = wire.decode_tx(wire.encode(wire.Final(b"n", self._host.take_final())))
             assert isinstance(final, wire.Final)
             self._final = final.traffic

@@ -286,7 +286,7 @@ class Host:
         gone = self.nodes[node]
         goes_on = self._runs(gone)
         self._refill(gone)
-        gone.disconnect()
+        gone.disconnect(self._clocks.shown_ns(node, time_ns))
         self._active[node] = False
         self._late = [entry for entry in self._late if entry[0] != node]
         self._window.drop(node)
@@ -561,14 +561,17 @@ class Host:
             if task.done() and not task.cancelled():
                 task.exception()
 
-    def close(self, loop: VirtualTimeLoop) -> None:
+    def close(self, loop: VirtualTimeLoop, time_ns: int | None = None) -> None:
         """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep).
 
+        They run at `time_ns`, the end, whenever their process last had anything to do; at that time if it is None.
         `take_traffic` then returns the exceptions that nobody has handled, and programs in a deadlock.
         """
         self._closing = True
         if self._mains:  # else the run has ended before the first grant
             self._tell_deadlocks([node for node in self.nodes.values() if self._runs(node)])
+        if time_ns is not None:
+            loop.end_at(time_ns)
         tasks = self._cancel_all()
         with contextlib.suppress(LoopAbandonedError, SpinError):
             while True:

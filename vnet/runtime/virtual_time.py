@@ -445,6 +445,12 @@ class VirtualTimeLoop(SkewedLoop):
             if generation not in self._collections_ns:
                 self._collections_ns[generation] = (self._now_ns // period_ns + 1) * period_ns
 
+    def end_at(self, time_ns: int) -> None:
+        """Let it be this time, before which all has happened; timers that are due at it or later never are."""
+        for timer in asyncio_internals.timers(self):
+            timer.cancel()
+        self._now_ns = max(self._now_ns, time_ns)
+
     def finish(self, main: Coroutine[Any, Any, None]) -> None:
         """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
         self.is_ending = True

@@ -495,11 +495,12 @@ class Await(Message, frozen=True):
 
 
 class End(Message, frozen=True):
-    """End of the run, or refusal of this node."""
+    """End of the run, or refusal of this node. In lockstep it may say when: programs end at that time."""
 
     nonce: bytes | None
     reason: str
     refused: bool = False
+    time_ns: int | None = None
 
 
 AgentMessage = Hello | Yield | Frames | Final | StackDump

@@ -542,7 +542,8 @@ class LiveProcesses(Processes):
         process_of = self.members.process_of
         for process_id, killed in {process_of(node): killed for node, killed in actions.stop.items()}.items():
             reason = "it has left" if self._emulation.presence.is_outside(process_id) else "restarted by a fault"
-            await self.supervisor.end(process_id, killed, "killed by a fault" if killed else reason)
+            reason = "killed by a fault" if killed else reason
+            await self.supervisor.end(process_id, killed, reason, actions.time_ns)
             if not killed and not self._realtime:
                 await self._await_final(process_id, actions.time_ns)
         begun = list(dict.fromkeys(map(process_of, actions.start)))
@@ -654,7 +655,7 @@ class LiveProcesses(Processes):
         """Tell all that the run is over."""
         self.supervisor.pause(())
         for node in self.members.joined:
-            self.say(node, wire.End(None, "the run is over"))
+            self.say(node, wire.End(None, "the run is over", time_ns=self._emulation.ended_ns))
         self.supervisor.all_told_to_end()
 
     async def last_traffic(self, deadline_s: float) -> list[wire.Traffic]:

@@ -186,8 +186,11 @@ class Supervisor:
         if self._realtime:
             self._agents.signal(process_id, signal.SIGCONT)
 
-    async def end(self, process_id: str, killed: bool, reason: str) -> None:
-        """End a process. Those started by hand are told to go, and whoever started them may start them again."""
+    async def end(self, process_id: str, killed: bool, reason: str, time_ns: int | None = None) -> None:
+        """End a process, and one that is not killed at this time.
+
+        Those started by hand are told to go, and whoever started them may start them again.
+        """
         if killed and self._options.launch:
             self._change(process_id, ProcessState.AWAY)
             self._agents.kill(process_id)
@@ -195,7 +198,7 @@ class Supervisor:
         if self.state(process_id) is ProcessState.PAUSED:
             self._resume(process_id)  # or it could not go
         self._change(process_id, ProcessState.AWAY)
-        self._say(process_id, wire.End(None, reason))
+        self._say(process_id, wire.End(None, reason, time_ns=time_ns))
         if self._options.launch:
             ending = asyncio.create_task(asyncio.to_thread(self._agents.detach(process_id), SHUT_DOWN_S))
             if self._realtime:

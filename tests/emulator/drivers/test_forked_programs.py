@@ -177,7 +177,7 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
     process = ForkedPrograms(welcomes, {}, emulation.folder, [], lambda: None, 30.0)
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     try:
-        process.give((), None)
+        process.end(None)
         with pytest.raises(VnetError, match="no room for programs"):
             process.take()
     finally:

@@ -63,6 +63,17 @@ async def waits_at_its_end(node: Node) -> None:
                 file.write("ends")
 
 
+async def writes_when_it_ends(node: Node) -> None:
+    """Has nothing more to do after a time of its own, but for a timer at the end; writes and says when it ends."""
+    asyncio.get_running_loop().call_at(3.0, note, node, "is past the end")
+    try:
+        await asyncio.sleep(0.1 * int(node.id[1:]))
+        await asyncio.Event().wait()
+    finally:
+        (node.folder / f"ended{node.incarnation}").write_text(str(node.now_ns / 1e9))
+        node.event("ends")
+
+
 async def tells_its_end(node: Node) -> None:
     """Waits for nothing, and says how it ends."""
     try:
@@ -215,6 +226,18 @@ def test_who_is_restarted_waits_for_nothing_more_and_keeps_what_it_has_written(r
     assert diary == {}, "no time passes in processes that end"
     written = {file.name: file.read_text() for file in emulation.folder.disks.glob("v02/log*")}
     assert written == dict.fromkeys(["log0", "log1"], "begins to end, ends")
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+def test_a_process_ends_at_the_instant_that_ends_it_whenever_it_last_had_anything_to_do(run: Run) -> None:
+    diary.clear()
+    emulation = run(scenario_of([fault("restart", 1.1, 0.6, "v02")], f"{HERE}:writes_when_it_ends"))
+    assert diary == {}, "what is due at the end is not done"
+    files = {node: sorted(emulation.folder.disks.glob(f"{node}/*")) for node in IDS}
+    written = {node: [float(file.read_text()) for file in some] for node, some in files.items()}
+    assert written == {"v01": [3.0], "v02": [1.1, 3.0], "v03": [3.0], "v04": [3.0]}
+    told = [(event.time_ns, event.node) for event in emulation.folder.events if event.kind == "event"]
+    assert told == [(3_000_000_000, node) for node in IDS]
 
 
 @pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
