@@ -344,7 +344,7 @@ def _ruled(recorded: RecordedRun) -> Mask:
     ruled = np.zeros(len(recorded.trace), dtype=bool)
     for planned in recorded.plan:
         if isinstance(planned.fault, Custom | CustomSender):
-            ruled |= recorded.reached(planned, recorded.guard_ns)
+            ruled |= recorded.may_reach(planned)
     return ruled
 
 
@@ -377,10 +377,10 @@ def _replaced(recorded: RecordedRun) -> Mask:
             remembered_ns[planned.nodes] = np.minimum(remembered_ns[planned.nodes], planned.start_ns)
     for planned in recorded.plan:
         if isinstance(planned.fault, CustomSender):
-            replaced |= recorded.reached(planned, recorded.guard_ns) & (recorded.copy == 0)
+            replaced |= recorded.may_reach(planned) & (recorded.copy == 0)
         if isinstance(planned.fault, StaleMessages):
             old_ns = recorded.sent_ns - round(planned.fault.age_s * NS_PER_S) + recorded.guard_ns
-            acts = recorded.reached(planned, recorded.guard_ns) & (recorded.copy == 0)
+            acts = recorded.may_reach(planned) & (recorded.copy == 0)
             replaced |= acts & (old_ns >= remembered_ns[recorded.sender])
     return replaced
 
@@ -573,15 +573,14 @@ def _bitrates(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, A
 def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array]:
     """Latency that faults add to each row in ns: at least, and at most."""
     least, most = np.zeros(len(recorded.trace)), np.zeros(len(recorded.trace))
-    guard_ns = recorded.guard_ns
     for planned in plan:
         match planned.fault:
             case DelayFault(bounds_ms=(least_ms, most_ms)):
                 if least_ms:
-                    least += np.where(recorded.reached(planned, -guard_ns), least_ms, 0)
-                most += np.where(recorded.reached(planned, guard_ns), most_ms, 0)
+                    least += np.where(recorded.surely_reaches(planned), least_ms, 0)
+                most += np.where(recorded.may_reach(planned), most_ms, 0)
             case Custom():
-                later = np.where(recorded.reached(planned, guard_ns), LONGEST_DELAY_S * NS_PER_S / NS_PER_MS, 0)
+                later = np.where(recorded.may_reach(planned), LONGEST_DELAY_S * NS_PER_S / NS_PER_MS, 0)
                 most += later * np.where(received_twice(recorded), 1 + MOST_COPIES, 1)
             case Duplicate(delay_ms=delay_ms, copies=copies):
                 mine = (recorded.cause == planned.number) & (recorded.copy > 0)

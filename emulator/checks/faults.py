@@ -114,7 +114,7 @@ def _sent_by_rule(recorded: RecordedRun) -> Mask:
     ruled = np.zeros(len(recorded.trace), dtype=bool)
     for planned in recorded.plan:
         if isinstance(planned.fault, CustomSender):
-            ruled |= recorded.reached(planned, recorded.guard_ns)
+            ruled |= recorded.may_reach(planned)
     return ruled
 
 
@@ -246,7 +246,7 @@ def check_causes(recorded: RecordedRun) -> Finding:
         explained = recorded.cause == NO_FAULT
         for planned in recorded.plan:
             mine = recorded.cause == planned.number
-            explained |= mine & recorded.reached(planned, recorded.guard_ns) & can_cause(planned.fault, recorded)
+            explained |= mine & recorded.may_reach(planned) & can_cause(planned.fault, recorded)
         broken = ~explained | (recorded.outcome_is("fault") & (recorded.cause == NO_FAULT))
         broken |= recorded.cause == UNHEARD_OF
     count, named = int(broken.sum()), int((recorded.cause != NO_FAULT).sum())
@@ -303,7 +303,7 @@ def check_partition_respected(recorded: RecordedRun) -> Finding:
         return not_exercised("no fault cuts links" if recorded.plan else NO_FAULTS)
     across = np.zeros(len(recorded.trace), dtype=bool)
     for planned in cuts:
-        across |= recorded.reached(planned, -recorded.guard_ns)
+        across |= recorded.surely_reaches(planned)
     if not across.any():
         return unknown("no frame was sent across a cut")
     passed = across & recorded.outcome_is(*ON_AIR)
@@ -440,7 +440,7 @@ def _loss_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
 
 def _drew_for(recorded: RecordedRun, planned: PlannedFault) -> Mask:
     """Receptions that came as far as a fault of chance: not cut, and not lost to an earlier one."""
-    reached = recorded.reached(planned, -recorded.guard_ns) & ~received_twice(recorded)
+    reached = recorded.surely_reaches(planned) & ~received_twice(recorded)
     later = [other.number for other in begun(recorded, _loses) if other.number >= planned.number]
     further = recorded.outcome_is(*ON_AIR) | (recorded.outcome_is("fault") & np.isin(recorded.cause, later))
     return np.asarray(reached & further)

@@ -574,6 +574,7 @@ class Emulation:
         endings: list[wire.Ending] = []
         unhandled: list[wire.Unhandled] = []
         notes: list[wire.Note] = []
+        actions: list[Action] = []
         for part in traffic:
             for frame in part.frames:
                 frames.setdefault(frame.node, []).append(frame)
@@ -584,8 +585,9 @@ class Emulation:
             self.orders.take(part.deviations)
             if part.messages:
                 self.backbone.send(time_ns, part.messages)
-            if part.actions:
-                self.driving.take(time_ns, (action for action in part.actions if self.up[action.node]))
+            actions.extend(action for action in part.actions if self.up[action.node])
+        if actions:
+            self.driving.take(time_ns, sorted(actions, key=lambda each: self.number[each.node]))
         if frames:
             self._place(time_ns // self.world.period_ns)
         senders = [node for node in sorted(frames, key=self.number.__getitem__) if self.up[node]]

@@ -647,16 +647,41 @@ class RecordedRun:
                 struck[period] = planned.placed(period * self.scenario.period_ns).nodes
         return np.asarray(struck)
 
-    def connectivity(self, planned: PlannedFault) -> Iterator[tuple[int, int, Mask]]:
-        """The links (N, N), rows are senders, whose rows may name a fault, and from when until when."""
+    def may_reach(self, planned: PlannedFault) -> Mask:
+        """Mask of the rows that may have been sent on a link while a fault acted there."""
+        later_ns = [0, self.guard_ns, -self.guard_ns] if self.guard_ns else [0]
+        return np.asarray(np.logical_or.reduce([self._reached(planned, each_ns, True) for each_ns in later_ns]))
+
+    def surely_reaches(self, planned: PlannedFault) -> Mask:
+        """Mask of the rows that were certainly sent on a link while a fault acted there."""
+        later_ns = [self.guard_ns, -self.guard_ns] if self.guard_ns else [0]
+        return np.asarray(np.logical_and.reduce([self._reached(planned, each_ns, False) for each_ns in later_ns]))
+
+    def _reached(self, planned: PlannedFault, later_ns: int, where_unknown: bool) -> Mask:
+        """The same, as if every row had been sent so much later, and with an answer where positions are unknown."""
+        reached = np.zeros(len(self.trace), dtype=bool)
+        for start_ns, end_ns, links in self._links_under(planned, where_unknown):
+            rows = self.sent_between(start_ns - later_ns, end_ns - later_ns)
+            reached[rows] |= links[self.sender[rows], self.receiver[rows]]
+        return reached
+
+    def _links_under(self, planned: PlannedFault, where_unknown: bool) -> Iterator[tuple[int, int, Mask]]:
+        """The links (N, N), rows are senders, whose rows may name a fault, and from when until when.
+
+        Of a period that the run has not completed no position is known.
+        """
         if planned.moving is None and not (self.moves and planned.fault.follows_vehicles):
             yield from self._connectivity(planned)
             return
-        period_ns = self.scenario.period_ns
-        for period in range(planned.start_ns // period_ns, min(-(-planned.end_ns // period_ns), self.periods)):
+        period_ns, count = self.scenario.period_ns, len(self.node_ids)
+        for period in range(planned.start_ns // period_ns, -(-planned.end_ns // period_ns)):
             start_ns = max(planned.start_ns, period * period_ns)
+            end_ns = min(planned.end_ns, (period + 1) * period_ns)
+            if period >= self.periods and (planned.moving is not None or isinstance(planned.fault, Range)):
+                yield start_ns, end_ns, np.full((count, count), where_unknown)
+                continue
             for _, _, links in self._connectivity(planned.placed(start_ns), period):
-                yield start_ns, min(planned.end_ns, (period + 1) * period_ns), links
+                yield start_ns, end_ns, links
 
     def _connectivity(self, planned: PlannedFault, period: int = 0) -> Iterator[tuple[int, int, Mask]]:
         """The same, for a fault that acts on the same nodes all the time, with the distances of a period."""
@@ -672,21 +697,6 @@ class RecordedRun:
             for node, off_ns, back_ns in swizzle_times_ns(planned, self.scenario.run.seed):
                 one = np.arange(len(self.node_ids)) == node
                 yield off_ns, min(back_ns, end_ns), one[:, None] | one[None, :]
-
-    def reached(self, planned: PlannedFault, widen_ns: int = 0) -> Mask:
-        """Mask of the rows that were sent on a link while a fault acted there; those near a change count as well,
-        or not if `widen_ns` is negative.
-        """
-        late, early = self._reached(planned, widen_ns), self._reached(planned, -widen_ns)
-        return early | late | self._reached(planned, 0) if widen_ns > 0 else early & late
-
-    def _reached(self, planned: PlannedFault, later_ns: int) -> Mask:
-        """The same, as if every row had been sent so much later."""
-        reached = np.zeros(len(self.trace), dtype=bool)
-        for start_ns, end_ns, links in self.connectivity(planned):
-            rows = self.sent_between(start_ns - later_ns, end_ns - later_ns)
-            reached[rows] |= links[self.sender[rows], self.receiver[rows]]
-        return reached
 
     @cached_property
     def dropped_by_sender(self) -> Mask:

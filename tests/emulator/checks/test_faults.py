@@ -674,3 +674,23 @@ def test_a_corruption_of_all_receptions_is_seen_by_their_cause() -> None:
     fault = {"kind": "corrupt", "probability": 1.0, "at_s": 0.5, "duration_s": 2.0}
     recorded = simulated(fault, radio={"loss": 0.0})
     assert not_valid(recorded) == {}
+
+
+async def talks_on(node: Node) -> None:
+    """Talk all the time."""
+    while True:
+        await asyncio.sleep(0.007)
+        await node.radio.broadcast(b"x")
+
+
+@pytest.mark.parametrize("kind", ["delay", "corrupt", "range", "block", "loss"])
+def test_a_fault_in_a_period_that_the_run_does_not_complete_is_judged_where_vehicles_move(kind: str) -> None:
+    described = fault(kind, at_s=0.15, duration_s=0.1)
+    recorded = simulated(
+        described,
+        program=f"{__name__}:talks_on",
+        run={"duration_s": 0.25, "settle_s": 0.0},
+        network={"kind": "driven", "vehicles": 3},
+    )
+    assert len(recorded.trace) > recorded.places.known(recorded.sent_ns).sum()
+    assert not [name for name, found in not_valid(recorded).items() if found is Verdict.INVALID]

@@ -1,5 +1,7 @@
 """Programs that drive, in whole runs: the same in every division into windows and processes, and recorded."""
 
+import asyncio
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,19 @@ def test_windows_and_processes_do_not_change_how_vehicles_drive() -> None:
         mine = [event for event in fingerprint(apart)[4] if event[1] != "started"]
         assert fingerprint(apart)[:4] == reference[:4]
         assert mine == [event for event in reference[4] if event[1] != "started"]
+
+
+async def asks_too_much(node: Node) -> None:
+    """Ask for more than vehicles can, all at one instant, for which the first one sets its timer last."""
+    await asyncio.sleep(0.25 if node.id == "v01" else 0.5)
+    await asyncio.sleep(0.25 if node.id == "v01" else 0.0)
+    node.drive(50.0)
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+def test_what_vehicles_ask_for_at_one_instant_is_done_in_their_order(run: Callable[[Scenario], Emulation]) -> None:
+    emulation = run(driven(f"{__name__}:asks_too_much", 3, run={"duration_s": 1.0, "settle_s": 0.0}))
+    assert [e.node for e in emulation.folder.events if e.kind == "drive_limited"] == ["v01", "v02", "v03"]
 
 
 @pytest.mark.parametrize("is_map", [False, True])
