@@ -35,7 +35,7 @@ from vnet.node import Node
 from vnet.runtime import interrupts
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.host import Disks, Host
-from vnet.runtime.outside_loop import count_as_death, end_within
+from vnet.runtime.outside_loop import collected_by_schedule, count_as_death, end_within
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, VirtualTimeLoop
 from vnet.transport import keys, wire
@@ -463,15 +463,17 @@ def _run_lockstep(
     attachment.time_ns = lambda: loop.now_ns
     asyncio.set_event_loop(loop)
     try:
-        host.order_events(loop)
-        loop.start_at(next_grant())
-        host.start(loop, programs)
-        host.run(loop)
-    except RunOverError as over:
-        ahead.close()
-        attachment.say_so_far(host.unhandled_so_far())
-        host.close(loop, over.time_ns)
-        attachment.say(wire.Final(attachment.nonce, host.take_final()))
+        with collected_by_schedule():  # to the end, at which nothing is collected any more
+            try:
+                host.order_events(loop)
+                loop.start_at(next_grant())
+                host.start(loop, programs)
+                host.run(loop)
+            except RunOverError as over:
+                ahead.close()
+                attachment.say_so_far(host.unhandled_so_far())
+                host.close(loop, over.time_ns)
+                attachment.say(wire.Final(attachment.nonce, host.take_final()))
     finally:
         loop.close()
         host.discard_abandoned()

@@ -50,7 +50,7 @@ from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.error_text import NOT_THE_PROGRAM, error_line
 from vnet.runtime.host import Disks, Host
-from vnet.runtime.outside_loop import caught, present_node
+from vnet.runtime.outside_loop import caught, collected_by_schedule, present_node
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.ready_queue import CpuMeter
 from vnet.runtime.running_node import LOOK_S, Patience, RunningNode
@@ -270,7 +270,8 @@ class HostedPrograms:
         with process_kept(), output_kept(self._owns, self._logs), caught(self._host.process_ended):
             asyncio.set_event_loop(self.loop)
             try:
-                self._run()
+                with collected_by_schedule():  # to the end, at which nothing is collected any more
+                    self._run()
             finally:
                 asyncio.set_event_loop(None)
                 self.loop.close()

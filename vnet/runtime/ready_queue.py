@@ -207,6 +207,11 @@ class OrderedQueue(ReadyQueue):
         label = f"result of {printable(name, LONGEST_NAME)}"
         self._rounds(node).jobs.append(_Event(label, label, job, show, job))
 
+    @property
+    def all(self) -> list[asyncio.Handle]:
+        """See `ReadyQueue`; those that a node has yet to run are among them."""
+        return [*super().all, *(handle for rounds in self._nodes.values() for handle, _ in rounds.ready)]
+
     def setter(self, node: Node | None, task: asyncio.Task[Any] | None) -> tuple[str, object]:
         """Return the name of what sets a timer, and the task or the callback that does.
 

@@ -3,8 +3,9 @@
 import asyncio
 import gc
 import random
-from collections.abc import Callable
-from typing import Any
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from typing import Any, cast
 
 import pytest
 
@@ -61,6 +62,24 @@ async def waits_at_its_end(node: Node) -> None:
                     note(node, "goes on")
             finally:
                 file.write("ends")
+
+
+async def abandons_generators(node: Node) -> None:
+    """Leaves generators to the collector of garbage, whose end is an event, and keeps much else."""
+
+    async def numbers() -> AsyncIterator[int]:
+        try:
+            yield 1
+        finally:
+            node.event("ends")
+
+    kept: list[object] = []
+    while True:
+        await asyncio.sleep(0.07)
+        generator: list[object] = [numbers()]
+        await anext(cast(AsyncIterator[int], generator[0]))
+        generator.append(generator)
+        kept += [[] for _ in range(100)]
 
 
 async def writes_when_it_ends(node: Node) -> None:
@@ -226,6 +245,19 @@ def test_who_is_restarted_waits_for_nothing_more_and_keeps_what_it_has_written(r
     assert diary == {}, "no time passes in processes that end"
     written = {file.name: file.read_text() for file in emulation.folder.disks.glob("v02/log*")}
     assert written == dict.fromkeys(["log0", "log1"], "begins to end, ends")
+
+
+@pytest.mark.parametrize("order", ["fifo", "shuffle"])
+def test_a_program_that_is_restarted_before_it_has_begun_is_in_no_deadlock(order: str) -> None:
+    emulation, _ = both([fault("restart", 0.0, 0.5, "v02")], "lives", run={"order": order})
+    assert [event.node for event in emulation.folder.events if event.kind == "exception"] == []
+
+
+@pytest.mark.parametrize("run", [run_together, run_forked])
+def test_nothing_is_collected_any_more_once_the_run_is_over(run: Run) -> None:
+    scenario = scenario_of([], f"{HERE}:abandons_generators", run={"settle_s": 0.0})
+    generators = Counter(event.time_ns for event in run(scenario).folder.events if event.kind == "event")
+    assert generators.keys() == {1_000_000_000, 2_000_000_000}
 
 
 @pytest.mark.parametrize("run", [run_together, run_apart, run_forked])

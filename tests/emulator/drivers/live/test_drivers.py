@@ -142,7 +142,7 @@ async def test_in_lockstep_a_process_that_does_not_come_back_ends_the_run() -> N
         await play.run()
     (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
     assert (stalled.node, stalled.details["error"]) == ("v02", "has not come back within 1 s")
-    assert play.sent(wire.End) == [("v02", wire.End(None, "restarted by a fault"))]
+    assert play.sent(wire.End) == [("v02", wire.End(None, "restarted by a fault", time_ns=150_000_000))]
 
 
 @in_virtual_time
