@@ -71,7 +71,7 @@ Zenoh's, so it may come a little later than the batch that refers to it."""
 
 
 class RunOverError(Exception):
-    """The emulator has said that the run is over: in lockstep at `time_ns`, if it has said when."""
+    """The emulator has said that the run is over, in lockstep also when (`time_ns`; None if it has not)."""
 
     def __init__(self, reason: str, time_ns: int | None) -> None:
         super().__init__(reason)

@@ -482,7 +482,7 @@ class Emulation:
         self._watchers: list[Callable[[PeriodView], None]] = []
         self._period = 0
         self.ended_ns: int | None = None
-        """When the run was over, as soon as it is."""
+        """Emulated time at which the run was over; None until then."""
         self._reports: list[Report] = []
         self._arrived: list[Deliveries] = []
         self.costs = Costs()

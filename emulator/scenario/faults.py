@@ -645,7 +645,7 @@ class GnssFreeze(GnssFault):
 class Skew(ClockFault):
     """The nodes' clocks are off by a constant.
 
-    `node.now_ns`, the times at which packets are received, and all timers of a program follow them.
+    `node.now_ns`, the times at which packets are received, and timers that a program sets meanwhile follow them.
     """
 
     kind: Literal["skew"]
