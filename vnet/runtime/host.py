@@ -568,6 +568,8 @@ class Host:
         `take_traffic` then returns the exceptions that nobody has handled, and programs in a deadlock.
         """
         self._closing = True
+        if self._paused:
+            self.pause(())  # whoever is paused ends as the others do
         if self._mains:  # else the run has ended before the first grant
             self._tell_deadlocks([node for node in self.nodes.values() if self._runs(node)])
         if time_ns is not None:

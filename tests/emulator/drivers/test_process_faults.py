@@ -273,6 +273,13 @@ def test_a_process_ends_at_the_instant_that_ends_it_whenever_it_last_had_anythin
 
 
 @pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+def test_whoever_is_paused_as_the_run_ends_ends_as_the_others_do(run: Run) -> None:
+    faults = [fault("pause", 0.15, 9, "v02"), fault("pause", 2.9, 9, "v03")]
+    scenario = scenario_of(faults, f"{HERE}:writes_when_it_ends", run={"settle_s": 0.0})
+    assert [event.node for event in run(scenario).folder.events if event.kind == "event"] == IDS
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
 @pytest.mark.parametrize("kind", ["kill", "restart"])
 def test_a_fault_after_which_nobody_has_anything_to_do_acts_all_the_same(run: Run, kind: str) -> None:
     scenario = scenario_of([fault(kind, 2.5, 9, "v01")], f"{HERE}:tells_its_end", run={"settle_s": 0.0})
