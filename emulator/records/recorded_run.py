@@ -668,13 +668,14 @@ class RecordedRun:
     def _links_under(self, planned: PlannedFault, where_unknown: bool) -> Iterator[tuple[int, int, Mask]]:
         """The links (N, N), rows are senders, whose rows may name a fault, and from when until when.
 
-        Of a period that the run has not completed no position is known.
+        Of the last period, if the run has not completed it, no position is known.
         """
         if planned.moving is None and not (self.moves and planned.fault.follows_vehicles):
             yield from self._connectivity(planned)
             return
         period_ns, count = self.scenario.period_ns, len(self.node_ids)
-        for period in range(planned.start_ns // period_ns, -(-planned.end_ns // period_ns)):
+        end_period = min(-(-planned.end_ns // period_ns), self.periods + 1)
+        for period in range(planned.start_ns // period_ns, end_period):
             start_ns = max(planned.start_ns, period * period_ns)
             end_ns = min(planned.end_ns, (period + 1) * period_ns)
             if period >= self.periods and (planned.moving is not None or isinstance(planned.fault, Range)):

@@ -564,7 +564,7 @@ class Host:
     def close(self, loop: VirtualTimeLoop, time_ns: int | None = None) -> None:
         """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep).
 
-        They run at `time_ns`, the end, whenever their process last had anything to do; at that time if it is None.
+        They run at `time_ns`, the end; None: when their process last had anything to do.
         `take_traffic` then returns the exceptions that nobody has handled, and programs in a deadlock.
         """
         self._closing = True
