@@ -131,9 +131,8 @@ class RunHarness:
         promised = {PREFIX + name for name in self._promises} - self._named
         broken = [each for each in judgement.checks if each.name in promised and _fails(each, allow_unknown=False)]
         if not self._ended_by_test:
-            broken += [
-                each for each in judgement.checks if each.name in CRASHES and _fails(each, allow_unknown=True)
-            ]
+            crashes = [each for each in judgement.checks if each.name in CRASHES and each.name not in self._named]
+            broken += [each for each in crashes if _fails(each, allow_unknown=True)]
         if broken:
             raise AssertionError(self._complaint(broken))
 

@@ -40,6 +40,8 @@ LONGEST_NAME = 100
 """Characters of a task's or a job's name."""
 STARTED = "start"
 """The source of what no callback has registered."""
+NOBODY = None, STARTED, object()
+"""Node, source and callback of what is registered while nobody runs."""
 
 
 class ReadyQueue(deque[asyncio.Handle]):
@@ -166,7 +168,7 @@ class OrderedQueue(ReadyQueue):
         self._now_ns = now_ns
         self._on_deviation = on_deviation
         self._nodes: dict[Node, _NodeRounds] = {}
-        self._running: tuple[Node | None, str, object] = (None, STARTED, object())
+        self._running: tuple[Node | None, str, object] = NOBODY
         self._sources: dict[int, str] = {}
         self.steps: Counter[str] = Counter()
         """Decisions of each node so far."""
@@ -245,9 +247,10 @@ class OrderedQueue(ReadyQueue):
         return handle
 
     def compose(self) -> bool:
-        """Put the next round together; returns whether there is anything in it."""
+        """Put the next round together; returns whether there is anything in it. Nobody runs then."""
         for node, rounds in list(self._nodes.items()):
             self._compose(node, rounds)
+        self._running = NOBODY
         return len(self) > 0
 
     @property

@@ -186,7 +186,11 @@ def test_a_crash_fails_a_test_that_has_not_judged_it(pytester: pytest.Pytester) 
         """
 CRASHED = dict(program="tests.emulator.testing.programs:impatient", vehicles=2, duration=3, settle=1)
 
-@pytest.mark.parametrize("judge", [None, lambda emu: emu.check("conservation"), lambda emu: emu.end()])
+def expects(emu):
+    with pytest.raises(AssertionError, match="crashed"):
+        emu.check("agents_alive")
+
+@pytest.mark.parametrize("judge", [None, lambda emu: emu.check("conservation"), lambda emu: emu.end(), expects])
 async def test_crash(vnet_emulation, judge):
     async with vnet_emulation(BEACON, **CRASHED) as emu:
         await emu.run_for(1.0)
@@ -197,7 +201,7 @@ async def test_crash(vnet_emulation, judge):
             judge(emu)
 """,
     )
-    result.assert_outcomes(passed=1, failed=2)
+    result.assert_outcomes(passed=2, failed=2)
     result.stdout.fnmatch_lines(["*agents_alive is invalid: v01 crashed*"])
 
 

@@ -2,16 +2,17 @@
 
 import asyncio
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import cast
 
 import pytest
 
 from tests.vnet.runtime.test_host import LANES
 from vnet import Node
 from vnet.runtime.host import Host
-from vnet.runtime.ready_queue import Option, Pct, Shuffle, Taped
+from vnet.runtime.ready_queue import Option, OrderedQueue, Pct, Shuffle, Taped
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
 from vnet.transport.wire import Deviation, Order
@@ -312,6 +313,44 @@ def test_timers_of_different_callbacks_and_mail_come_in_any_order() -> None:
 # What makes decisions.
 
 OPTIONS = [Option("fix", "gnss"), Option("timer of a", "a"), Option("go on", "radio")]
+
+
+class OwnedHandle(asyncio.Handle):
+    """The handle of a callback of a node."""
+
+    node: Node
+
+
+class AnyNode:
+    """Stands for a node."""
+
+    id = "v01"
+
+
+def test_what_arrives_while_nobody_runs_is_registered_by_nobody_whoever_ran_last() -> None:
+    """In a process of several vehicles another one ran last."""
+    loop, node, seen = asyncio.new_event_loop(), cast(Node, AnyNode()), list[Option]()
+
+    class Fifo:
+        def choose(self, time_ns: int, decision: int, options: Sequence[Option]) -> int:
+            seen.extend(options)
+            return 0
+
+    def handle() -> OwnedHandle:
+        made = OwnedHandle(print, (), loop)
+        made.node = node
+        return made
+
+    queue = OrderedQueue([], lambda node: Fifo(), lambda: 0, lambda node, deviation: None)
+    queue.add_event(node, "timer of beat", "beat", lambda: queue.append(handle()), lambda: True)
+    while queue.compose():
+        queue.popleft()
+    seen.clear()
+    queue.append(handle())
+    queue.add_event(node, "packet", "radio", lambda: None, lambda: True)
+    queue.compose()
+    assert [option.source for option in seen] == ["radio", "start"]
+    loop.close()
 
 
 def test_pct_follows_priorities_until_one_falls() -> None:
