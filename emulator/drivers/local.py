@@ -308,7 +308,7 @@ class HostedPrograms:
         self._seq = grant.seq
         for name, arguments in calls:
             getattr(self._host, name)(*arguments)
-        self._host.apply_clock_error(grant.clocks, self.loop)  # of no concern to programs that have ended before
+        self._host.apply_clock_error(grant.clocks, self.loop)  # after what has ended by then
         return self._host.open_window(grant, mail)
 
 

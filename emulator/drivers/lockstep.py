@@ -392,6 +392,7 @@ class Lockstep:
         if clock.is_wrong or clock.node in process.affected:
             process.clocks.append(clock)
             process.affected.add(clock.node)
+            self._woken.add(process.id)  # or it would not know its clock at the end of the run
 
     def _stop(self, node: str) -> None:
         process_id = self._process_of[node]

@@ -296,7 +296,7 @@ class RunHarness:
     def end(self) -> Judgement:
         """End the run where it stands, or once all planned faults have healed, and judge it. Again: the same.
 
-        A crash, which fails a test otherwise, is then for the test to judge.
+        Crashes and exceptions that nobody has handled fail a test otherwise: they are then for the test to judge.
         """
         self._ended_by_test = True
         return self._judge()
