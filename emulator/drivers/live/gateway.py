@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from emulator.drivers.agent_keys import Hear
-from emulator.scenario.program import ZenohSessions
+from emulator.scenario.program import Program, ZenohSessions
 from vnet.errors import ProgramError, shown
 from vnet.gateway import STARTUP, client_config, session_variables
 from vnet.gateway.frames import (
@@ -281,12 +281,13 @@ def is_peer(name: str) -> bool:
 
 
 def session_environment(
-    node: str, endpoint: str, settings: ZenohSessions, folder: Path, inherited: Mapping[str, str]
+    node: str, endpoint: str, program: Program, folder: Path, inherited: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the environment in which an unmodified program connects to its vehicle's router alone.
 
     Its configuration becomes a file in `folder`, which has passwords and is for this account alone.
     """
+    settings = program.sessions
     client = client_config(endpoint)
     transport: dict[str, Any] = {}
     if settings.authority is not None:
@@ -299,7 +300,8 @@ def session_environment(
     path = folder / f"{node}.json5"
     path.write_text(json.dumps(client))
     path.chmod(0o600)
-    python_path = os.pathsep.join(filter(None, [str(STARTUP), inherited.get("PYTHONPATH")]))
+    searched = [str(STARTUP), *map(str, program.folders), inherited.get("PYTHONPATH")]
+    python_path = os.pathsep.join(filter(None, searched))
     return {**inherited, **session_variables(node, endpoint, client, path), "PYTHONPATH": python_path}
 
 

@@ -1,6 +1,8 @@
 """The gateway of a vehicle: real Zenoh sessions on both sides of a radio that the test plays."""
 
 import asyncio
+import subprocess
+import sys
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -23,8 +25,8 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import NameOID
 
-from emulator.drivers.live.gateway import Gateway, check_trust, read_users
-from emulator.scenario.program import ZenohSessions
+from emulator.drivers.live.gateway import Gateway, check_trust, read_users, session_environment
+from emulator.scenario.program import Program, ZenohSessions
 from vnet.errors import ProgramError
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments
 from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY, check_keys
@@ -526,3 +528,13 @@ def test_users_are_those_whom_zenoh_reads(tmp_path: Path) -> None:
     path = tmp_path / "users"
     path.write_bytes(b"\n car : a:b \r\nbus:c\ncar:d")
     assert read_users(path) == {"car": "d", "bus": "c"}
+
+
+def test_commands_find_modules_in_the_folders_of_the_program(tmp_path: Path) -> None:
+    (tmp_path / "app").mkdir()
+    (tmp_path / "app" / "solo.py").write_text("print('found')")
+    program = Program.model_validate({"kind": "zenoh", "command": ["python"], "folders": [str(tmp_path / "app")]})
+    environment = session_environment("v01", "tcp/127.0.0.1:7447", program, tmp_path, {"PYTHONPATH": "own"})
+    assert environment["PYTHONPATH"].endswith("own")
+    ran = subprocess.run([sys.executable, "-m", "solo"], env=environment, cwd=tmp_path, capture_output=True)
+    assert ran.stdout == b"found\n"
