@@ -500,7 +500,7 @@ class End(Message, frozen=True):
     nonce: bytes | None
     reason: str
     refused: bool = False
-    time_ns: int | None = None
+    time_ns: TimeNs | None = None
 
 
 AgentMessage = Hello | Yield | Frames | Final | StackDump
