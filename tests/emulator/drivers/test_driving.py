@@ -64,8 +64,8 @@ def test_windows_and_processes_do_not_change_how_vehicles_drive() -> None:
 
 async def asks_too_much(node: Node) -> None:
     """Ask for more than vehicles can, all at one instant, for which the first one sets its timer last."""
-    await asyncio.sleep(0.25 if node.id == "v01" else 0.5)
-    await asyncio.sleep(0.25 if node.id == "v01" else 0.0)
+    for wait_s in [0.25, 0.25] if node.id == "v01" else [0.5]:
+        await asyncio.sleep(wait_s)
     node.drive(50.0)
 
 

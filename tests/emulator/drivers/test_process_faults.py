@@ -273,6 +273,14 @@ def test_a_process_ends_at_the_instant_that_ends_it_whenever_it_last_had_anythin
 
 
 @pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
+def test_whoever_waits_for_nothing_ends_by_the_clock_that_it_has_by_then(run: Run) -> None:
+    faults = [fault("skew", 1.5, 0.5, "v02", offset_ms=500), fault("skew", 2.4, 9, "v03", offset_ms=500)]
+    scenario = scenario_of(faults, f"{HERE}:writes_when_it_ends", run={"settle_s": 0.0})
+    written = {file.parent.name: float(file.read_text()) for file in run(scenario).folder.disks.glob("*/ended0")}
+    assert written == {"v01": 3.0, "v02": 3.0, "v03": 3.5, "v04": 3.0}
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
 def test_whoever_is_paused_as_the_run_ends_ends_as_the_others_do(run: Run) -> None:
     faults = [fault("pause", 0.15, 9, "v02"), fault("pause", 2.9, 9, "v03")]
     scenario = scenario_of(faults, f"{HERE}:writes_when_it_ends", run={"settle_s": 0.0})
