@@ -541,8 +541,8 @@ class LiveProcesses(Processes):
         """Do to the processes what the faults and the trips of an instant do. Raises Stalled."""
         process_of = self.members.process_of
         for process_id, killed in {process_of(node): killed for node, killed in actions.stop.items()}.items():
-            reason = "it has left" if self._emulation.presence.is_outside(process_id) else "restarted by a fault"
-            reason = "killed by a fault" if killed else reason
+            has_left = self._emulation.presence.is_outside(process_id)
+            reason = "killed by a fault" if killed else "it has left" if has_left else "restarted by a fault"
             await self.supervisor.end(process_id, killed, reason, actions.time_ns)
             if not killed and not self._realtime:
                 await self._await_final(process_id, actions.time_ns)
