@@ -181,11 +181,11 @@ def check_peer_cap(recorded: RecordedRun) -> Finding:
     """Check that each receiver hears its nearest `max_peers` live senders in range, and no other."""
     cap = recorded.scenario.radio.max_peers
     largest = recorded.places.most_in_range
-    if largest <= cap and not recorded.outcome_is("peer_cap").any():
+    capped = recorded.outcome_is("peer_cap") & recorded.placed
+    if largest <= cap and not capped.any():
         return not_exercised(f"no receiver has more than {cap} senders in range (at most {largest})")
     if not len(recorded.trace):
         return unknown("no frame was sent")
-    capped = recorded.outcome_is("peer_cap")
     wrong = _wrongly_capped(recorded, capped)
     broken = int(wrong.sum())
     figures = {"cap": cap, "largest_in_range": largest, "capped": int(capped.sum()), "wrong": broken}

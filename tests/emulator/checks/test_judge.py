@@ -449,3 +449,22 @@ def test_a_file_that_was_cut_short_is_refused(name: str, tmp_path: Path) -> None
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(VnetError, match=rf"{name}: (cannot be read|not JSON)"):
         check_run(tmp_path / "run")
+
+
+def test_a_cap_that_acts_first_in_a_period_that_the_run_does_not_complete_is_not_judged(tmp_path: Path) -> None:
+    rows = ["a,0,0,0", "a,5,0,0", "b,0,50,0", "b,5,50,0", "c,0,160,0", "c,5,10,0"]
+    (tmp_path / "trips.csv").write_text("\n".join(["id,time_s,x_m,y_m", *rows]))
+    recorded = run_scenario(
+        tmp_path / "run",
+        Scenario.model_validate(
+            {
+                "run": {"duration_s": 2.5, "settle_s": 0.0},
+                "network": {"kind": "trips", "path": str(tmp_path / "trips.csv")},
+                "world": {"gnss": {"rate_hz": 0.5}},
+                "radio": {"range_m": 100.0, "max_peers": 1},
+                "program": {"entry": "tests.emulator.checks.test_faults:talks_on"},
+            }
+        ),
+    )
+    assert recorded.outcome_is("peer_cap").any()
+    assert isinstance(result(recorded, "peer_cap"), NotExercised)
