@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import emulator
+from docs.examples.its import station
 from docs.examples.its2.perception import NOWHERE_M, PLACES, fused, seen_of
 from docs.examples.its2.sight import sensor
 from docs.examples.its2.standard_messages import (
@@ -185,11 +186,22 @@ def test_a_vam_of_a_clock_that_is_ahead_has_its_time() -> None:
     assert decoded is not None and decoded.time_ns == message.time_ns
 
 
-@given(st.binary(max_size=200))
-def test_other_bytes_are_no_message(data: bytes) -> None:
-    for payload in (data, b"\x02\x0e" + data, b"\x03\x10" + data):
-        for decoded in (decode_cpm(payload, schema()), decode_vam(payload, schema(), 0)):
-            assert decoded is None or isinstance(decoded, Message)
+def test_a_message_with_a_flipped_bit_and_other_bytes_are_a_message_or_none() -> None:
+    message = Message(7, 10**9, (10.0, -20.0), objects=(Seen((50.0, 60.0), (3.0, -4.0)),))
+    sent = station.Message(message.station, message.position_m, cause=station.EMERGENCY_BRAKE)
+    encoded = [
+        encode_cpm(message, schema()),
+        encode_vam(message, schema()),
+        station.encode_cam(sent, message.time_ns),
+        station.encode_denm(sent, 1, message.time_ns),
+    ]
+    for payload in encoded:
+        number, bits = int.from_bytes(payload, "big"), 8 * len(payload)
+        flipped = [(number ^ 1 << bit).to_bytes(len(payload), "big") for bit in range(bits)]
+        for read in (*flipped, *(payload[:length] for length in range(len(payload)))):
+            for decoded in (decode_cpm(read, schema()), decode_vam(read, schema(), 0)):
+                assert decoded is None or isinstance(decoded, Message)
+            assert isinstance(station.decode(read), station.Message | None)
 
 
 def test_a_vehicle_and_a_building_hide_what_is_behind() -> None:

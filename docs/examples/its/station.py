@@ -90,7 +90,10 @@ def encode_denm(message: Message, number: int, time_ns: int) -> bytes:
 
 
 def decode(payload: bytes) -> Message | None:
-    """Return a message; None for bytes that are none, which the radio may well deliver."""
+    """Return a message; None for bytes that are none, which the radio may well deliver.
+
+    None, too, for a DENM that ends an event, and for a CAM of a roadside unit.
+    """
     known = {CAM: CAM_PDU_Descriptions.CAM, DENM: DENM_PDU_Descriptions.DENM}
     if len(payload) < 2 or payload[0] != VERSION or payload[1] not in known:
         return None
@@ -101,12 +104,16 @@ def decode(payload: bytes) -> Message | None:
         return None
     station = value["header"]["stationID"]
     if payload[1] == DENM:
+        if "situation" not in value["denm"]:
+            return None
         management, event = value["denm"]["management"], value["denm"]["situation"]["eventType"]
         return Message(
             station, _metres(management["eventPosition"]), cause=(event["causeCode"], event["subCauseCode"])
         )
     parameters = value["cam"]["camParameters"]
-    _, high_frequency = parameters["highFrequencyContainer"]
+    kind, high_frequency = parameters["highFrequencyContainer"]
+    if kind != "basicVehicleContainerHighFrequency":
+        return None
     heading_rad = math.radians(90 - high_frequency["heading"]["headingValue"] / 10) % math.tau
     speed_m_s = high_frequency["speed"]["speedValue"] / 100
     return Message(station, _metres(parameters["basicContainer"]["referencePosition"]), heading_rad, speed_m_s)

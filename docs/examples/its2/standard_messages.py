@@ -104,8 +104,9 @@ def encode_cpm(message: Message, types: Any) -> bytes:
 
 def _is_sayable(message: Message, seen: Seen) -> bool:
     """Return whether an object is within the ranges of its fields, which asn1tools does not check."""
-    away_m = max(abs(there_m - here_m) for there_m, here_m in zip(seen.position_m, message.position_m, strict=True))
-    return away_m <= 1310.71 and max(map(abs, seen.velocity_m_s)) <= 163.81 and -2.047 <= seen.age_s <= 2.047
+    offsets_m = [there_m - here_m for there_m, here_m in zip(seen.position_m, message.position_m, strict=True)]
+    is_near = all(abs(offset_m) <= 1310.71 for offset_m in offsets_m)  # false for NaN, too
+    return is_near and all(abs(each) <= 163.81 for each in seen.velocity_m_s) and -2.047 <= seen.age_s <= 2.047
 
 
 def _object(number: int, message: Message, seen: Seen) -> dict[str, Any]:
@@ -127,7 +128,10 @@ def _object(number: int, message: Message, seen: Seen) -> dict[str, Any]:
 
 @lru_cache(maxsize=1024)  # in a simulation all receivers decode the same bytes
 def decode_cpm(payload: bytes, types: Any) -> Message | None:
-    """Return a CPM; None for bytes that are none, which the radio may well deliver."""
+    """Return a CPM; None for bytes that are none, which the radio may well deliver.
+
+    Objects without a velocity along the axes are left out.
+    """
     if payload[:2] != bytes(CPM_HEADER.values()):
         return None
     try:
@@ -140,7 +144,8 @@ def decode_cpm(payload: bytes, types: Any) -> Message | None:
     management = value["payload"]["managementContainer"]
     position_m = _metres(management["referencePosition"])
     time_ns = (management["referenceTime"] - START_MS) * 1_000_000
-    objects = tuple(_seen(each, position_m) for each in found)
+    moving = [each for each in found if each.get("velocity", ("",))[0] == "cartesianVelocity"]
+    objects = tuple(_seen(each, position_m) for each in moving)
     return Message(value["header"]["stationId"], time_ns, position_m, _from_north(heading), objects=objects)
 
 
@@ -160,7 +165,7 @@ def encode_vam(message: Message, types: Any) -> bytes:
     }
     moves = {
         "heading": {"value": _to_north(message.heading_rad), "confidence": NOT_KNOWN},
-        "speed": {"speedValue": min(round(100 * message.speed_m_s), 16382), "speedConfidence": NOT_KNOWN},
+        "speed": {"speedValue": min(round(100 * abs(message.speed_m_s)), 16382), "speedConfidence": NOT_KNOWN},
         "longitudinalAcceleration": {
             "longitudinalAccelerationValue": 161,
             "longitudinalAccelerationConfidence": 102,
