@@ -109,12 +109,12 @@ class _Station:
 class _Flow:
     """Frames of one period of a sender: those that wait with the slots in which they became ready, and their grant.
 
-    None waits for the reservation of a frame that was sent elsewhere. `sent_ns` are the last times at which frames
-    came.
+    One that is sent elsewhere is in the queue, too, and marked: it uses up a reservation. `sent_ns` are the last
+    times at which frames came.
     """
 
     station: _Station
-    queue: deque[tuple[int, Transmission | None]] = field(default_factory=deque)
+    queue: deque[tuple[int, Transmission, bool]] = field(default_factory=deque)
     grant: _Grant | None = None
     sent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS + 1))
     until_shot: int = 0
@@ -276,10 +276,10 @@ class Sidelink(Mac):
             if len(flow.queue) > turn or grant.slot + grant.period * turn > slot + self._t2_slots:
                 is_alone = True
             else:
-                flow.queue.append((slot, None if is_alone else sent))
+                flow.queue.append((slot, sent, is_alone))
         else:
             if not is_alone:
-                flow.queue.append((slot, sent))
+                flow.queue.append((slot, sent, False))
             self._reserve(flow)
         if is_alone:
             self._send_alone(flow, sent, slot)
@@ -307,7 +307,7 @@ class Sidelink(Mac):
 
     def _reserve(self, flow: _Flow) -> None:
         """Select a resource for the frames that wait, and for those to come."""
-        waiting = [(ready, sent) for ready, sent in flow.queue if sent is not None]
+        waiting = [(ready, sent) for ready, sent, is_alone in flow.queue if not is_alone]
         flow.queue.clear()
         if not waiting:
             return
@@ -326,7 +326,7 @@ class Sidelink(Mac):
             return
         first, subchannel, repeat = self._choose(found, frame, _CHOICE)
         flow.grant = _Grant(first, subchannel, length, period, counter, repeat)
-        flow.queue.append(waiting[0])
+        flow.queue.append((*waiting[0], False))
         self._book(self._use_of(flow, last), checks=True)
         for ready, sent in waiting[1:]:
             self._send_alone(flow, sent, ready)
@@ -352,13 +352,13 @@ class Sidelink(Mac):
 
     def _send_alone(self, flow: _Flow, sent: Transmission, ready: int) -> None:
         """Select a resource for one frame that was ready in a slot."""
-        flow.station.frames -= 1
         length = self._link.length(sent.frame.size_bytes)
         first = self._now_ns // self._slot_ns + self._mac.t1_slots
         last = max(first, ready + self._t2_slots)
         wanted = Wanted(flow.station.node, first, last, length, 0, 1)
         found = self._candidates(flow.station, sent.frame, wanted)
         if not found.mask.any():
+            flow.station.frames -= 1
             self._leave(sent, Outcome.no_grant, self._now_ns)
             return
         first, subchannel, repeat = self._choose(found, sent.frame, _CHOICE)
@@ -419,8 +419,7 @@ class Sidelink(Mac):
         flow, station, grant = booking.flow, booking.station, booking.grant
         if grant is not None and (flow.grant is not grant or not flow.queue):
             return
-        sent = booking.sent or flow.queue[0][1]
-        assert sent is not None, "the first use of a grant is that of the frame it was selected for"
+        sent = booking.sent or flow.queue[0][1]  # the first use of a grant is that of the frame it was selected for
         times = 10 * grant.counter if grant is not None else 1
         wanted = Wanted(station.node, booking.slot, booking.last, booking.length, booking.period, times)
         station.booked -= booking.slots
@@ -449,8 +448,10 @@ class Sidelink(Mac):
             is_free = all(other.station is not booking.station for other in on_air)
             if booking.grant is not None:
                 self._use_grant(booking, is_free)
-            elif not booking.is_repeat and not (is_free and self._may_send(booking)):
-                self._give_up(booking)
+            elif not booking.is_repeat:
+                booking.station.frames -= 1
+                if not (is_free and self._may_send(booking)):
+                    self._give_up(booking)
             if booking.sent is not None:
                 on_air.append(booking)
         if on_air:
@@ -464,20 +465,17 @@ class Sidelink(Mac):
         if grant is None or flow.grant is not grant or grant.slot != booking.slot:
             return
         is_due = bool(flow.queue) and flow.queue[0][0] <= booking.slot - self._mac.t1_slots
-        if is_due and flow.queue[0][1] is None:
-            flow.queue.popleft()
+        if is_due and (is_free or flow.queue[0][2]):
+            _, sent, is_elsewhere = flow.queue.popleft()
             grant.unused = 0
             grant.counter -= 1
-        elif is_due and is_free:
-            booking.sent = flow.queue.popleft()[1]
-            assert booking.sent is not None
-            flow.station.frames -= 1
-            grant.unused = 0
-            grant.counter -= 1
-            if grant.counter <= 0 and self._draw(booking.sent.frame, _KEEP) < self._mac.keep_probability:
-                grant.counter = self._counter(booking.sent.frame, grant.period)
-            if not self._may_send(booking):
-                self._give_up(booking)
+            if grant.counter <= 0 and self._draw(sent.frame, _KEEP) < self._mac.keep_probability:
+                grant.counter = self._counter(sent.frame, grant.period)
+            if not is_elsewhere:
+                booking.sent = sent
+                flow.station.frames -= 1
+                if not self._may_send(booking):
+                    self._give_up(booking)
         else:
             grant.unused += 1
         grant.slot += grant.period

@@ -310,6 +310,33 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
     assert 9 < np.mean(np.diff(first)) < 11.5, "the counter of 5 to 15 frames counts them"
 
 
+@pytest.mark.slow
+def test_one_shots_take_nothing_from_the_probability_to_keep_a_resource() -> None:
+    rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True, keep_probability=0.8)), 1, 200.0)
+    phase = [row["on_air_ns"] % (100 * MS) for row in rows]
+    reserved = [at for before, at, after in zip(phase, phase[1:], phase[2:], strict=False) if at in (before, after)]
+    changes = len(list(groupby(reserved))) - 1
+    assert abs(changes - 40) < 3 * sqrt(200 * 0.2 * 0.8), "a counter of 10 frames ends 200 times"
+
+
+@pytest.mark.parametrize("scheduling", ["sps", "dynamic"])
+def test_no_more_frames_wait_than_the_queue_has_however_they_are_scheduled(scheduling: str) -> None:
+    subject = engine(line(0, 50), queue_frames=2, access_jitter_ms=0.0, **with_mac(NR, scheduling=scheduling))
+    for time_ns in range(0, 60 * MS, 3 * MS):
+        subject.advance(time_ns)
+        subject.transmit(time_ns, 0, [SentFrame("", bytes(20), period_ms=100)])
+    subject.drain()
+    taken = [row for row in subject.trace.to_table().to_pylist() if row["outcome"] != "queue_full"]
+    mac = Radio.model_validate(NR).sidelink
+    assert mac is not None
+    decided = [row["on_air_ns"] - (mac.t1_slots - 1) * mac.slot_ns for row in taken]
+    waiting = [
+        sum(one["sent_ns"] <= at["sent_ns"] < until for one, until in zip(taken, decided, strict=True))
+        for at in taken
+    ]
+    assert max(waiting) == 2
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_one_shot_that_ends_a_reservation_leaves_nothing_that_waited_for_it(seed: int) -> None:
     subject = engine(line(0, 50), seed, access_jitter_ms=0.0, **with_mac(LTE, one_shot=True))
