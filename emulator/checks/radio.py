@@ -313,11 +313,11 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
 
 
 def _audible(air: _Air, rows: NDArray[np.intp]) -> Mask:
-    """Return the mask of these rows that met a transmission that their receiver could hear, or its own."""
+    """Return the mask of these rows that met a transmission that their receiver may have heard, or its own."""
     recorded = air.recorded
     index, other = air.met(rows)
-    receiver = recorded.receiver[rows][index]
-    heard = recorded.places.pairs_in_range(air.sender[other], receiver, recorded.sent_ns[air.rows[other]])
+    receiver, sent_ns = recorded.receiver[rows][index], recorded.sent_ns[air.rows[other]]
+    heard = recorded.places.pairs_in_range(air.sender[other], receiver, sent_ns) | ~recorded.places.known(sent_ns)
     heard |= air.sender[other] == receiver
     return np.asarray(np.bincount(index, weights=heard, minlength=len(rows)) > 0)
 

@@ -1,5 +1,6 @@
 """The checks of a physical radio: what really happened is valid, and every breach of its rules is seen."""
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from tests.emulator.checks.test_judge import checked, result, verdict
 from tests.support.recorded import prepared
 from tests.support.recorded import recorded as record_run
 from vnet.errors import VnetError
+from vnet.node import Node
 
 pytestmark = pytest.mark.slow
 
@@ -358,3 +360,31 @@ def test_what_a_fault_keeps_from_a_receiver_is_still_on_air(tmp_path: Path) -> N
     )
     mine = (blocked.sender == 0) & (blocked.sent_ns < 2_500_000_000)
     assert set(blocked.trace["outcome"].to_numpy()[mine]) == {"fault"}
+
+
+def test_frames_of_a_period_that_the_run_does_not_complete_are_heard_by_whoever_they_met(tmp_path: Path) -> None:
+    """Positions of that period are unknown, and so is who could hear."""
+    for seed in (1, 3):
+        scenario = Scenario.model_validate(
+            {
+                "run": {"duration_s": 1.15, "settle_s": 0.0, "seed": seed},
+                "network": {"kind": "driven", "vehicles": 20, "driven": {"lanes": 4, "gap_m": 20.0}},
+                "radio": {
+                    "max_peers": 1000,
+                    "path_loss": {"kind": "winner_b1", "tx_power_dbm": 33.0, "floor_dbm": -110.0},
+                    "mac": {"kind": "lte-mode4", "subchannels": 1},
+                },
+                "program": {"entry": f"{__name__}:ticks"},
+            }
+        )
+        record_run(scenario, tmp_path / f"{seed}")
+        checks = {each.name: each.verdict for each in judge(RecordedRun.open(tmp_path / f"{seed}")).checks}
+        assert checks["medium"] is Verdict.VALID
+
+
+async def ticks(node: Node) -> None:
+    """Send 100 bytes every 50 ms."""
+    await asyncio.sleep(float(node.rng.uniform(0, 0.05)))
+    while True:
+        await node.radio.broadcast(b"x" * 100)
+        await asyncio.sleep(0.05)
