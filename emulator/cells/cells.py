@@ -32,6 +32,7 @@ from emulator.cells.worker import Place, Worker, WorkerDiedError, call_fitly, mo
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session, over_zenoh
+from emulator.drivers.signals import terminated_as_interrupted
 from emulator.records.code_digest import digests_of
 from emulator.records.disk import atomically, disk_errors, write_atomically
 from emulator.records.events import Level
@@ -243,7 +244,7 @@ def run_cells(
 
     Simulated cells run on `executor`, or in `jobs` processes of this machine (default: as many as it has cores);
     live ones one after the other, because each starts a process a vehicle. Raises VnetError if a cell cannot be
-    run or the folder is that of a run, and KeyboardInterrupt: those that are finished stay.
+    run or the folder is that of a run, and KeyboardInterrupt after Ctrl-C or SIGTERM: those that are finished stay.
     """
     if is_run_folder(folder):
         raise VnetError(f"{folder}: this is a run's folder, which is for that run alone")
@@ -252,7 +253,7 @@ def run_cells(
         store.mkdir(parents=True, exist_ok=True)
     _code_digests.cache_clear()  # in a notebook a program may have been edited since
     missing = {cell.digest: cell for cell in cells if not _result_path(store, cell).exists()}
-    with progress_bar(title, len(cells), len(cells) - len(missing)) as advance:
+    with terminated_as_interrupted(), progress_bar(title, len(cells), len(cells) - len(missing)) as advance:
         if live:
             for cell in missing.values():
                 keep(cell, compute(cell, live=True), store)

@@ -39,6 +39,14 @@ def signals_handled(
             signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
 
 
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Have SIGTERM raise KeyboardInterrupt within the block, as Ctrl-C does, where it would end this process."""
+    is_deadly = gets_signals() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    with signals_handled(signal.default_int_handler, *([signal.SIGTERM] if is_deadly else [])):
+        yield
+
+
 @asynccontextmanager
 async def cancelled_by_signals() -> AsyncIterator[None]:
     """Let the first Ctrl-C or SIGTERM cancel the task that runs the block; any further one changes nothing.

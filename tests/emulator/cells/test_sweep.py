@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -116,10 +117,13 @@ async def crash(node: Any) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("default_signals")
 def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    signals = iter([signal.SIGINT, signal.SIGTERM])
+
     def one_only(jobs: list[Cell], *_: object) -> Any:
         yield jobs[0], compute(jobs[0])
-        raise KeyboardInterrupt
+        signal.raise_signal(next(signals))
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny.toml").write_text("[run]\nname = 'tiny'\nduration_s = 0.4\n[network]\nvehicles = 3\n")
