@@ -275,8 +275,7 @@ class HostedPrograms:
             finally:
                 asyncio.set_event_loop(None)
                 self.loop.close()
-                running_node.running.show("")
-                self._host.discard_abandoned()
+                self._host.discard_abandoned(running_node.running.show)
                 if (ordered := self._host.mail.ordered) is not None:
                     self._order_steps = ordered.steps
 

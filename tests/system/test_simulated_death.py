@@ -83,6 +83,21 @@ def test_what_ends_the_process_after_the_run_is_a_death_then_and_no_earlier(tmp_
     assert [check["name"] for check in checks if check["verdict"] == "invalid"] == ["agents_alive"]
 
 
+CATCHES_ALL = """while True:
+                try:
+                    await asyncio.sleep(1.0)
+                except BaseException:
+                    pass"""
+
+
+def test_a_program_that_catches_all_that_ends_it_has_died_after_the_run(tmp_path: Path) -> None:
+    """Outside of its loop `asyncio.sleep` fails at once, and the program goes round for ever."""
+    words = [*command(tmp_path, CATCHES_ALL), "--set", "run.stall_timeout_s=0.3"]
+    done = run(words, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
+    assert done.returncode == 1, done.stderr
+    assert died(tmp_path / "run") == {"v02"}
+
+
 LATER = """
 import atexit, ctypes, os, pathlib, threading
 def end():

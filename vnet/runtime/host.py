@@ -587,14 +587,22 @@ class Host:
         self._settle()
         self._thread = None  # what is left of programs is silent, and any thread's collector may find it
 
-    def discard_abandoned(self) -> None:
-        """Discard what is left of programs that were killed or wait at the end, after the loop has been closed."""
+    def discard_abandoned(self, show: Callable[[str], None] = lambda node: None) -> None:
+        """Discard what is left of programs that were killed or wait at the end, after the loop has been closed.
+
+        `show` is told whose code runs: one that catches all that ends it may run on and on.
+        """
         if self._killed:
             with nothing_changed():
-                for task in [task for tasks in self._killed.values() for task in tasks]:
-                    asyncio_internals.close_abandoned(task)
+                for node, tasks in self._killed.items():
+                    show(node.id)
+                    for task in tasks:
+                        asyncio_internals.close_abandoned(task)
         for task in self._left:
+            if (owner := self._tasks[task]) is not None:
+                show(owner.id)
             asyncio_internals.close_abandoned(task)
+        show("")
 
     async def cancel(self) -> None:
         """Cancel all programs and wait a second at most for their `finally` blocks (real time)."""
