@@ -248,6 +248,7 @@ def _why_not_decided_again(recorded: OpenedRun) -> str:
     reasons = {
         "no frame was sent": not len(recorded.trace),
         "in real time the machine has a part in it": run.pacing == "realtime",
+        "where vehicles are in a period that the run did not complete is not known": not recorded.placed.all(),
         "the order of events was not FIFO": run.order != "fifo" or run.tape is not None,
         "the run was cut short": bool(recorded.event(*kinds_with(CUTS_RUN), EventKind.spun, EventKind.died)),
         f"receptions: more than {MOST_RECEPTIONS:,}": len(recorded.trace) > MOST_RECEPTIONS,

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import emulator
 from emulator.checks.folder import check_files
 from emulator.checks.judge import CheckResult, Judgement, RecordedRun, Verdict, check_run
 from emulator.records.manifest import write_manifest
@@ -259,3 +260,21 @@ def test_no_verdict_of_the_file_itself_excuses_its_files(copy: Path) -> None:
     write_manifest(RunFolder(copy))
     files = next(check for check in check_run(copy).checks if check.name == "files")
     assert files.verdict is Verdict.UNKNOWN
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed_m_s", [40.0, -40.0])
+def test_a_folder_is_valid_where_vehicles_meet_or_part_in_a_period_that_the_run_does_not_complete(
+    tmp_path: Path, speed_m_s: float
+) -> None:
+    """Who hears whom changes at 2 s, and the run ends before the period does."""
+    rows = [f"b,{time_s},{100 + (time_s - 1) * speed_m_s},0" for time_s in range(6)]
+    (tmp_path / "trips.csv").write_text("\n".join(["id,time_s,x_m,y_m", "a,0,0,0", "a,5,0,0", *rows]))
+    scenario = {
+        "run": {"duration_s": 2.5, "settle_s": 0.0},
+        "network": {"kind": "trips", "path": str(tmp_path / "trips.csv")},
+        "world": {"gnss": {"rate_hz": 0.5}},
+        "radio": {"range_m": 100.0},
+        "program": {"entry": "tests.emulator.checks.test_faults:talks_on"},
+    }
+    assert broken(check_run(emulator.simulate(scenario, out=tmp_path / "run").folder)) == set()
