@@ -29,7 +29,7 @@ class OwnChild:
     def __init__(self) -> None:
         self._folder = mmap.mmap(-1, LONGEST_PATH)
         self.ending = "ended"
-        """Word for its end by a vehicle: "ended" or "stalled"."""
+        """Word for its end: by a vehicle "ended" or "stalled", by a second SIGTERM "terminated"."""
 
     def told(self, folder: Path) -> None:
         """Take note of the folder that the run has made; of none, that all is done."""
@@ -44,13 +44,15 @@ class OwnChild:
         sys.stdout.flush()
         sys.stderr.flush()
         in_foreground = _is_in_foreground()
-        handled = (*FORWARDED, signal.SIGCHLD)
+        heeded = [each for each in FORWARDED if signal.getsignal(each) is not signal.SIG_IGN]
+        handled = (*heeded, signal.SIGCHLD)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may ignore it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, handled)
         child = os.fork()
         if child == 0:
             if not in_foreground:  # what is sent to the parent's group would reach it twice
                 os.setpgid(0, 0)
+                signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell
             signal_at_parent_death(signal.SIGKILL)
             _leaving.append(self)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -65,17 +67,18 @@ class OwnChild:
                     continue
                 if forwarded and not insists:
                     insists, patience = True, Patience(running_node.running, stall_limit_s)
-                    os.kill(child, min(forwarded))  # the second one ends it at once
+                    os.kill(child, signal.SIGINT)  # the second one ends it at once
                 else:
                     self.ending = "stalled"
                     os.kill(child, signal.SIGKILL)
             elif told.si_signo in FORWARDED:
                 if told.si_signo == signal.SIGTERM and signal.SIGTERM in forwarded:
+                    self.ending = "terminated"
                     os.kill(child, signal.SIGKILL)  # it does not end, as where its main thread has
                 forwarded.add(told.si_signo)
                 if not in_foreground or told.si_code != FROM_TERMINAL:
-                    os.kill(child, told.si_signo)
-        forwarded |= signal.sigpending() & set(FORWARDED)
+                    os.kill(child, signal.SIGINT)  # SIGTERM in it is one that a program sends itself
+        forwarded |= signal.sigpending() & set(heeded)
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
         ended = os.waitstatus_to_exitcode(waited[1])
         # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short.
@@ -88,6 +91,8 @@ class OwnChild:
             sys.stderr.write(f"vnet: {vehicle} does not end, and is killed: the run has no verdict\n")
             sys.stderr.flush()
             return interrupts.exit_now(interrupts.INTERRUPTED)
+        if self.ending == "terminated":
+            ended = -signal.SIGTERM
         if ended < 0:
             if -ended != signal.SIGKILL:
                 signal.signal(-ended, signal.SIG_DFL)

@@ -22,7 +22,7 @@ from typing import Literal
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.local import InLoop, LocalProcesses, Pipes
 from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
-from emulator.drivers.signals import tell_from_handler
+from emulator.drivers.signals import ENDING, gets_signals, signals_handled, tell_from_handler
 from emulator.records.events import EventKind
 from vnet.errors import VnetError, shown
 from vnet.runtime.debug_target import DebugTarget
@@ -113,24 +113,26 @@ def _take_endings(emulation: Emulation, processes: LocalProcesses, time_ns: int,
 def _ending_between_windows(
     processes: LocalProcesses, stop: threading.Event, on_interrupt: Callable[[], None]
 ) -> Iterator[None]:
-    """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done."""
+    """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done.
+
+    And SIGTERM, where they run in processes of their own: one that ends this process may be a program's.
+    """
 
     def ask(number: int, frame: object) -> None:
         stop.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for each in mine:
+            signal.signal(each, signal.default_int_handler)
         tell_from_handler(on_interrupt)
 
-    here = threading.current_thread() is threading.main_thread()
-    if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # others see to it
-        processes.no_signal_raises = lambda: not here or signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    def can_raise(number: signal.Signals) -> bool:
+        return signal.getsignal(number) not in (ask, signal.SIG_DFL, signal.SIG_IGN)
+
+    numbers = ENDING if isinstance(processes, Pipes) else (signal.SIGINT,)
+    handled = {each: signal.getsignal(each) for each in numbers if gets_signals()}
+    mine = [each for each, by in handled.items() if by in (signal.SIG_DFL, signal.default_int_handler)]
+    processes.no_signal_raises = lambda: not any(map(can_raise, handled))
+    with signals_handled(ask, *mine):  # others see to the rest
         yield
-        return
-    signal.signal(signal.SIGINT, ask)
-    processes.no_signal_raises = lambda: signal.getsignal(signal.SIGINT) is ask
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 OBJECTS_A_VEHICLE = 100

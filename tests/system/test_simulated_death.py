@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -247,14 +248,39 @@ AT_TERMINAL = (
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_signal_that_ends_the_command_ends_its_child(tmp_path: Path, number: signal.Signals) -> None:
-    """And is not taken for the vehicle's death."""
+    """And is not taken for the vehicle's death. The first SIGTERM waits until programs yield, which none does."""
     pid_file = tmp_path / "pid"
     process = Command(command(tmp_path, ENDLESS), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         wait_until(pid_file.exists, process)
         assert int(pid_file.read_text()) != process.pid
         process.send_signal(number)
+        if number is signal.SIGTERM:
+            assert process.stderr is not None
+            assert any("as soon as the programs yield" in str(line) for line in process.stderr)
+            process.send_signal(number)
         assert process.wait(TIMEOUT_S) == -number
         process.communicate(timeout=TIMEOUT_S)  # the child has closed its ends
     finally:
         process.kill()
+
+
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_sigterm_is_an_interrupt_and_one_that_a_program_sends_itself_its_death(
+    tmp_path: Path, processes: str
+) -> None:
+    told = "pathlib.Path('new').write_text('x'); os.rename('new', 'pid')"
+    words = [*command(tmp_path, told), "--processes", processes, "--duration", "3000"]
+    process = Command(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        wait_until((tmp_path / "pid").exists, process)
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=TIMEOUT_S)
+        assert process.returncode == 130
+    finally:
+        process.kill()
+    assert [event["kind"] for event in events(tmp_path / "run")][-2:] == ["interrupted", "ended"]
+    shutil.rmtree(tmp_path / "run")
+    itself = [*command(tmp_path, "os.kill(os.getpid(), 15)"), "--processes", processes]
+    assert run(itself, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S).returncode == 1
+    assert "v02" in died(tmp_path / "run")
