@@ -267,7 +267,7 @@ def test_no_verdict_of_the_file_itself_excuses_its_files(copy: Path) -> None:
 def test_a_folder_is_valid_where_vehicles_meet_or_part_in_a_period_that_the_run_does_not_complete(
     tmp_path: Path, speed_m_s: float
 ) -> None:
-    """Who hears whom changes at 2 s, and the run ends before the period does."""
+    """Links change at 2 s, and the run ends before the period does."""
     rows = [f"b,{time_s},{100 + (time_s - 1) * speed_m_s},0" for time_s in range(6)]
     (tmp_path / "trips.csv").write_text("\n".join(["id,time_s,x_m,y_m", "a,0,0,0", "a,5,0,0", *rows]))
     scenario = {
