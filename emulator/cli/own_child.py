@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
@@ -19,6 +20,8 @@ from vnet.runtime.running_node import LOOK_S, Patience
 LONGEST_PATH = 4096
 """Bytes of the path of a run's folder."""
 FORWARDED = (signal.SIGINT, signal.SIGTERM)
+AGAIN_S = 1.0
+"""Least time after which a second SIGTERM is a new one: `timeout` sends it to the command, and to its group."""
 FROM_TERMINAL = 0x80
 """`si_code` of a signal that the kernel sends, as Ctrl-C does to all of the terminal's foreground (SI_KERNEL)."""
 
@@ -43,7 +46,7 @@ class OwnChild:
         """
         sys.stdout.flush()
         sys.stderr.flush()
-        in_foreground = _is_in_foreground()
+        in_foreground = interrupts.is_in_foreground()
         heeded = [each for each in FORWARDED if signal.getsignal(each) is not signal.SIG_IGN]
         handled = (*heeded, signal.SIGCHLD)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may ignore it
@@ -58,7 +61,7 @@ class OwnChild:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return None
         forwarded: set[int] = set()
-        insists = False
+        insists, terminated_s = False, 0.0
         patience = Patience(running_node.running, stall_limit_s)
         while not (waited := os.waitpid(child, os.WNOHANG))[0]:
             told = signal.sigtimedwait(handled, LOOK_S)
@@ -73,8 +76,12 @@ class OwnChild:
                     os.kill(child, signal.SIGKILL)
             elif told.si_signo in FORWARDED:
                 if told.si_signo == signal.SIGTERM and signal.SIGTERM in forwarded:
+                    if time.monotonic() < terminated_s + AGAIN_S:
+                        continue
                     self.ending = "terminated"
                     os.kill(child, signal.SIGKILL)  # it does not end, as where its main thread has
+                if told.si_signo == signal.SIGTERM:
+                    terminated_s = time.monotonic()
                 forwarded.add(told.si_signo)
                 if not in_foreground or told.si_code != FROM_TERMINAL:
                     os.kill(child, signal.SIGINT)  # SIGTERM in it is one that a program sends itself
@@ -114,15 +121,6 @@ def leave(status: int) -> NoReturn:
             stream.flush()
     _leaving[0].told(Path())
     interrupts.exit_now(status)
-
-
-def _is_in_foreground() -> bool:
-    """Return whether this process may read from its terminal: Ctrl-C there is for its group."""
-    try:
-        with Path("/dev/tty").open() as terminal:
-            return os.tcgetpgrp(terminal.fileno()) == os.getpgrp()
-    except OSError:
-        return False
 
 
 def may_fork() -> bool:

@@ -44,7 +44,7 @@ from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.node import Node
-from vnet.runtime import running_node
+from vnet.runtime import interrupts, running_node
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.die_with_parent import signal_at_parent_death
@@ -674,6 +674,8 @@ def _be(
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if not interrupts.is_in_foreground():  # nothing that ends the parent's group is a program's end
+            os.setpgid(0, 0)
         signal.signal(signal.SIGUSR1, partial(_tell_stack, connection, os.getpid()))
         signal_at_parent_death(signal.SIGKILL)
         detach()
