@@ -543,7 +543,8 @@ def _wrong_payloads(recorded: OpenedRun, cost: RunCost) -> dict[str, tuple[Any, 
     sizes = recorded.column("size_bytes")[first]
     due = run_cost(Costs(), recorded.node_ids, recorded.sender[first], sizes, len(recorded.node_ids))
     of_node = {vehicle.node: vehicle.payload for vehicle in due.vehicles}
-    seen = dict(zip(recorded.node_ids, recorded.places.always_in_range.tolist(), strict=True))
+    always = recorded.places.always_in_range & recorded.places.is_whole
+    seen = dict(zip(recorded.node_ids, always.tolist(), strict=True))
     told = [("cost.payload", cost.payload, due.payload, all(seen.values()))]
     for vehicle in cost.vehicles:
         payload = of_node.get(vehicle.node, PayloadSizes(-1))

@@ -328,7 +328,7 @@ def _collided_alone(air: _Air) -> NDArray[np.intp]:
     A frame that nobody is in range of has no row: receivers that sent such frames may have collided with their own.
     """
     recorded = air.recorded
-    seen = recorded.places.always_in_range[recorded.receiver]
+    seen = recorded.places.always_in_range[recorded.receiver] & recorded.places.known(recorded.column("left_ns"))
     rows = np.flatnonzero(recorded.outcome_is("collided") & recorded.placed & seen)
     return np.asarray(rows[~_audible(air, rows)])
 
@@ -399,6 +399,7 @@ def broken_rules(recorded: RecordedRun, mac: Sidelink) -> dict[str, NDArray[np.i
     deaf = _transmit(recorded.receiver, recorded, mac, rows, key).all(axis=0)
     outcome_deaf = recorded.outcome_is("half_duplex")[rows]
     seen = recorded.places.always_in_range[recorded.receiver[rows]]
+    seen &= recorded.places.known(recorded.on_air_ns[rows])
     judged = recorded.outcome_is(*ON_AIR)[rows]
     return {
         "unaligned": rows[_unaligned(recorded, mac, rows)],

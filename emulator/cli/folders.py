@@ -81,7 +81,7 @@ def trace(
             raise VnetError(f"--to {end:g}: must come after --from {start:g}")
         recorded = RecordedRun.open(run)
         ended_s = recorded.closed_ns / NS_PER_S
-        if start >= ended_s:
+        if start and start >= ended_s:
             raise VnetError(f"--from {start:g}: must come before the run's end at {ended_s:g} s")
         if node is not None and node not in recorded.number:
             raise VnetError(f"--node {node}: no such vehicle{did_you_mean(node, recorded.node_ids)}")

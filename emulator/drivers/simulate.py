@@ -127,10 +127,11 @@ def _ending_between_windows(
     def can_raise(number: signal.Signals) -> bool:
         return signal.getsignal(number) not in (ask, signal.SIG_DFL, signal.SIG_IGN)
 
-    numbers = ENDING if isinstance(processes, Pipes) else (signal.SIGINT,)
-    handled = {each: signal.getsignal(each) for each in numbers if gets_signals()}
-    mine = [each for each, by in handled.items() if by in (signal.SIG_DFL, signal.default_int_handler)]
-    processes.no_signal_raises = lambda: not any(map(can_raise, handled))
+    before = {each: signal.getsignal(each) for each in ENDING if gets_signals()}
+    mine = [each for each, by in before.items() if by is signal.default_int_handler]
+    if isinstance(processes, Pipes) and before.get(signal.SIGTERM) is signal.SIG_DFL:
+        mine.append(signal.SIGTERM)
+    processes.no_signal_raises = lambda: not any(map(can_raise, before))
     with signals_handled(ask, *mine):  # others see to the rest
         yield
 

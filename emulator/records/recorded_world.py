@@ -200,7 +200,8 @@ class Places:
         self._connectivity = connectivity
         periods_ns = np.arange(len(position_m)) * period_ns
         self._end_ns = len(position_m) * period_ns if moves else end_ns
-        self._is_whole = self._end_ns >= end_ns
+        self.is_whole = self._end_ns >= end_ns
+        """False if the run ended within a period, in which positions are not known."""
         changes_ns = connectivity.changes_ns
         known = changes_ns < (self._end_ns if len(position_m) else 0)
         self.starts_ns = np.union1d(periods_ns, changes_ns[known])
@@ -339,11 +340,8 @@ class Places:
 
     @cached_property
     def always_in_range(self) -> Mask:
-        """(N,), who is known to have had somebody in range throughout: each of its frames has rows.
-
-        Nobody is where the run ended within a period.
-        """
-        return np.asarray((self._degrees[0] > 0).all(axis=0) & self._is_whole)
+        """(N,), who had somebody in range as long as positions are known: each of its frames then has rows."""
+        return np.asarray((self._degrees[0] > 0).all(axis=0))
 
     def were_lonely(self, sender: NDArray[np.intp], start_ns: IntArray, end_ns: IntArray) -> Mask:
         """(n,), whether each of these senders had nobody in range at some time from one instant to another."""
