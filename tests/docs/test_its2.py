@@ -186,7 +186,7 @@ def test_a_vam_of_a_clock_that_is_ahead_has_its_time() -> None:
     assert decoded is not None and decoded.time_ns == message.time_ns
 
 
-def test_a_message_with_a_flipped_bit_and_other_bytes_are_a_message_or_none() -> None:
+def test_a_message_with_a_flipped_bit_or_cut_short_is_a_message_or_none() -> None:
     message = Message(7, 10**9, (10.0, -20.0), objects=(Seen((50.0, 60.0), (3.0, -4.0)),))
     sent = station.Message(message.station, message.position_m, cause=station.EMERGENCY_BRAKE)
     encoded = [
