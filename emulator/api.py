@@ -75,7 +75,8 @@ def simulate(
         if is_fit():
             path = _interruptible(lambda stop: simulate_into(loaded, folder, stop, processes=processes))
         else:
-            path = call_fitly(Place.here(loaded), simulate_into, loaded, folder, None, "", processes)
+            how = loaded, folder, None, "", processes
+            path = call_fitly(Place.here(loaded), simulate_into, *how, stall_limit_s=loaded.run.stall_timeout_s)
         return Run.open(path)
     why = _why_not_warranted(function)
     with given_programs({loaded.program.entry: function}):

@@ -28,7 +28,7 @@ import pyarrow.parquet as pq
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from emulator.cells.worker import Place, Worker, WorkerDiedError, call_fitly, modules_of
+from emulator.cells.worker import Place, Worker, WorkerDiedError, WorkerTimeoutError, call_fitly, modules_of
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session, over_zenoh
@@ -88,9 +88,9 @@ class WorkerPool(Executor):
             return self._threads.submit(self.call, *args, **kwargs)
         return self._threads.submit(fn, *args, **kwargs)
 
-    def call(self, place: Place, function: Callable[..., T], *args: Any, limit_s: float | None = None) -> T:
-        """Return what the function returns in a worker process of the calling thread."""
-        return self._worker(place).call(function, *args, limit_s=limit_s)
+    def call(self, place: Place, function: Callable[..., T], *args: Any, **limits: Any) -> T:
+        """Return what the function returns in a worker of the calling thread; limits are those of `call_fitly`."""
+        return self._worker(place).call(function, *args, **limits)
 
     def _worker(self, place: Place) -> Worker:
         worker: Worker | None = getattr(self._local, "worker", None)
@@ -140,7 +140,8 @@ def each_done(
         key = modules_of(job.scenario), job.scenario.program.folders
         if key not in places:
             places[key] = Place.here(job.scenario)
-        return pool.submit(call_fitly, places[key], function, job)
+        stall_limit_s = job.scenario.run.stall_timeout_s
+        return pool.submit(call_fitly, places[key], function, job, stall_limit_s=stall_limit_s)
 
     waiting: dict[Future[R], tuple[J, int]] = {}
     try:
@@ -155,6 +156,8 @@ def each_done(
                     raise VnetError(
                         f"cell {dict(job.labels)}: the executor is broken; run it again to go on"
                     ) from None
+                except WorkerTimeoutError as error:
+                    raise VnetError(f"cell {dict(job.labels)}: {error}") from None
                 except Exception as error:
                     if not worker_died(error):
                         raise

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import math
 import os
 import pickle
 import signal
@@ -33,8 +34,10 @@ from emulator.records.code_digest import digests_of, entries_of, rules_of
 from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ProgramError, ScenarioError, VnetError, shown
+from vnet.runtime import running_node
 from vnet.runtime.environment import SAME_ARITHMETIC, has_same_arithmetic
 from vnet.runtime.programs import Program
+from vnet.runtime.running_node import LONGEST_ID, LOOK_S, Patience, RunningNode
 
 T = TypeVar("T")
 LONGEST_TAIL_BYTES = 1000
@@ -48,7 +51,7 @@ class WorkerDiedError(VnetError):
 
 
 class WorkerTimeoutError(VnetError):
-    """A job took longer than it may."""
+    """A job took longer than it may, or a program of its did without a pause."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +94,17 @@ def is_fit() -> bool:
     return sys.flags.hash_randomization == 0 and has_same_arithmetic()
 
 
-def call_fitly(place: Place, function: Callable[..., T], *arguments: Any, limit_s: float | None = None) -> T:
+def call_fitly(
+    place: Place,
+    function: Callable[..., T],
+    *arguments: Any,
+    limit_s: float | None = None,
+    stall_limit_s: float = math.inf,
+) -> T:
     """Return what a function returns in a fit process, whose programs are found as in `place`.
 
-    With `limit_s` that is never this process, so that it can be ended after so many seconds of wall clock.
+    With `limit_s` that is never this process, so that it can be ended after so many seconds of wall clock. Another
+    process is ended, too, once a node's code has run in it for `stall_limit_s` without a pause.
     Raises what the function raises, WorkerDiedError if the process ends before, and WorkerTimeoutError.
     """
     is_here = is_fit() and threading.current_thread() is threading.main_thread() and _entered in ([], [place])
@@ -106,7 +116,7 @@ def call_fitly(place: Place, function: Callable[..., T], *arguments: Any, limit_
         if worker is not None:
             worker.close()
         worker = _kept.worker = Worker(place)
-    return worker.call(function, *arguments, limit_s=limit_s)
+    return worker.call(function, *arguments, limit_s=limit_s, stall_limit_s=stall_limit_s)
 
 
 _kept = threading.local()
@@ -122,13 +132,16 @@ class Worker:
         self.place = place
         mine, its = socket.socketpair()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the process
-        with its:
+        with its, tempfile.TemporaryFile() as shown:
+            shown.truncate(LONGEST_ID + 1)
+            self._running = RunningNode(shown.fileno())
+            passed = its.fileno(), shown.fileno()
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "emulator.cells.worker", str(its.fileno())],
+                [sys.executable, "-P", "-m", "emulator.cells.worker", *map(str, passed)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=self._errors,
-                pass_fds=[its.fileno()],
+                pass_fds=passed,
                 process_group=0,  # Ctrl-C is for whoever has started it
                 cwd=place.folder if Path(place.folder).is_dir() else None,
                 env={**os.environ, **_with_vnet(os.environ), **SAME_ARITHMETIC, "PYTHONHASHSEED": "0"},
@@ -148,20 +161,31 @@ class Worker:
         """Id of the process."""
         return self._process.pid
 
-    def call(self, function: Callable[..., T], *arguments: Any, limit_s: float | None = None) -> T:
+    def call(
+        self,
+        function: Callable[..., T],
+        *arguments: Any,
+        limit_s: float | None = None,
+        stall_limit_s: float = math.inf,
+    ) -> T:
         """Return what the function returns there, or raise what it raises.
 
-        Raises WorkerDiedError, and WorkerTimeoutError after `limit_s` seconds. Ctrl-C interrupts the function.
+        Raises WorkerDiedError, and WorkerTimeoutError after `limit_s` seconds, or once a node's code has run for
+        `stall_limit_s` without a pause. Ctrl-C interrupts the function.
         """
         if not self._entered:
-            self._ask(self.place.enter, (), None)
+            self._ask(self.place.enter, (), None, math.inf)
             self._entered = True
-        return self._ask(function, arguments, limit_s)
+        return self._ask(function, arguments, limit_s, stall_limit_s)
 
-    def _ask(self, function: Callable[..., T], arguments: tuple[Any, ...], limit_s: float | None) -> T:
+    def _ask(
+        self, function: Callable[..., T], arguments: tuple[Any, ...], limit_s: float | None, stall_limit_s: float
+    ) -> T:
         try:
             self._connection.send_bytes(pickle.dumps((function, arguments)))
-            if not self._connection.poll(limit_s):
+            if limit_s is None and stall_limit_s < math.inf:
+                self._wait(stall_limit_s)
+            elif not self._connection.poll(limit_s):
                 self.close()
                 raise WorkerTimeoutError(f"not over within {limit_s:g} s of wall clock")
             succeeded, value = self._connection.recv()
@@ -173,6 +197,15 @@ class Worker:
         if succeeded:
             return value  # type: ignore[no-any-return]
         raise value
+
+    def _wait(self, stall_limit_s: float) -> None:
+        """Wait for an answer. Raises WorkerTimeoutError."""
+        patience = Patience(self._running, stall_limit_s, has_user=False)
+        while not self._connection.poll(LOOK_S):
+            if patience.is_over(self.pid):
+                node = self._running.read()
+                self.close()
+                raise WorkerTimeoutError(f"{node}: no yield within {stall_limit_s:g} s of wall clock")
 
     def _interrupt(self) -> None:
         with suppress(OSError, EOFError):
@@ -216,8 +249,10 @@ def _with_vnet(environment: Mapping[str, str]) -> dict[str, str]:
 # In the worker.
 
 
-def _serve(descriptor: int) -> None:
-    """Do the jobs that come in on a connection, until it is closed at the other end."""
+def _serve(descriptor: int, shown: int) -> None:
+    """Do the jobs that come in on a connection, until it is closed at the other end; show whose code runs."""
+    running_node.running = RunningNode(shown)
+    os.close(shown)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell starts in the background
     connection = Connection(descriptor)
     jobs: SimpleQueue[bytes] = SimpleQueue()
@@ -256,7 +291,7 @@ def _portable(error: BaseException) -> BaseException:
 if __name__ == "__main__":
     from emulator.cells.worker import _serve as serve  # so that its classes are those that others import
 
-    serve(int(sys.argv[1]))
+    serve(*map(int, sys.argv[1:]))
 
 
 def entry_of(program: str | Program | None) -> str | None:

@@ -233,7 +233,7 @@ def _become(request: dict[str, Any], descriptors: list[int], address: bytes) -> 
 def _be(module: str) -> int:
     """Be the command that runs a module; return its exit status."""
     if module == WORKER:
-        emulator.cells.worker._serve(int(sys.argv[1]))
+        emulator.cells.worker._serve(*map(int, sys.argv[1:]))
     elif module == CHECK:
         return agents.program_check.main(sys.argv[1:])
     elif module == AGENT[-1]:

@@ -53,10 +53,10 @@ class Patience:
     terminal a process that waits may wait for its user, as in `breakpoint()`.
     """
 
-    def __init__(self, running: RunningNode, limit_s: float) -> None:
+    def __init__(self, running: RunningNode, limit_s: float, has_user: bool | None = None) -> None:
         self._running = running
         self._most = math.ceil(limit_s / LOOK_S)
-        self._has_user = sys.stdin is not None and sys.stdin.isatty()
+        self._has_user = sys.stdin is not None and sys.stdin.isatty() if has_user is None else has_user
         self._seen, self._looks = b"", 0
 
     def is_over(self, pid: int) -> bool:

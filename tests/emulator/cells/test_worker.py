@@ -18,6 +18,7 @@ from emulator.cells.worker import Place, Worker, WorkerDiedError, WorkerTimeoutE
 from emulator.scenario.scenario import Scenario
 from tests.support.paths import ROOT
 from vnet.errors import PayloadTooLargeError, ScenarioError, VnetError
+from vnet.runtime import running_node
 
 pytestmark = pytest.mark.slow
 
@@ -140,6 +141,17 @@ def test_a_job_whose_worker_dies_is_run_again_but_not_for_ever(
     assert next(done) == (works[0], 2)
     with pytest.raises(VnetError, match=r"^cell \{'seed': 2\}: its process ended with SIGKILL, 2 times$"):
         next(done)
+
+
+def run_on(work: Work) -> None:
+    running_node.running.show("v07")
+    time.sleep(1000)
+
+
+def test_a_job_whose_program_runs_on_and_on_is_ended_and_named(tmp_path: Path) -> None:
+    impatient = Scenario.model_validate({"run": {"stall_timeout_s": 0.1}})
+    with pytest.raises(VnetError, match=r"^cell \{'seed': 1\}: v07: no yield within 0\.1 s of wall clock$"):
+        next(each_done([Work(impatient, {"seed": 1}, tmp_path, 0)], run_on, most=1))
 
 
 def test_a_pool_that_is_closed_gives_up_what_it_does() -> None:
