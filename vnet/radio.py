@@ -251,8 +251,8 @@ class Radio:
         The frame is transmitted again until an acknowledgement comes, up to 7 times in all. The result comes one
         `radio.latency_ms` after the sender's MAC knows it. Cancelling the call stops no transmission. The other
         arguments and exceptions are those of `broadcast`; raise ValueError also without `[radio.mac]` of 802.11p,
-        and for a `to` that is no other vehicle's name. A name that no vehicle has is not acknowledged, with 0
-        attempts.
+        and for a `to` that is no text, or the vehicle's own name. A name that no vehicle has is not acknowledged,
+        with 0 attempts.
         """
         if not self.acknowledges:
             raise ValueError(

@@ -292,10 +292,10 @@ CHECKS: list[Check] = [
     Check(
         check_own_rules,
         FAULTS,
-        "Rules of your own (`custom`, `custom_sender`) answered each frame. One that fails is named with its error "
-        "and line, and lets everything pass from then on.",
-        invalid="a rule raised, did not answer, or answered nonsense",
-        not_applicable="no rule of your own",
+        "Rules of your own (`custom`, `custom_sender`) answered each frame, and sensors of your own each period. A "
+        "rule that fails is named with its error and line, and lets everything pass from then on.",
+        invalid="a rule or a sensor raised, did not answer, or answered nonsense",
+        not_applicable="no rule and no sensor of your own",
         without_positions=WithoutPositions.JUDGE,
     ),
     Check(

@@ -140,9 +140,10 @@ def eventually(
     entered_s = {m.node: m.time_s for m in reversed(present) if nodes is None or m.node in nodes}
     reached: dict[str, float] = {}
     for moment in present if at == PERIOD else moments(run, at):
-        waited_s = moment.time_s - entered_s.get(moment.node, math.inf)
-        asked = moment.node not in reached and waited_s <= within_s + _ROUNDING_S
-        if asked and _ask(name, predicate, moment):
+        if moment.node not in entered_s or moment.node in reached:
+            continue
+        waited_s = moment.time_s - entered_s[moment.node]
+        if waited_s <= within_s + _ROUNDING_S and _ask(name, predicate, moment):
             reached[moment.node] = waited_s
     end_s = _end_ns(run) / NS_PER_S
     late = [

@@ -566,5 +566,7 @@ def _restarts(recorded: RecordedRun) -> list[tuple[str, int]]:
         nodes, time_ns = np.flatnonzero(planned.nodes), planned.end_ns
         if planned.start_ns < time_ns < recorded.closed_ns:
             before, after = (recorded.is_down(nodes, np.full(len(nodes), at)) for at in (time_ns - 1, time_ns))
-            found |= {(recorded.node_ids[node], time_ns) for node in nodes[before & ~after].tolist()}
+            ended = np.array([recorded.deaths_ns.get(node) == time_ns for node in nodes.tolist()], dtype=bool)
+            back = before & (~after | ended)  # a program may end at the instant at which it is started again
+            found |= {(recorded.node_ids[node], time_ns) for node in nodes[back].tolist()}
     return sorted(found - entered)

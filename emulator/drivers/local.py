@@ -313,16 +313,37 @@ class HostedPrograms:
 
 @contextmanager
 def process_kept() -> Iterator[None]:
-    """Take back what programs have changed of this process within the block, which goes on without them."""
+    """Take back what programs have changed of this process within the block, which goes on without them.
+
+    The processes that they have started are ended, as by a live vehicle's end, unless another thread may have.
+    """
     folder, variables, modules = Path.cwd(), dict(os.environ), list(sys.path)
+    here = threading.current_thread()
+    is_alone = here is threading.main_thread() and all(
+        each.daemon or each is here for each in threading.enumerate()
+    )
+    others: set[int | None] = set(_started_processes(os.getpid()))
     try:
         yield
     finally:
+        tracker = getattr(sys.modules.get("multiprocessing.resource_tracker"), "_resource_tracker", None)
+        others.add(getattr(tracker, "_pid", None))  # which ends by itself, once it has removed what others left
+        for process in set(_started_processes(os.getpid())) - others if is_alone else ():
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
         os.chdir(folder)
         sys.path[:] = modules
         if os.environ != variables:
             os.environ.clear()
             os.environ.update(variables)
+
+
+def _started_processes(by: int) -> Iterator[int]:
+    """Yield the processes that one has started, and that these have; none where the system does not tell."""
+    with suppress(OSError):
+        for file in Path(f"/proc/{by}/task").glob("*/children"):
+            for process in map(int, file.read_text().split()):
+                yield from (process, *_started_processes(process))
 
 
 # What simulated programs print goes to the terminal, and to `logs/NODE.log` as in a run of many processes.

@@ -38,6 +38,8 @@ ENTRY = "emulator.learning.episode:vehicle"
 """Entry by which a scenario names the program of agents."""
 THINKING_S = 1e-6
 """Emulated time from the fixes of a period to what agents do."""
+FOR_EVER_S = 1e9
+"""Emulated time that no run takes."""
 NO_REPLAY = "not warranted: what vehicles did was decided outside of the run"
 
 
@@ -161,7 +163,10 @@ class Episode:
             loop.call_later(THINKING_S, self._take_turn, fix_time_ns, context=Context())
         future: asyncio.Future[tuple[bool, Any]] = loop.create_future()
         self._asking[node] = observation, future
-        return await future
+        answer = await future
+        if self._stop.is_set():  # the run ends with this window, and its programs as if they still acted
+            await asyncio.sleep(FOR_EVER_S)
+        return answer
 
     def _take_turn(self, time_ns: int) -> None:
         """Stop emulated time until the caller has answered."""
@@ -169,9 +174,7 @@ class Episode:
         asking = {node: each for node, each in asking.items() if not each[1].done()}  # not of killed programs
         observed = {node: observation for node, (observation, _) in asking.items()}
         self._turns.put(Turn(time_ns, observed))
-        answers = self._answers.get()
-        if answers is None:
-            return
+        answers = self._answers.get() or {}
         for node, (_, future) in asking.items():
             future.set_result((node in answers, answers.get(node)))
 

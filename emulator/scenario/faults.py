@@ -592,7 +592,7 @@ class Range(NodeFault):
 
 
 class Swizzle(NodeFault):
-    """The nodes are cut off one by one, and then come back in another order, each for half of `over_s`."""
+    """The nodes are cut off one by one in the first half of `over_s`, and come back in the second in any order."""
 
     cuts: ClassVar[bool] = True
 

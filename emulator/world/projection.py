@@ -104,7 +104,13 @@ def project(
 
 
 def middle_deg(latitude_deg: Array, longitude_deg: Array) -> tuple[float, float]:
-    """Return the centre of the bounding box of these points (n,), of which there is at least one."""
+    """Return the centre of the bounding box of these points (n,), of which there is at least one.
+
+    Where longitudes are more than half of the earth apart, the box lies across the antimeridian.
+    """
+    if np.ptp(longitude_deg) > 180.0:
+        middle = _middle(np.mod(longitude_deg, 360.0))
+        return _middle(latitude_deg), middle - 360.0 if middle > 180.0 else middle
     return _middle(latitude_deg), _middle(longitude_deg)
 
 

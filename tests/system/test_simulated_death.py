@@ -100,6 +100,16 @@ def test_a_program_that_catches_all_that_ends_it_has_died_after_the_run(tmp_path
     assert died(tmp_path / "run") == {"v02"}
 
 
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_what_a_program_has_started_ends_with_the_simulation(tmp_path: Path, processes: str) -> None:
+    """Otherwise it would keep what is printed open, and who reads that would wait for ever."""
+    begins = "__import__('subprocess').Popen(['sh', '-c', 'sleep 1000; true'])"
+    done = run(
+        [*command(tmp_path, begins), "--processes", processes], cwd=tmp_path, capture_output=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+
+
 LATER = """
 import atexit, ctypes, os, pathlib, threading
 def end():

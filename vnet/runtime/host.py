@@ -625,13 +625,13 @@ class Host:
             if self._debugger is not None:
                 self._debugger.begin(node.id, program)
             await program(node)
-        except GeneratorExit:
+        except (GeneratorExit, KeyboardInterrupt):
             raise
         except asyncio.CancelledError as error:  # of a task that the program awaits, unless vnet has cancelled it
             if self._closing or not self._runs(node):
                 raise
             self._exited(node, error)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             if self._debugger is not None and isinstance(error, Exception):
                 self._debugger.crashed(node.id, error)
             self._exited(node, error)

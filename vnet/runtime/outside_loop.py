@@ -171,10 +171,9 @@ def attach() -> None:
         threading.Thread.start = _start_noted  # type: ignore[assignment, method-assign]
     if _thread.start_new_thread is _start_new_thread:
         _thread.start_new_thread = _start_new_noted
-    processes = sys.modules.get("concurrent.futures.process")  # slow to import, and few programs need it
-    for kind in (ThreadPoolExecutor, *([processes.ProcessPoolExecutor] if processes else [])):
-        if not hasattr(kind.submit, "__wrapped__"):
-            kind.submit = _noted(kind.submit)
+    Executor.__init_subclass__ = classmethod(_note_pools)  # type: ignore[assignment, method-assign]
+    for kind in (ThreadPoolExecutor, *Executor.__subclasses__()):
+        _note_pools(kind)
     if sys.unraisablehook is not _unraisable:
         _before = (sys.unraisablehook, _before[1])
         sys.unraisablehook = _unraisable
@@ -267,6 +266,12 @@ def _noted(submit: Callable[..., Future[Any]]) -> Callable[..., Future[Any]]:
         return job
 
     return submit_noted
+
+
+def _note_pools(kind: type[Executor]) -> None:
+    """Note the jobs of Python's own executors; that of processes is slow to import, and few programs do."""
+    if kind.__module__.startswith("concurrent.futures.") and not hasattr(kind.submit, "__wrapped__"):
+        kind.submit = _noted(kind.submit)  # type: ignore[method-assign]
 
 
 def _on_behalf_of(owner: Node, job: Callable[..., Any], /, *args: Any, **options: Any) -> Any:

@@ -329,12 +329,13 @@ READERS: dict[str, Callable[[Path, tuple[float, float] | None], Roads]] = {
 }
 
 
-def read_roads(path: Path, origin_deg: tuple[float, float] | None = None) -> Roads:
+def read_roads(path: str | Path, origin_deg: tuple[float, float] | None = None) -> Roads:
     """Read a map. `origin_deg` (latitude, longitude) is the origin of its metres.
 
     Without it the origin is the centre of the map, or the one that a file in metres states. Raise ScenarioError, in
     one line that names the file and the line or feature, for a bad file.
     """
+    path = Path(path)
     reader = _by_ending(path, READERS)
     try:
         size = path.stat().st_size

@@ -111,7 +111,8 @@ def choose_columns(path: Path, names: Sequence[str]) -> list[str]:
 
     Raise ScenarioError if one is missing, or appears twice.
     """
-    where = METRES if set(METRES) <= set(names) else DEGREES
+    metres, degrees = set(METRES) & set(names), set(DEGREES) & set(names)
+    where = METRES if len(metres) > len(degrees) or len(metres) == len(METRES) else DEGREES
     for name in ("id", "time_s", *where):
         if name not in names:
             raise ScenarioError(
@@ -384,12 +385,13 @@ def own_samples(network: Network, program: Program, duration_s: float) -> Sample
         raise ScenarioError(f"{problem}: returns {shown(answer)}: a dict from ids to samples is needed")
     samples, first = Samples(Path(problem), "sample"), 1
     tables = {name: _table(problem, name, rows) for name, rows in answer.items()}
-    width = min(table.shape[1] for table in tables.values())
+    width = max(table.shape[1] for table in tables.values())
     if sum(map(len, tables.values())) > MOST_SAMPLES:
         raise ScenarioError(f"{problem}: more than {MOST_SAMPLES:,} samples")
     for name, table in tables.items():
         lines = np.arange(first, first + len(table))
-        columns = dict(zip(COLUMNS[:width], table.T, strict=False))
+        headed = np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan)
+        columns = dict(zip(COLUMNS, headed.T, strict=False))
         samples.add(pa.array([str(name)] * len(table)), lines, columns)
         first += len(table)
     return samples

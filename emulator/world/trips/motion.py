@@ -94,7 +94,7 @@ MOST_STATES = 50_000_000
 @dataclass(frozen=True)
 class Trip:
     """One vehicle's samples: `time_s` (n,) increasing, `position_m` (n, 2), and optionally `heading_rad` and
-    `speed_mps` (n,).
+    `speed_mps` (n,), of which those that are NaN are interpolated.
     """
 
     node_id: str
@@ -225,7 +225,7 @@ class Samples:
         trips = []
         for rows in np.split(order, np.flatnonzero(np.diff(code)) + 1):
             optional = {name: columns[name][rows] for name in OPTIONAL if name in columns}
-            known = {name: values for name, values in optional.items() if not np.isnan(values).any()}
+            known = {name: values for name, values in optional.items() if not np.isnan(values).all()}
             name = names[int(columns["code"][rows[0]])]
             trips.append(Trip(name, columns["time_s"][rows], position_m[rows], **known))
         return trips
@@ -572,14 +572,14 @@ def _resample(driven: Array, trip: Trip, rows: NDArray[np.intp], selection: Sele
 
     periods = slice(first, last + 1)
     driven[periods, 0], driven[periods, 1] = (at(axis_m, at_s) for axis_m in trip.position_m.T)
-    if trip.heading_rad is not None:
-        unwound = np.unwrap(trip.heading_rad[rows])
-        driven[periods, 2] = np.mod(np.interp(at_s, time_s, unwound), 2 * np.pi)
+    if trip.heading_rad is not None and (told := ~np.isnan(trip.heading_rad[rows])).any():
+        unwound = np.unwrap(trip.heading_rad[rows][told])
+        driven[periods, 2] = np.mod(np.interp(at_s, time_s[told], unwound), 2 * np.pi)
         return
     early_s, late_s = np.maximum(at_s - CHORD_S, time_s[0]), np.minimum(at_s + CHORD_S, time_s[-1])
     chord_m = np.array([at(axis_m, late_s) - at(axis_m, early_s) for axis_m in trip.position_m.T])
-    if trip.speed_mps is not None:
-        speed_mps = at(trip.speed_mps, at_s)
+    if trip.speed_mps is not None and (told := ~np.isnan(trip.speed_mps[rows])).any():
+        speed_mps = np.interp(at_s, time_s[told], trip.speed_mps[rows][told])
     else:
         speed_mps = np.hypot(*chord_m) / np.maximum(late_s - early_s, 1e-9)
     moving = (speed_mps >= STANDING_MPS) & chord_m.any(axis=0)

@@ -87,6 +87,8 @@ def test_a_vehicle_without_any_event_is_asked_as_well(run: Run) -> None:
     assert some.figures["rows"] == [{"node": "v01", "time_s": 0.0}]
     others = eventually(run, "warned", warned, at="event", nodes=["v02", "v03", "v04"])
     assert others.text == "true of 3 vehicles within 0.9 s", "from their entry on"
+    assert eventually(run, "one", warned, at="event", nodes=["v02"]).text.startswith("true of 1 vehicle ")
+    assert eventually(run, "none", warned, at="event", nodes=["v99"]).verdict == "unknown"
     assert eventually(run, "warned", warned, 0.8, "event", ["v02", "v03"]).text.startswith(
         "never came true within 0.8 s: first of v03"
     )

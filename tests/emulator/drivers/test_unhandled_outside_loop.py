@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -124,8 +124,24 @@ async def submits_and_forgets(node: Node) -> None:
     await sends(node)
 
 
+async def imports_an_executor_and_forgets(node: Node) -> None:
+    await asyncio.sleep(0.5)
+
+    class Pool(Executor):
+        __module__ = "concurrent.futures.process"
+
+        def submit(self, *_: Any, **__: Any) -> Future[Any]:
+            job: Future[Any] = Future()
+            job.set_exception(ValueError("boom"))
+            return job
+
+    Pool().submit(int, "x")
+    await sends(node)
+
+
 TOLD: dict[Program, tuple[str, float]] = {
     submits_and_forgets: ("in an executor job", 0.5),
+    imports_an_executor_and_forgets: ("in an executor job", 0.5),
     fails_in_a_thread: ("in a thread", 0.5),
     fails_in_a_thread_of_a_thread: ("in a thread", 0.5),
     fails_in_a_thread_of_a_job: ("in a thread", 0.5),

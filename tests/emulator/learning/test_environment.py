@@ -116,6 +116,19 @@ def test_a_killed_program_s_agent_is_terminated_and_not_revived() -> None:
     assert steps[5][2]["v02"]
 
 
+@pytest.mark.slow
+def test_an_episode_with_a_kill_that_ends_is_valid_and_one_that_is_left_early_is_not_judged(tmp_path: Path) -> None:
+    fault = {"kind": "kill", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}
+    env = make(sections={"fault": [fault]}, out=tmp_path)
+    play(env)
+    env.reset(seed=2)
+    env.step({})
+    env.close()
+    folders = sorted(path for path in tmp_path.iterdir() if path.is_dir())
+    verdicts = [emulator.Run.open(folder).verdict for folder in folders]
+    assert [verdict.value for verdict in verdicts] == ["valid", "unknown"]
+
+
 def test_a_paused_vehicle_s_agent_has_its_last_observation() -> None:
     fault = {"kind": "pause", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}
     steps = play(make(sections={"fault": [fault]}))

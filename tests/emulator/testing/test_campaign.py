@@ -236,6 +236,18 @@ def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path, pytester:
     assert "growth" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)
 
 
+def test_coordinates_of_the_network_are_no_growth(tmp_path: Path) -> None:
+    (tmp_path / "utm.csv").write_text("id,x_m,y_m,heading_rad\na,500000,5400000,0\nb,500010,5400000,0\n")
+    far = Scenario.model_validate(
+        {
+            "run": {"duration_s": 1.0, "settle_s": 0.0},
+            "network": {"kind": "file", "path": tmp_path / "utm.csv"},
+            "program": {"entry": "agents.beacon:main"},
+        }
+    )
+    assert run(Plan.of(far, "none", 1, seed=1, shrink_steps=0), tmp_path / "far")[0] == 0
+
+
 def test_an_interrupted_campaign_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(futures: list[Future[Any]]) -> Iterator[Future[Any]]:
         futures[0].result()

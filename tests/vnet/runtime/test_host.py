@@ -219,11 +219,19 @@ def test_a_program_that_raises_ends_its_node_and_no_other() -> None:
     assert [(frame.node, frame.payload) for frame in frames] == [("v2", b"still here")]
 
 
-@pytest.mark.parametrize(("code", "kind"), [(0, "finished"), (None, "finished"), (3, "crashed")])
-def test_sys_exit_in_a_program_ends_its_node_only(code: int | None, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (SystemExit(0), "finished"),
+        (SystemExit(None), "finished"),
+        (SystemExit(3), "crashed"),
+        (BaseException("no"), "crashed"),
+    ],
+)
+def test_what_is_raised_and_no_exception_ends_its_node_only(error: BaseException, kind: str) -> None:
     async def program(node: Node) -> None:
         if node.id == "v1":
-            raise SystemExit(code)
+            raise error
         await asyncio.sleep(1.0)
 
     world = World("v1", "v2")

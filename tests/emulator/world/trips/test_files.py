@@ -144,6 +144,14 @@ def test_degrees_become_metres_from_the_origin_or_from_their_middle(tmp_path: Pa
     assert read(path, origin_deg=(42.28, -83.74))["a"].position_m[0] == pytest.approx([0, 0], abs=1e-6)
 
 
+def test_the_middle_of_trips_across_the_antimeridian_is_between_them(tmp_path: Path) -> None:
+    text = "id,time_s,lat_deg,lon_deg\na,0,10,179.998\na,9,10,179.998\nb,0,10,-179.998\nb,9,10,-179.998\n"
+    a, b = (trip.position_m[0] for trip in read(write(tmp_path, "t.csv", text)).values())
+    # 0.004 degrees, of 109 640 m each there; the eastern one is b.
+    assert b - a == pytest.approx([438.6, 0], abs=1.0)
+    assert a + b == pytest.approx([0, 0], abs=1.0)
+
+
 def test_ids_of_sumo_are_escaped_so_that_they_can_be_told_apart(tmp_path: Path) -> None:
     ids = ("flow#1:0/2", ":J1_0", "plain-1.0", "a-b c", "-7", "flow-23-1")
     rows = "".join(f"{name},{time_s},{9 * number},0\n" for number, name in enumerate(ids) for time_s in (0, 2))

@@ -298,6 +298,14 @@ def test_given_headings_are_taken_and_go_the_short_way_round() -> None:
     assert heading[5] == pytest.approx((6.2 + 0.1 + 2 * math.pi) / 2 % (2 * math.pi))
 
 
+def test_what_is_missing_between_given_headings_and_speeds_is_interpolated() -> None:
+    heading_rad = np.array([np.nan, 1.0, np.nan, 2.0])
+    stands = trip([0, 1, 2, 3], [0, 0, 0, 0], heading_rad=heading_rad)
+    assert drive(stands, seconds=3.0).heading_rad[:30:5, 0] == pytest.approx([1, 1, 1, 1.25, 1.5, 1.75])
+    slow = trip([0, 1, 2, 3], [0, 0.4, 0.8, 1.2], speed_mps=np.array([0.6, np.nan, 0.6, np.nan]))
+    assert drive(slow, seconds=3.0).heading_rad[:30, 0] == pytest.approx(np.zeros(30))
+
+
 def test_a_given_speed_says_who_stands() -> None:
     time_s = np.arange(0, 10, 0.1)
     x_m, y_m = 0.4 * time_s, 0.0 * time_s

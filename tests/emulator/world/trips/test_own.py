@@ -35,7 +35,7 @@ def place(time_s, angle):
 
 
 def stands_and_enters(seed, vehicles, duration_s):
-    return {"unit": [(0, 1, 2, 0.5), (duration_s, 1, 2, 0.5)], "late": [(1, 50, 0, 0), (2, 70, 0, 0)]}
+    return {"unit": [(0, 1, 2, 0.5), (duration_s, 1, 2, 0.5)], "late": [(1, 50, 0), (2, 70, 0)]}
 
 
 def leaves(seed, vehicles, duration_s):
@@ -78,12 +78,14 @@ def test_its_seed_is_that_of_the_network(scenario: Path) -> None:
     assert angle == pytest.approx(2)
 
 
-def test_two_samples_stand_for_all_between_and_others_enter_and_leave(scenario: Path) -> None:
+def test_two_samples_stand_for_all_between_and_others_enter_leave_and_need_no_heading(scenario: Path) -> None:
     loaded = load_scenario(scenario, ["network.kind=shapes.py:stands_and_enters", "run.duration_s=30"])
     world = build_world(loaded)
     there = np.array([world.present(period) for period in range(300)])
     assert there[:, world.node_ids.index("unit")].all()
     assert np.flatnonzero(there[:, world.node_ids.index("late")]).tolist() == list(range(10, 21))
+    heading_rad = world.at(15).heading_rad
+    assert [heading_rad[world.node_ids.index(node)] for node in ("unit", "late")] == pytest.approx([0.5, 0.0])
 
 
 @answers("network")
