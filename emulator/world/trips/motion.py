@@ -42,6 +42,8 @@ METRES = ("x_m", "y_m")
 DEGREES = ("lat_deg", "lon_deg")
 """Columns of positions in degrees."""
 OPTIONAL = ("heading_rad", "speed_mps")
+MOST_TURNED_RAD = 4 * np.pi
+"""Heading beyond which it is probably in degrees: whoever unwinds headings rarely counts more turns."""
 """Columns that a file may lack."""
 _BOUND = {
     "time_s": FAR_S,
@@ -219,6 +221,8 @@ class Samples:
         columns = {name: np.concatenate([part[name] for part in self._kept]) for name in self._kept[0]}
         self._kept = []
         position_m = self._positions_m(columns, origin_deg)
+        if (np.abs(columns.get("heading_rad", 0.0)) > MOST_TURNED_RAD).any():
+            self.notes.append("heading_rad looks like degrees, and is taken for radians")
         order = np.argsort(columns["code"], kind="stable")
         code = columns["code"][order].astype(np.int64)
         names = self._node_ids()

@@ -584,7 +584,7 @@ def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Dri
         module = importlib.util.module_from_spec(spec)
         sys.modules["loaded"] = module
         spec.loader.exec_module(module)
-        print(module.year(), importlib.util.find_spec("plugin").name, importlib.util.find_spec("none") is None)
+        print(module.year(), importlib.util.find_spec("plugin").name, importlib.util.find_spec("no_such") is None)
         script = runpy.run_path(here / "script.py")
         print(pkgutil.resolve_name("plugin:year")(), pydoc.locate("plugin.year")(), script["year"])
         loader = importlib.machinery.SourceFileLoader("again", str(here / "plugin.py"))

@@ -152,6 +152,14 @@ def test_the_middle_of_trips_across_the_antimeridian_is_between_them(tmp_path: P
     assert a + b == pytest.approx([0, 0], abs=1.0)
 
 
+def test_headings_in_degrees_are_noted(tmp_path: Path) -> None:
+    header = HEADER.replace("\n", ",heading_rad\n")
+    for heading, notes in (("90", 1), ("6.3", 0)):
+        samples = READERS[".csv"](write(tmp_path, "t.csv", f"{header}a,0,0,0,{heading}\na,9,9,0,0\n"), None)
+        samples.trips(None)
+        assert len(samples.notes) == notes
+
+
 def test_ids_of_sumo_are_escaped_so_that_they_can_be_told_apart(tmp_path: Path) -> None:
     ids = ("flow#1:0/2", ":J1_0", "plain-1.0", "a-b c", "-7", "flow-23-1")
     rows = "".join(f"{name},{time_s},{9 * number},0\n" for number, name in enumerate(ids) for time_s in (0, 2))
