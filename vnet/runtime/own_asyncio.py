@@ -13,7 +13,9 @@ callback belongs that runs.
 
 **Chance.** The functions of `random` and `numpy.random` that share a generator, and what asks `os.urandom` for
 bytes (`secrets`, `uuid.uuid4`, generators without a seed), draw from generators of the node whose code runs on a
-loop. They have the seed of `node.rng`, and are other streams. All other code draws as ever.
+loop. They have the seed of `node.rng`, and are other streams. A module that is imported meanwhile draws from
+generators of its own: nodes that share a process share it, and the one that imports it first may be another there.
+All other code draws as ever.
 """
 
 from __future__ import annotations
@@ -21,17 +23,19 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextvars
+import importlib
 import inspect
 import os
 import random
+import sys
 import tempfile
 import threading
 from abc import ABCMeta
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextvars import Context
 from functools import wraps
 from itertools import count
-from types import FunctionType, ModuleType
+from types import FrameType, FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakKeyDictionary
 
@@ -186,52 +190,68 @@ STAND_INS: list[tuple[str, Any, Any]] = [
 class Chance:
     """Generators in place of the system's random bytes, and of the shared ones of `random` and `numpy.random`."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int | str) -> None:
         self.system = random.Random(f"system {seed}")
         self.python = random.Random(f"python {seed}")
         words = random.Random(f"numpy {seed}").getrandbits(128)
         self.numpy = np.random.RandomState(np.random.MT19937(words))
 
 
-_chances: WeakKeyDictionary[Node, Chance] = WeakKeyDictionary()
+_chances: WeakKeyDictionary[Node | ModuleType, Chance] = WeakKeyDictionary()
+_imports: Mapping[str, Any] = importlib._bootstrap._module_locks  # type: ignore[attr-defined]
+"""Modules that are being imported, in any thread."""
+_CALLBACK = asyncio.Handle._run.__code__
 
 
-def chance_of(node: Node) -> Chance:
-    """Return a node's generators."""
-    chance = _chances.get(node)
+def chance_of(owner: Node | ModuleType) -> Chance:
+    """Return the generators of a node, or of a module that is imported."""
+    chance = _chances.get(owner)
     if chance is None:
-        chance = _chances[node] = Chance(node.seed)
+        seed = owner.__name__ if isinstance(owner, ModuleType) else owner.seed
+        chance = _chances[owner] = Chance(seed)
     return chance
 
 
-def _drawing_node() -> Node | None:
-    """Return the node whose code draws; None in threads, whose order nothing decides, and in child processes."""
-    return None if asyncio._get_running_loop() is None else present_node()
+def _drawing() -> Chance | None:
+    """Return the generators of what draws; None in threads, whose order nothing decides, and in child processes."""
+    node = None if asyncio._get_running_loop() is None else present_node()
+    return None if node is None else chance_of((_imports and _imported_module()) or node)
+
+
+def _imported_module() -> ModuleType | None:
+    """Return the module of this process that runs because the present callback imports it; None if none does."""
+    frame: FrameType | None = sys._getframe()
+    while frame is not None and frame.f_code is not _CALLBACK:
+        module = sys.modules.get(frame.f_globals["__name__"]) if frame.f_code.co_name == "<module>" else None
+        if module is not None and vars(module) is frame.f_globals and module.__name__ != "__main__":
+            return module
+        frame = frame.f_back
+    return None
 
 
 def _random_bytes(size: int, /) -> bytes:
-    node = _drawing_node()
-    return _system_bytes(size) if node is None else chance_of(node).system.randbytes(size)
+    chance = _drawing()
+    return _system_bytes(size) if chance is None else chance.system.randbytes(size)
 
 
 def _entropy(size: int, flags: int = 0) -> bytes:
-    return _system_entropy(size, flags) if _drawing_node() is None else _random_bytes(size)
+    return _system_entropy(size, flags) if _drawing() is None else _random_bytes(size)
 
 
 def _seeded(generator: random.Random, a: Any = None, version: int = 2) -> None:
-    if a is None and _drawing_node() is not None:
+    if a is None and _drawing() is not None:
         a = _random_bytes(_SEED_BYTES)
     _seed(generator, a, version)
 
 
-def _drawing(own: Callable[..., Any], module: ModuleType, name: str, kind: str) -> Callable[..., Any]:
+def _drawer(own: Callable[..., Any], module: ModuleType, name: str, kind: str) -> Callable[..., Any]:
     """Return a function of a module that draws by its node's generator of this kind, or as ever."""
     method_name = _OTHER_NAMES.get(name, name) if kind == "numpy" else name
 
     @wraps(own)
     def draw(*arguments: Any, **options: Any) -> Any:
-        node = _drawing_node()
-        method = own if node is None else getattr(getattr(chance_of(node), kind), method_name)
+        chance = _drawing()
+        method = own if chance is None else getattr(getattr(chance, kind), method_name)
         return method(*arguments, **options)
 
     draw.__module__, draw.__qualname__ = module.__name__, own.__name__  # for pickle
@@ -244,8 +264,8 @@ class _SharedState:
     __class__ = np.random.RandomState  # type: ignore[assignment]
 
     def __getattr__(self, name: str) -> Any:
-        node = _drawing_node()
-        return getattr(_numpy_state if node is None else chance_of(node).numpy, name)
+        chance = _drawing()
+        return getattr(_numpy_state if chance is None else chance.numpy, name)
 
     def __reduce__(self) -> str:
         """Be the same object in a copy, and in a pickle."""
@@ -267,7 +287,7 @@ def _of_chance() -> list[tuple[Any, str, Any, Any]]:
         shared = random._inst if module is random else _numpy_state
         for name, own in vars(module).items():
             if getattr(own, "__self__", None) is shared or (kind == "numpy" and name in _OTHER_NAMES):
-                found.append((module, name, own, _drawing(own, module, name, kind)))
+                found.append((module, name, own, _drawer(own, module, name, kind)))
     return found
 
 

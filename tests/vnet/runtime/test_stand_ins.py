@@ -2,10 +2,12 @@
 
 import asyncio
 import copy
+import importlib
 import os
 import pickle
 import random
 import secrets
+import sys
 import uuid
 from collections.abc import Callable
 from functools import partial
@@ -102,6 +104,34 @@ def test_a_node_draws_the_same_whatever_others_draw_between(drawn: list[tuple[in
 
     both, alone = all_of(1, 2), iter(all_of(1))
     assert all(both[n] == next(alone) for n, (seed, _) in enumerate(drawn) if seed == 1)
+
+
+def test_who_imports_a_module_draws_what_others_do_and_so_does_the_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lucky.py").write_text(
+        "import random, uuid\nfrom lucky_inner import draw\nX = uuid.uuid4(), draw()\n"
+    )
+    (tmp_path / "lucky_inner.py").write_text(
+        "import random\nY = random.random()\ndef draw(): return random.random()\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    modules = ["lucky", "lucky_inner"]
+
+    def imports_and_draws() -> Any:
+        kept = [importlib.import_module(name) for name in modules]
+        return kept, [draw() for name, draw in DRAWS.items() if name != "SystemRandom"]
+
+    first, second, third = Fake(1), Fake(2), Fake(1)
+    kept, drawn = as_node(first, imports_and_draws)
+    values = kept[0].X, kept[1].Y
+    for name in modules:
+        del sys.modules[name]
+    again, of_another = as_node(second, imports_and_draws)
+    assert as_node(third, imports_and_draws) == (again, drawn) != of_another
+    assert values == (again[0].X, again[1].Y)
+    for name in modules:
+        del sys.modules[name]
 
 
 def test_a_seed_of_a_program_is_its_nodes_alone() -> None:
