@@ -214,6 +214,7 @@ def test_arguments_are_refused_as_by_zenoh_itself(drive: Drive) -> None:
     assert printed(run) == there["answers"] != []
 
 
+@pytest.mark.slow
 def test_an_option_that_is_refused_is_refused_by_its_name(drive: Drive) -> None:
     run = drive(
         """
@@ -229,6 +230,7 @@ def test_an_option_that_is_refused_is_refused_by_its_name(drive: Drive) -> None:
     assert log(run)[0].startswith("timestamp_instrumentation is not available on virtual time")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "call",
     [
