@@ -318,10 +318,10 @@ CHECKS: list[Check] = [
         check_liveness,
         REPORTS,
         "Once no fault acts any more, and restarts are over, each vehicle that is up reports at least once a "
-        "second, or in two periods, or within twice its program's usual time between reports, two seconds or "
-        "four periods at most. A process that starts in real time has 5 s; without faults, so has every program "
-        "at first and after it enters. A program that never reported is not expected to, unless a fault took "
-        "its vehicle and the program reports elsewhere.",
+        "second or every two periods. A program that usually reports less often has twice its usual time, at most "
+        "two seconds or four periods. A process that starts in real time has 5 s; without faults, so has every "
+        "program at first and after it enters. A program that never reported is not expected to, unless a fault "
+        "took its vehicle and the program reports elsewhere.",
         invalid="a longer silence",
         unknown=BEHIND,
         not_applicable="no program reports so often, or less than a second is left",

@@ -57,10 +57,9 @@ def access(
         loaded = load(scenario, overrides, program)
         users = create_access(loaded, build_world(loaded), listen, tls_name or (), host_names(hosts))
         users.save(out, listen, router_folder or out.resolve())
+        who = counted(len(users.processes), "agent process", "agent processes")
         if users.hosts:
-            who = f"{counted(len(users.hosts), 'host')} with {len(users.processes)} agent processes"
-        else:
-            who = f"{len(users.processes)} agent processes"
+            who = f"{counted(len(users.hosts), 'host')} with {who}"
         print(f"{who}, and the emulator, in {out}/credentials")
         print(f"start the router with: zenohd -c {shlex.quote(str(out / 'zenohd.json5'))}")
 

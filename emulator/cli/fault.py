@@ -37,7 +37,8 @@ def inject(
     kind: Annotated[str, typer.Argument(metavar="KIND", help=f"One of {', '.join(INJECTED)}.")],
     lasting: Annotated[float, typer.Option("--for", metavar="SECONDS", help="How long, in emulated time.")] = 5.0,
     at: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="When, in emulated time. Default: now.")
+        float | None,
+        typer.Option(metavar="SECONDS", help="When, in emulated time. Default: now, as of a time that is past."),
     ] = None,
     parameters: Annotated[
         list[str] | None,

@@ -185,7 +185,7 @@ BUSY = Table(
         "time_ns": Column(INT, "when the 100 ms began"),
         "node": Column(NAME, ID),
         "busy_ratio": Column(FLOAT, "the share of them in which it sent, or sensed `radio.mac.carrier_sense_dbm` "
-                                    "or more"),
+                                    "or more (sidelink: the busy share of subchannels)"),
     },
     which=": how busy the medium was that they share, with `[radio.mac]`", is_due=_with_mac,
 )

@@ -191,7 +191,7 @@ class Run(Section):
     order_seed: int = Field(1, ge=0, lt=2**63)
     """Draws the order, and nothing else."""
     order_depth: int = Field(3, ge=1, le=100)
-    """`pct`: how many events, in the right order, show the bugs that are sought."""
+    """`pct`: the number of events whose order matters in the bugs that are sought."""
     order_steps: int | None = Field(None, ge=1, le=MANY)
     """`pct`: decisions of a vehicle in a run; counted in a run in FIFO order if left out."""
     order_slack_us: int = Field(0, ge=0, le=MANY)

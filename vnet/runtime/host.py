@@ -625,7 +625,7 @@ class Host:
             if self._debugger is not None:
                 self._debugger.begin(node.id, program)
             await program(node)
-        except (GeneratorExit, KeyboardInterrupt):
+        except (GeneratorExit, KeyboardInterrupt, ProcessEndedError):
             raise
         except asyncio.CancelledError as error:  # of a task that the program awaits, unless vnet has cancelled it
             if self._closing or not self._runs(node):

@@ -29,7 +29,7 @@ from emulator.drivers.launch import Launcher, Zygote
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
 from emulator.records.code_digest import vnet_digest
-from vnet.errors import TransportError, VnetError, WireError
+from vnet.errors import TransportError, VnetError, WireError, counted
 from vnet.transport import keys, wire
 from vnet.transport.access import Access
 from vnet.transport.credentials import Credentials
@@ -215,7 +215,8 @@ def run_host(
         )
         join = _Join(up, name, events, join_timeout_s)
         welcome = join.until_welcome()
-        on_state(f"host {name}: {len(welcome.processes)} agent processes of run {run}")
+        agents = counted(len(welcome.processes), "agent process", "agent processes")
+        on_state(f"host {name}: {agents} of run {run}")
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="vnet-host-")))
         (folder / "logs").mkdir()
         zygote = Zygote(welcome.modules) if welcome.start == "fork" and sys.platform == "linux" else None

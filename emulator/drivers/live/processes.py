@@ -344,7 +344,8 @@ class LiveProcesses(Processes):
         elif self._options.launch:
             await self._agents_prepared(deadline)
             where = f" on {counted(len(hosts), 'host')}" if hosts else ""
-            on_state(f"listening at {endpoint}; starting {len(groups)} agent processes{where}")
+            agents = counted(len(groups), "agent process", "agent processes")
+            on_state(f"listening at {endpoint}; starting {agents}{where}")
             for first in range(0, len(groups), STARTED_AT_ONCE):
                 self.supervisor.launch(groups[first : first + STARTED_AT_ONCE])
                 await asyncio.sleep(0)  # those that have joined meanwhile are welcomed
