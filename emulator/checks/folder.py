@@ -406,6 +406,10 @@ class FolderCheck:
     not_applicable: str = ""
 
 
+_MORE_OPTIONS = re.compile(
+    r""" --program MODULE:FUNCTION| --check-determinism(=portable)?| --agent ('[^']*'("'"'[^']*')*|[^\s']+)"""
+)
+"""Options of a command that no other file shows; quoted as by `shlex`."""
 ROUNDED_S = 0.001
 """Digits that verdict.json keeps of the run's wall-clock time."""
 
@@ -514,7 +518,7 @@ def _wrong_commands(recorded: OpenedRun) -> Iterator[dict[str, Any]]:
         yield {"figure": "order", "kept": told, "computed": due}
     scenario, kept = shlex.quote(str(recorded.folder.absolute() / SCENARIO_FILE)), recorded.record.reproduce
     commands = [f"vnet {command} {scenario}" for command in ("simulate", "run")]
-    if re.sub(r" --program MODULE:FUNCTION| --check-determinism(=portable)?", "", kept) not in commands:
+    if _MORE_OPTIONS.sub("", kept) not in commands:
         yield {"figure": "reproduce", "kept": kept, "computed": commands[0]}
 
 

@@ -139,9 +139,11 @@ def delivery_ratio(recorded: RecordedRun) -> float | None:
 
 
 def rows_of_pairs(recorded: RecordedRun) -> NDArray[np.intp]:
-    """Rows (n,) of the trace that are pairs."""
-    original = (recorded.copy == 0) & (recorded.attempt == 0)
-    return np.flatnonzero(original & ~recorded.outcome_is("receiver_down"))
+    """Rows (n,) of the trace that are pairs: of frames as programs sent them, at receivers that are up."""
+    original = (recorded.copy == 0) & (recorded.attempt == 0) & ~recorded.outcome_is("receiver_down")
+    rows = np.flatnonzero(original)
+    down = ~recorded.arrived[rows] & recorded.is_down(recorded.receiver[rows], recorded.sent_ns[rows])
+    return rows[~down]
 
 
 def _pairs(recorded: RecordedRun, count: int, within_m: float, from_ns: int) -> _Pairs:

@@ -1,6 +1,7 @@
 """`vnet check` judges the whole folder: every edit is found, but for those that no reader can find."""
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -110,15 +111,25 @@ def reverse_events(folder: Path) -> None:
     ("edit", "name"),
     [
         (says("reproduce", "rm -rf ~; vnet simulate x"), "verdict_file"),
+        (says("reproduce", "vnet run --agent 'a b'; rm -rf ~ x"), "verdict_file"),
         (says("order", {"kind": "pct", "seed": 1, "deviations": 2, "left": None}), "verdict_file"),
         (reverse_events, "row_order"),
     ],
-    ids=["another command", "another order", "events reversed"],
+    ids=["another command", "one more command", "another order", "events reversed"],
 )
 def test_further_forgeries_are_found(copy: Path, edit: Callable[[Path], None], name: str) -> None:
     edit(copy)
     forge(copy)
     assert name in broken(check_run(copy))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["agent", "python my_agent.py {node}", "sh -c './agent $0' {node}"])
+def test_a_command_with_agents_of_the_users_own_is_no_forgery(copy: Path, agent: str) -> None:
+    command = f"vnet run --agent {shlex.quote(agent)} {shlex.quote(str(copy / 'scenario.toml'))}"
+    says("reproduce", command)(copy)
+    forge(copy)
+    assert broken(check_run(copy)) == set()
 
 
 def without_manifest(folder: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.checks.judge import RecordedRun
-from emulator.records.radio_metrics import radio_metrics
+from emulator.records.radio_metrics import radio_metrics, rows_of_pairs
 from emulator.records.tables import STATES
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import run_scenario
@@ -53,7 +53,7 @@ def traces(draw: st.DrawFn) -> tuple[list[Row], np.ndarray, bool]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     position_m = rng.uniform(0, 300, (10 if moves else 1, count, 2))
     if moves:
-        position_m[rng.random((10, count)) < 0.1] = np.nan
+        position_m[1:][rng.random((9, count)) < 0.1] = np.nan
     rows = []
     for sender in range(count):
         times_ns = np.sort(rng.choice(1_000_000_000, draw(st.integers(0, 12)), replace=False))
@@ -239,6 +239,22 @@ def test_a_beacon_that_all_hear_is_as_old_as_its_period_and_its_way(tmp_path: Pa
     stays = {row["node"]: row["frames"] for row in told.vehicles.to_pylist()}
     assert stays == {"a": 45, "b": 45, "c": 16}
     assert [row["from_m"] for row in told.distances.to_pylist()] == [0.0, 50.0, 100.0]
+
+
+def test_frames_that_are_lost_on_their_way_to_who_is_down_are_no_attempts(tmp_path: Path) -> None:
+    fault = {"kind": "kill", "nodes": ["v03"], "at_s": 1.0, "duration_s": 2.0}
+    sections = {
+        "run": {"duration_s": 5.0, "settle_s": 1.0},
+        "network": {"vehicles": 3},
+        "radio": {"loss": 0.3, "range_m": 1e5},
+    }
+    program = {"entry": "agents.beacon:main"}
+    recorded = run_scenario(tmp_path, Scenario.model_validate(sections | {"program": program, "fault": [fault]}))
+    links = [link for link in radio_metrics(recorded).links.to_pylist() if link["receiver"] == "v03"]
+    lost = recorded.outcome_is("lost")[rows_of_pairs(recorded)]
+    sent_s, to = recorded.sent_ns[rows_of_pairs(recorded)] / 1e9, recorded.receiver[rows_of_pairs(recorded)]
+    assert not np.any((to == recorded.number["v03"]) & (sent_s > 1.0) & (sent_s < 3.0)) and lost.any()
+    assert [link["contacts"] for link in links] == [2, 2]
 
 
 def test_a_run_in_which_nothing_was_sent_has_no_links(tmp_path: Path) -> None:
