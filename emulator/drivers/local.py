@@ -339,11 +339,12 @@ def process_kept() -> Iterator[None]:
 
 
 def _started_processes(by: int) -> Iterator[int]:
-    """Yield the processes that one has started, and that these have; none where the system does not tell."""
+    """Yield the processes of this session that one has started, and that these have; none if no file tells."""
     with suppress(OSError):
         for file in Path(f"/proc/{by}/task").glob("*/children"):
             for process in map(int, file.read_text().split()):
-                yield from (process, *_started_processes(process))
+                if os.getsid(process) == os.getsid(0):
+                    yield from (process, *_started_processes(process))
 
 
 # What simulated programs print goes to the terminal, and to `logs/NODE.log` as in a run of many processes.

@@ -142,6 +142,8 @@ def rows_of_pairs(recorded: RecordedRun) -> NDArray[np.intp]:
     """Rows (n,) of the trace that are pairs: of frames as programs sent them, at receivers that are up."""
     original = (recorded.copy == 0) & (recorded.attempt == 0) & ~recorded.outcome_is("receiver_down")
     rows = np.flatnonzero(original)
+    if not recorded.node_ids:  # no period was completed
+        return rows
     down = ~recorded.arrived[rows] & recorded.is_down(recorded.receiver[rows], recorded.sent_ns[rows])
     return rows[~down]
 

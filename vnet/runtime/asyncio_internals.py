@@ -79,7 +79,7 @@ def check_not_closed(loop: asyncio.AbstractEventLoop) -> None:
 def default_executor(loop: asyncio.AbstractEventLoop, thread_name_prefix: str) -> ThreadPoolExecutor:
     """Return the loop's default executor, which the loop shuts down; make one if there is none."""
     if _private(loop)._default_executor is None:
-        loop.set_default_executor(ThreadPoolExecutor(thread_name_prefix=thread_name_prefix))
+        _private(loop)._default_executor = ThreadPoolExecutor(thread_name_prefix=thread_name_prefix)
     return cast("ThreadPoolExecutor", _private(loop)._default_executor)
 
 

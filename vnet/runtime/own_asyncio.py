@@ -23,6 +23,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextvars
+import gc
 import importlib
 import inspect
 import os
@@ -54,7 +55,8 @@ NOBODY.run(current_node.set, None)
 
 _SEED_BYTES = 16
 _system_bytes, _seed, _system_entropy = os.urandom, random.Random.seed, os.getrandom
-_numpy_state = np.random.mtrand._rand
+_python_state, _numpy_state = random._inst, np.random.mtrand._rand
+_set_threshold = gc.set_threshold
 _OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
 """Functions of `numpy.random` that are no methods of its generator, and the methods that they call."""
 
@@ -261,18 +263,42 @@ def _drawer(own: Callable[..., Any], module: ModuleType, name: str, kind: str) -
 class _SharedState:
     """The generator of `numpy.random`, which scipy draws from without its functions: that of the present node."""
 
-    __class__ = np.random.RandomState  # type: ignore[assignment]
+    __class__: Any = np.random.RandomState
+    _own: Any = _numpy_state
+    _kind, _name = "numpy", "_shared_numpy"
 
     def __getattr__(self, name: str) -> Any:
         chance = _drawing()
-        return getattr(_numpy_state if chance is None else chance.numpy, name)
+        return getattr(self._own if chance is None else getattr(chance, self._kind), name)
 
     def __reduce__(self) -> str:
         """Be the same object in a copy, and in a pickle."""
-        return "_shared_state"
+        return self._name
 
 
-_shared_state = _SharedState()
+class _SharedPythonState(_SharedState):
+    """The generator of `random`, which networkx draws from, likewise."""
+
+    __class__: Any = random.Random
+    _own = _python_state
+    _kind, _name = "python", "_shared_python"
+
+
+_shared_numpy, _shared_python = _SharedState(), _SharedPythonState()
+
+
+class _Nobodys(random.Random):
+    """A generator that the whole process shares, as that of names in `tempfile`: its seed is no node's."""
+
+    def seed(self, a: Any = None, version: int = 2) -> None:
+        """Seed from the system, unless there is a seed."""
+        _seed(self, int.from_bytes(_system_bytes(_SEED_BYTES)) if a is None else a, version)
+
+
+def _threshold_set(*thresholds: int) -> None:
+    """Leave it to the loops when garbage is collected, where a program asks."""
+    if _drawing() is None:
+        _set_threshold(*thresholds)
 
 
 def _of_chance() -> list[tuple[Any, str, Any, Any]]:
@@ -281,19 +307,17 @@ def _of_chance() -> list[tuple[Any, str, Any, Any]]:
         (os, "getrandom", _system_entropy, _entropy),
         (random, "_urandom", _system_bytes, _random_bytes),  # asked by `secrets`, and by numpy for its seeds
         (random.Random, "seed", _seed, _seeded),
-        (np.random.mtrand, "_rand", _numpy_state, _shared_state),
+        (np.random.mtrand, "_rand", _numpy_state, _shared_numpy),
+        (random, "_inst", _python_state, _shared_python),
+        (tempfile, "_Random", random.Random, _Nobodys),
+        (gc, "set_threshold", _set_threshold, _threshold_set),
     ]
     for module, kind in (random, "python"), (np.random, "numpy"):
-        shared = random._inst if module is random else _numpy_state
+        shared = _python_state if module is random else _numpy_state
         for name, own in vars(module).items():
             if getattr(own, "__self__", None) is shared or (kind == "numpy" and name in _OTHER_NAMES):
                 found.append((module, name, own, _drawer(own, module, name, kind)))
     return found
-
-
-def _settle_shared() -> None:
-    """Have what a whole process shares draw its seed now, and not from the first node that needs it."""
-    next(tempfile._get_candidate_names())  # type: ignore[attr-defined]
 
 
 _STAND_INS: list[tuple[Any, str, Any, Any]] = [
@@ -309,7 +333,6 @@ def attach() -> None:
     """Let these stand in for the names, in all threads; each call is followed by one of `detach`."""
     global _users
     with _lock:
-        _settle_shared()
         _users += 1
         _set_names(own=False)
         asyncio_internals.hash_gatherings_by(number_of)

@@ -18,7 +18,7 @@ import os
 import selectors
 import sys
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from concurrent.futures import Future as Job
 from contextvars import Context, copy_context
 from functools import partial
@@ -93,6 +93,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
             WeakKeyDictionary()
         )
         self._factories: WeakKeyDictionary[Node, Any] = WeakKeyDictionary()
+        self._executors: WeakKeyDictionary[Node, Executor] = WeakKeyDictionary()
         super().__init__(selector)
         super().set_task_factory(self._new_task)
 
@@ -165,6 +166,21 @@ class SkewedLoop(asyncio.SelectorEventLoop):
             options["context"] = context
         return factory(loop, coroutine, **options)  # type: ignore[no-any-return]
 
+    def set_default_executor(self, executor: Any) -> None:
+        """Have jobs that name no executor done by this one: those of the program that asks, and of nobody else."""
+        node = present_node()
+        if node is None:
+            super().set_default_executor(executor)
+        elif not isinstance(executor, ThreadPoolExecutor):
+            raise TypeError("executor must be ThreadPoolExecutor instance")
+        else:
+            self._executors[node] = executor
+
+    def _executor_of(self, executor: Executor | None) -> Executor | None:
+        """Return the executor of a job; None for that of the loop."""
+        node = present_node() if executor is None and self._executors else None
+        return executor if node is None else self._executors.get(node)
+
     def set_exception_handler(self, handler: Callable[[Any, dict[str, Any]], object] | None) -> None:
         """Set the handler of what the node leaves unhandled on whose behalf this is called; others keep theirs."""
         if (node := present_node()) is None:
@@ -204,6 +220,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         self, executor: Executor | None, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
         """Run a job as asyncio does; the future knows on whose behalf."""
+        executor = self._executor_of(executor)
         outer = _submitting(executor).run(super().run_in_executor, executor, func, *args)
         if isinstance(outer, Future):
             outer.job_context = copy_context()
@@ -513,6 +530,7 @@ class VirtualTimeLoop(SkewedLoop):
     ) -> asyncio.Future[Any]:
         """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
         self.before_job()
+        executor = self._executor_of(executor)
         context = _submitting(executor)
         if executor is None:
             executor = asyncio_internals.default_executor(self, JOBS)

@@ -1,7 +1,9 @@
 """Hosting programs on a loop: mailboxes, endings, and programs that misbehave."""
 
 import asyncio
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -237,6 +239,24 @@ def test_what_is_raised_and_no_exception_ends_its_node_only(error: BaseException
     world = World("v1", "v2")
     world.run(program)
     assert [(e.node, e.kind) for e in world.endings] == [("v1", kind), ("v2", "finished")]
+
+
+def test_a_default_executor_is_its_programs_alone() -> None:
+    names: dict[str, str] = {}
+
+    async def program(node: Node) -> None:
+        if node.id == "v1":
+            with ThreadPoolExecutor(1, thread_name_prefix="own") as executor:
+                asyncio.get_running_loop().set_default_executor(executor)
+                names["v1"] = await asyncio.to_thread(lambda: threading.current_thread().name)
+        await asyncio.sleep(1.0)
+        if node.id == "v2":
+            names["v2"] = await asyncio.to_thread(lambda: threading.current_thread().name)
+
+    world = World("v1", "v2")
+    world.run(program)
+    assert [e.kind for e in world.endings] == ["finished", "finished"]
+    assert names["v1"].startswith("own") and not names["v2"].startswith("own")
 
 
 def test_an_early_exit_takes_the_nodes_other_tasks_with_it() -> None:

@@ -2,12 +2,14 @@
 
 import asyncio
 import copy
+import gc
 import importlib
 import os
 import pickle
 import random
 import secrets
 import sys
+import tempfile
 import uuid
 from collections.abc import Callable
 from functools import partial
@@ -41,6 +43,7 @@ DRAWS: dict[str, Callable[[], Any]] = {
     "normal": lambda: np.random.normal(),  # noqa: NPY002  # the shared generator is what is asked about
     "by name of numpy": lambda: normal(),  # noqa: NPY002
     "sample": lambda: np.random.sample(),  # noqa: NPY002
+    "networkx": lambda: random._inst.random(),
     "scipy": lambda: np.random.mtrand._rand.standard_normal(),  # which scipy asks for at each draw
     "default_rng": lambda: np.random.default_rng().integers(10**9),
     "RandomState": lambda: np.random.RandomState().random_sample(),
@@ -132,6 +135,19 @@ def test_who_imports_a_module_draws_what_others_do_and_so_does_the_module(
     assert values == (again[0].X, again[1].Y)
     for name in modules:
         del sys.modules[name]
+
+
+def test_names_that_a_process_shares_are_nobodys_draws() -> None:
+    names: Any = tempfile._RandomNameSequence()  # type: ignore[attr-defined]  # multiprocessing has another
+    first = as_node(Fake(1), lambda: (next(names), DRAWS["uuid4"]()))
+    other = as_node(Fake(1), lambda: (next(names), DRAWS["uuid4"]()))
+    assert first[0] != other[0] and first[1] == other[1]
+
+
+def test_a_program_leaves_to_the_loop_when_garbage_is_collected() -> None:
+    before = gc.get_threshold()
+    as_node(Fake(1), lambda: gc.set_threshold(7))
+    assert gc.get_threshold() == before
 
 
 def test_a_seed_of_a_program_is_its_nodes_alone() -> None:
