@@ -36,7 +36,7 @@ from emulator.scenario.scenario import Scenario
 from vnet.errors import ProgramError, ScenarioError, VnetError, shown
 from vnet.runtime import running_node
 from vnet.runtime.environment import SAME_ARITHMETIC, has_same_arithmetic
-from vnet.runtime.programs import Program
+from vnet.runtime.programs import Program, path_without_programs
 from vnet.runtime.running_node import LONGEST_ID, LOOK_S, Patience, RunningNode
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ class Place:
         """Return the place of this process, for the programs and own checks of a scenario."""
         entries, folders = modules_of(scenario), scenario.program.folders
         folder = str(Path.cwd())
-        path = tuple(str(Path(entry or folder).absolute()) for entry in sys.path)
+        path = tuple(str(Path(entry or folder).absolute()) for entry in path_without_programs())
         return cls(folder, path, folders, entries, tuple(sorted(digests_of(entries, folders).items())))
 
     def enter(self) -> None:

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextvars import copy_context
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -117,7 +118,8 @@ class Session:
         """True once a run that was stepped has come to its end."""
         self.stands: Future[None] = Future()
         """Done when a run that is stepped is held or over."""
-        self._thread = threading.Thread(target=self._run_held, name=f"vnet {self.command}", daemon=True)
+        self.started = False
+        """True once `start` was called."""
         self._horizons: SimpleQueue[int | None] = SimpleQueue()
         self._give: Callable[[int | None], Any] = self._horizons.put
         self._went_at: float | None = None
@@ -177,14 +179,11 @@ class Session:
 
     # Step by step, in lockstep, on a thread of its own. While the run is held, faults may be planned.
 
-    @property
-    def started(self) -> bool:
-        """Return whether `start` was called."""
-        return self._thread.ident is not None
-
     def start(self) -> Future[None]:
         """Get ready for time 0. The future, here and in `go`, is done when the run is held or over."""
-        self._thread.start()
+        self.started = True
+        run = copy_context().run  # of what a test has set for the programs that it imports
+        threading.Thread(target=run, args=(self._run_held,), name=f"vnet {self.command}", daemon=True).start()
         return self.stands
 
     def go(self, horizon_ns: int | None) -> Future[None]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextvars import Context
+from contextvars import Context, copy_context
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -100,7 +100,8 @@ class Episode:
         self._stop = threading.Event()
         self.finished: set[str] = set()
         """Agents whose episode is over: their programs await nothing any more."""
-        self._thread = threading.Thread(target=self._run, name="vnet episode", daemon=True)
+        within = copy_context().run
+        self._thread = threading.Thread(target=within, args=(self._run,), name="vnet episode", daemon=True)
         self._thread.start()
 
     # On the caller's thread.

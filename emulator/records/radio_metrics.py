@@ -126,11 +126,20 @@ def radio_metrics(
     codes, place = np.unique(pairs.link, return_inverse=True)
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(recorded.node_ids, codes, count, figures)
-    first = math.ceil(round(from_s * NS_PER_S) / WINDOW_NS)
-    busy = recorded.busy_ratio[first:] if has_busy else np.zeros((0, count))
+    busy = _busy(recorded, math.ceil(round(from_s * NS_PER_S) / WINDOW_NS)) if has_busy else np.zeros((0, count))
     vehicles = _vehicles_table(recorded, codes, count, figures, busy)
-    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(busy)}
+    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(busy[~np.isnan(busy)])}
     return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
+
+
+def _busy(recorded: RecordedRun, first: int) -> Array:
+    """Return the channel busy ratios (W, N) of windows from the `first` on; NaN for a vehicle that is not there."""
+    busy = recorded.busy_ratio[first:]
+    if not recorded.moves or not len(busy):
+        return busy
+    present = recorded.places.present()
+    periods = recorded.places.index((first + np.arange(len(busy))) * WINDOW_NS)
+    return np.where(present[np.minimum(periods, len(present) - 1)], busy, np.nan)
 
 
 def delivery_ratio(recorded: RecordedRun) -> float | None:
@@ -310,7 +319,8 @@ def _vehicles_table(
         "heard_vehicles": np.bincount(receiver[figures["delivered"] > 0], minlength=count),
         **{name: mean(name) for name in ("latency_mean_ms", "inter_reception_mean_ms", "age_mean_ms")},
     }
-    columns["busy_ratio_mean"] = busy.mean(axis=0) if len(busy) else np.full(count, np.nan)
+    windows = (~np.isnan(busy)).sum(axis=0)
+    columns["busy_ratio_mean"] = _ratio(np.nansum(busy, axis=0), windows)
     named = {"node": pa.array(recorded.node_ids, pa.string())}
     return pa.table(named | {name: _column(values) for name, values in columns.items()}).cast(VEHICLES)
 

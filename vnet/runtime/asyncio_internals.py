@@ -18,7 +18,7 @@ names what is missing or different when a new version of Python changes it. What
 - `call_soon`, `call_soon_threadsafe` and tasks make their handles in `_call_soon`. What writes to the self-pipe
   wakes the selector. An async generator is told of to `_asyncgen_firstiter_hook` when it begins, and to
   `_asyncgen_finalizer_hook` when it is discarded before its end, which calls `call_soon_threadsafe`.
-- `_default_executor`, `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`.
+- `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ import inspect
 import traceback
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
 from types import FrameType
 from typing import Any, cast
@@ -74,13 +73,6 @@ def set_clock_resolution(loop: asyncio.AbstractEventLoop, seconds: float) -> Non
 def check_not_closed(loop: asyncio.AbstractEventLoop) -> None:
     """Raise RuntimeError if the loop is closed, as its own methods do."""
     _private(loop)._check_closed()
-
-
-def default_executor(loop: asyncio.AbstractEventLoop, thread_name_prefix: str) -> ThreadPoolExecutor:
-    """Return the loop's default executor, which the loop shuts down; make one if there is none."""
-    if _private(loop)._default_executor is None:
-        _private(loop)._default_executor = ThreadPoolExecutor(thread_name_prefix=thread_name_prefix)
-    return cast("ThreadPoolExecutor", _private(loop)._default_executor)
 
 
 def push_ready(loop: asyncio.AbstractEventLoop, handle: asyncio.Handle) -> None:

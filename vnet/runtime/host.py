@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import contextvars
 import gc
 import logging
 import os
@@ -19,6 +18,7 @@ import traceback
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import Context
 from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import count
@@ -40,7 +40,7 @@ from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, 
 from vnet.runtime.error_text import error_line, line_of_caller, own_line
 from vnet.runtime.outside_loop import ProcessEndedError
 from vnet.runtime.own_asyncio import Task, current_node, present_node
-from vnet.runtime.programs import Program, Programs
+from vnet.runtime.programs import Program, Programs, context_of
 from vnet.runtime.ready_queue import EventChooser, chooser_of, node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap
 from vnet.runtime.unhandled import UnhandledExceptions, line_of_task
@@ -259,9 +259,11 @@ class Host:
         main, context = self._main(node, self._programs[node.id]), self._context_of(node)
         self._mains[node.id] = self._loop.create_task(main, name=f"{node.id} main", context=context)
 
-    def _context_of(self, node: Node) -> contextvars.Context:
-        context = contextvars.copy_context()
+    def _context_of(self, node: Node) -> Context:
+        context = context_of(self._programs[node.id])
         context.run(current_node.set, node)
+        if (decimal := sys.modules.get("decimal")) is not None:  # one object in all copies of a context
+            context.run(lambda: decimal.setcontext(decimal.getcontext().copy()))
         return context
 
     def _chooser_of(self, node: Node) -> EventChooser:

@@ -28,6 +28,7 @@ import importlib
 import inspect
 import os
 import random
+import signal
 import sys
 import tempfile
 import threading
@@ -38,11 +39,13 @@ from functools import wraps
 from itertools import count
 from types import FrameType, FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any, cast
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
 
 from vnet.runtime import asyncio_internals
+from vnet.runtime.error_text import NOT_THE_PROGRAM
+from vnet.runtime.own_packages import OWN
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -56,7 +59,7 @@ NOBODY.run(current_node.set, None)
 _SEED_BYTES = 16
 _system_bytes, _seed, _system_entropy = os.urandom, random.Random.seed, os.getrandom
 _python_state, _numpy_state = random._inst, np.random.mtrand._rand
-_set_threshold = gc.set_threshold
+_set_threshold, _signal = gc.set_threshold, signal.signal
 _OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
 """Functions of `numpy.random` that are no methods of its generator, and the methods that they call."""
 
@@ -295,6 +298,13 @@ class _Nobodys(random.Random):
         _seed(self, int.from_bytes(_system_bytes(_SEED_BYTES)) if a is None else a, version)
 
 
+def _signal_set(number: int, handler: Any) -> Any:
+    """Set a handler; of a program in another thread than the main one, as in a test, nothing, and no error."""
+    if _drawing() is None or threading.current_thread() is threading.main_thread():
+        return _signal(number, handler)
+    return signal.getsignal(number)
+
+
 def _threshold_set(*thresholds: int) -> None:
     """Leave it to the loops when garbage is collected, where a program asks."""
     if _drawing() is None:
@@ -311,8 +321,9 @@ def _of_chance() -> list[tuple[Any, str, Any, Any]]:
         (random, "_inst", _python_state, _shared_python),
         (tempfile, "_Random", random.Random, _Nobodys),
         (gc, "set_threshold", _set_threshold, _threshold_set),
+        (signal, "signal", _signal, _signal_set),
     ]
-    for module, kind in (random, "python"), (np.random, "numpy"):
+    for module, kind in (random, "python"), (np.random, "numpy"), (np.random.mtrand, "numpy"):
         shared = _python_state if module is random else _numpy_state
         for name, own in vars(module).items():
             if getattr(own, "__self__", None) is shared or (kind == "numpy" and name in _OTHER_NAMES):
@@ -335,6 +346,7 @@ def attach() -> None:
     with _lock:
         _users += 1
         _set_names(own=False)
+        _use_in_modules()
         asyncio_internals.hash_gatherings_by(number_of)
 
 
@@ -357,6 +369,28 @@ def _set_names(own: bool) -> None:
 
 def use_stand_ins(function: Callable[..., Any]) -> None:
     """Let the module of a program use these where it has imported names by `from … import` before they were set."""
-    names = function.__globals__ if isinstance(function, FunctionType) else {}
+    _use_in(function.__globals__ if isinstance(function, FunctionType) else {})
+
+
+def _use_in(names: dict[str, Any]) -> None:
     for name, value in list(names.items()):
         names[name] = _OTHER.get(id(value), value)
+
+
+_seen: WeakSet[ModuleType] = WeakSet()
+
+
+def _use_in_modules() -> None:
+    """Let modules of the user's that were imported before, as a test's may be, and scipy's generators use these."""
+    for name, module in list(sys.modules.items()):
+        if not issubclass(type(module), ModuleType) or module in _seen:
+            continue
+        _seen.add(module)
+        names = object.__getattribute__(module, "__dict__")  # without loading one that is lazy
+        file = names.get("__file__")
+        if name.startswith("scipy.stats."):
+            for value in names.values():
+                if getattr(value, "__dict__", {}).get("_random_state") is _numpy_state:
+                    value._random_state = _shared_numpy
+        elif isinstance(file, str) and not file.startswith(NOT_THE_PROGRAM) and name.partition(".")[0] not in OWN:
+            _use_in(names)

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
+from types import ModuleType
 
 OWN = ("agents", "emulator", "vnet")
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,6 +50,15 @@ def name_clash(module: str, folder: Path) -> str:
         hider = _hider(package, file)
         return f"{hider}: rename {file}" if hider else ""
     return ""
+
+
+def another_file(module: ModuleType) -> Path | None:
+    """Return the file that would be imported by this name now, if it is not that of the module of a process."""
+    own = getattr(module, "__file__", None)
+    if own is None or "." in module.__name__:
+        return None
+    found = _file_of(PathFinder.find_spec(module.__name__))
+    return None if found == Path(own).resolve() else found
 
 
 def _hider(package: str, file: Path) -> str:

@@ -8,19 +8,18 @@ import os
 import sys
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import Context, ContextVar, copy_context
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 from vnet.errors import ProgramError, did_you_mean
 from vnet.extras import missed_by
 from vnet.runtime.error_text import error_line
-from vnet.runtime.own_packages import name_clash
+from vnet.runtime.own_packages import another_file, name_clash
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from vnet.node import Node
     from vnet.transport import wire
 
@@ -33,6 +32,7 @@ RENAMED_MODULES = {"agents.liar": "agents.cooperative.attacker"}
 """New names of modules with a program, by the old."""
 
 
+_contexts: WeakKeyDictionary[ModuleType, Context] = WeakKeyDictionary()
 _given: ContextVar[Mapping[str, Program]] = ContextVar("vnet_given_programs", default=MappingProxyType({}))
 
 
@@ -57,8 +57,9 @@ def load_program(entry: str) -> Program:
     if module_name in RENAMED_MODULES:
         raise ProgramError(f"program.entry = {entry!r}: renamed; use {RENAMED_MODULES[module_name]}:{name}")
     own_asyncio.attach()
+    is_new, context = module_name not in sys.modules, copy_context()
     try:
-        module = importlib.import_module(module_name)
+        module = context.run(importlib.import_module, module_name)
     except Exception as error:
         if needed := missed_by(error):
             raise ProgramError(f"program.entry = {entry!r} {needed}") from error
@@ -66,6 +67,10 @@ def load_program(entry: str) -> Program:
         raise _load_error(entry, f"cannot import: {error_line(error)}", missed or module_name) from error
     finally:
         own_asyncio.detach()
+    if is_new:
+        _contexts[module] = context
+    elif other := another_file(module):
+        raise ProgramError(f"program.entry = {entry!r}: {module_name} is already {_origin(module)}: rename {other}")
     program = getattr(module, name, None)
     if program is None:
         found = f"module {module_name} ({_origin(module)})"
@@ -78,6 +83,16 @@ def load_program(entry: str) -> Program:
         raise _load_error(entry, f"called with the node: {error}; async def {name}(node)", module_name) from None
     own_asyncio.use_stand_ins(program)
     return program  # type: ignore[no-any-return]
+
+
+def context_of(program: Program) -> Context:
+    """Return a copy of the context in which the program's module was imported, or of this one if it was before.
+
+    What the module sets at its top for all of it is in there, such as numpy's errors.
+    """
+    module = sys.modules.get(str(program.__module__))
+    kept = None if module is None else _contexts.get(module)
+    return copy_context() if kept is None else kept.copy()
 
 
 def _load_error(entry: str, reason: str, module: str) -> ProgramError:
@@ -110,12 +125,17 @@ _added: list[str] = []
 """The folders that were added last: those of another run give way."""
 
 
+def path_without_programs() -> list[str]:
+    """Return `sys.path` without the folders in which programs of this process are looked for."""
+    return [path for path in sys.path if path not in _added]
+
+
 def search_programs_in(folders: Iterable[Path]) -> None:
     """Have modules looked for in `folders`, in this order, and then in the current one.
 
     They come last on `sys.path`, so that they shadow nothing. Folders of an earlier call are looked in no more.
     """
-    sys.path[:] = [path for path in sys.path if path not in _added]
+    sys.path[:] = path_without_programs()
     wanted = dict.fromkeys(str(folder) for folder in [*folders, Path.cwd()])
     _added[:] = [path for path in wanted if path not in sys.path]
     sys.path.extend(_added)

@@ -69,6 +69,10 @@ def _submitting(executor: Executor | None) -> Context:
     return context
 
 
+MOST_THREADS = 32
+"""Threads for the jobs of a program: as many as asyncio has on a machine with many cores."""
+
+
 class SkewedLoop(asyncio.SelectorEventLoop):
     """A loop that shows some tasks another time: `clock_error_of` gives the clock of the task that asks, or None.
 
@@ -256,6 +260,8 @@ class VirtualTimeLoop(SkewedLoop):
         self.is_ending = False
         """True once the run is over, and programs only end."""
         self._jobs: list[tuple[Job[Any], Future]] = []
+        self._pools: dict[Node | None, ThreadPoolExecutor] = {}
+        """The default executor of each node: a job may wait for one of its own program, and for no other's."""
         self._timers = count()
         self._meter: CpuMeter | None = None
         self._ordered: OrderedQueue | None = None
@@ -275,6 +281,12 @@ class VirtualTimeLoop(SkewedLoop):
     def now_ns(self) -> int:
         """The granted time in nanoseconds."""
         return self._now_ns
+
+    def close(self) -> None:
+        """Close the loop, and its threads as they become idle."""
+        super().close()
+        for pool in self._pools.values():
+            pool.shutdown(wait=False)
 
     def start_at(self, time_ns: int) -> None:
         """Set the clock before anything runs: a process that is started again joins late."""
@@ -532,12 +544,14 @@ class VirtualTimeLoop(SkewedLoop):
         self.before_job()
         executor = self._executor_of(executor)
         context = _submitting(executor)
+        node = present_node()
         if executor is None:
-            executor = asyncio_internals.default_executor(self, JOBS)
+            if node not in self._pools:
+                self._pools[node] = ThreadPoolExecutor(MOST_THREADS, thread_name_prefix=JOBS)
+            executor = self._pools[node]
         job = context.run(executor.submit, func, *args)
         outer = Future(loop=self)
         outer.job_context = copy_context()
-        node = present_node()
         if self._ordered is None or node is None:
             self._jobs.append((job, outer))
         else:

@@ -241,6 +241,16 @@ def test_a_beacon_that_all_hear_is_as_old_as_its_period_and_its_way(tmp_path: Pa
     assert [row["from_m"] for row in told.distances.to_pylist()] == [0.0, 50.0, 100.0]
 
 
+def test_how_busy_a_vehicle_finds_the_medium_is_of_the_time_in_which_it_is_there(tmp_path: Path) -> None:
+    vehicles = {"a": [(0, 9, still(0))], "b": [(0, 9, still(100))], "c": [(6, 9, still(50))]}
+    path = write_trips(tmp_path / "t.csv", vehicles)
+    run_scenario(tmp_path / "run", scenario_of_trips(path, 9.0, radio={"mac": {"kind": "80211p"}}))
+    recorded = RecordedRun.open(tmp_path / "run")
+    told = {row["node"]: row["busy_ratio_mean"] for row in radio_metrics(recorded).vehicles.to_pylist()}
+    assert told["c"] == pytest.approx(recorded.busy_ratio[60:90, recorded.number["c"]].mean())
+    assert told["c"] > told["a"] > 0, "three send while it is there, and two before"
+
+
 def test_frames_that_are_lost_on_their_way_to_who_is_down_are_no_attempts(tmp_path: Path) -> None:
     fault = {"kind": "kill", "nodes": ["v03"], "at_s": 1.0, "duration_s": 2.0}
     sections = {

@@ -313,6 +313,44 @@ def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester) 
     assert "restarted" in (again / "events.jsonl").read_text()
 
 
+IMPORTED = """
+import signal
+from decimal import Decimal, getcontext
+from draws_by_name import draw
+
+getcontext().prec = 6
+
+
+async def main(node):
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    async for fix in node.gnss:
+        await node.radio.broadcast(f"{Decimal(1) / 7} {draw()}".encode())
+"""
+
+
+@pytest.mark.parametrize("imports", ["", "import imported_before\n"])
+def test_a_program_does_what_it_does_in_a_command_whoever_has_imported_it(
+    pytester: pytest.Pytester, imports: str
+) -> None:
+    pytester.makepyfile(imported_before=IMPORTED, draws_by_name="from random import random as draw\n")
+    code = """
+@pytest.mark.parametrize("again", [1, 2])
+async def test_it(vnet_emulation, again):
+    async with vnet_emulation(BEACON, vehicles=2, duration=1, program="imported_before.py") as emu:
+        await emu.run_until(1.0)
+"""
+    session = pytester.path / "test_session.py"
+    session.write_text(f"import pytest\n{imports}BEACON = {str(BEACON)!r}\n{code}")
+    done = session_of_its_own(pytester, "--basetemp=basetemp", session.name)
+    folders = sorted((pytester.path / "basetemp").glob("**/vnet-1"))
+    assert len(folders) == 2, done.stdout
+    command = [*VNET, "simulate", str(folders[0] / "scenario.toml"), "--out", "again"]
+    run(command, cwd=pytester.path, capture_output=True, timeout=120)
+    verdicts = [verdict_of(folder) for folder in (*folders, pytester.path / "again")]
+    assert len({verdict["trace_sha256"] for verdict in verdicts}) == 1
+    assert {verdict["verdict"] for verdict in verdicts} == {"valid"}
+
+
 def test_an_order_is_the_same_when_it_is_reproduced(pytester: pytest.Pytester) -> None:
     result = run_tests(
         pytester,

@@ -10,7 +10,6 @@ import selectors
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -198,19 +197,6 @@ def test_call_later_sleep_and_timeouts_set_their_timers_by_call_at(
     task.cancel()
     loop.round()
     loop.round()
-
-
-def test_the_loop_shuts_its_default_executor_down(loop: StandingLoop) -> None:
-    has(loop, "_default_executor")
-    executor = asyncio_internals.default_executor(loop, "vnet")
-    assert asyncio_internals.default_executor(loop, "vnet") is executor
-    given = ThreadPoolExecutor(1)
-    loop.set_default_executor(given)
-    assert asyncio_internals.default_executor(loop, "vnet") is given, f"{CHANGED}it keeps its executor elsewhere"
-    loop.close()
-    with pytest.raises(RuntimeError):
-        given.submit(nothing)
-    executor.shutdown()
 
 
 def test_a_closed_loop_says_so(loop: StandingLoop) -> None:

@@ -4,6 +4,8 @@ import asyncio
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from decimal import Decimal, getcontext
+from queue import Queue
 from typing import Any
 
 import numpy as np
@@ -257,6 +259,34 @@ def test_a_default_executor_is_its_programs_alone() -> None:
     world.run(program)
     assert [e.kind for e in world.endings] == ["finished", "finished"]
     assert names["v1"].startswith("own") and not names["v2"].startswith("own")
+
+
+def test_a_job_waits_for_a_thread_of_its_own_program_alone() -> None:
+    async def program(node: Node) -> None:
+        queue: Queue[int] = Queue()
+        waits = asyncio.create_task(asyncio.to_thread(queue.get))
+        for _ in range(3):  # until the jobs of all programs wait
+            await asyncio.sleep(0)
+        await asyncio.to_thread(queue.put, 1)
+        await waits
+
+    nodes = [f"v{number}" for number in range(40)]  # more than there are threads for one program
+    world = World(*nodes)
+    world.run(program)
+    assert [e.kind for e in world.endings] == ["finished"] * len(nodes)
+
+
+def test_a_number_of_decimals_is_its_programs_alone() -> None:
+    thirds: dict[str, Decimal] = {}
+
+    async def program(node: Node) -> None:
+        if node.id == "v1":
+            getcontext().prec = 3
+        await asyncio.sleep(1.0)
+        thirds[node.id] = Decimal(1) / 3
+
+    World("v1", "v2").run(program)
+    assert [len(str(thirds[node])) for node in ("v1", "v2")] == [5, 30]
 
 
 def test_an_early_exit_takes_the_nodes_other_tasks_with_it() -> None:

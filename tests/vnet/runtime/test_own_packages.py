@@ -11,7 +11,7 @@ import pytest
 from tests.support.paths import ROOT
 from vnet.errors import ProgramError
 from vnet.runtime.own_packages import foreign_on_path, name_clash
-from vnet.runtime.programs import load_program
+from vnet.runtime.programs import load_program, search_programs_in
 
 PROGRAM = "async def main(node):\n    pass\n"
 
@@ -65,6 +65,22 @@ def test_a_module_of_a_package_that_vnet_s_own_hides(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ProgramError, match=f"rename {tmp_path}/agents/__init__.py$"):
         load_program("agents.mine:main")
+
+
+def test_a_program_of_another_folder_with_the_name_of_one_before_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "same_name.py").write_text("async def main(node): ...\n")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    search_programs_in([Path("one")])
+    load_program("same_name:main")
+    search_programs_in([Path("two")])
+    with pytest.raises(ProgramError, match=r"same_name is already one/same_name\.py: rename .*two/same_name\.py$"):
+        load_program("same_name:main")
+    del sys.modules["same_name"]
 
 
 def test_without_such_a_file_nothing_is_said_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
