@@ -777,6 +777,8 @@ class NodeLogHandler(logging.Handler):
     Records on nobody's behalf, and asyncio's own, go the way of `logging.lastResort`, as without this handler.
     """
 
+    is_vnets = True
+
     def __init__(self, write: Callable[[Node, str, str], None]) -> None:
         super().__init__()
         self._write = write

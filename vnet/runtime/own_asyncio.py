@@ -26,6 +26,7 @@ import contextvars
 import gc
 import importlib
 import inspect
+import logging
 import os
 import random
 import signal
@@ -59,7 +60,7 @@ NOBODY.run(current_node.set, None)
 _SEED_BYTES = 16
 _system_bytes, _seed, _system_entropy = os.urandom, random.Random.seed, os.getrandom
 _python_state, _numpy_state = random._inst, np.random.mtrand._rand
-_set_threshold, _signal = gc.set_threshold, signal.signal
+_set_threshold, _signal, _basic_config = gc.set_threshold, signal.signal, logging.basicConfig
 _OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
 """Functions of `numpy.random` that are no methods of its generator, and the methods that they call."""
 
@@ -298,6 +299,19 @@ class _Nobodys(random.Random):
         _seed(self, int.from_bytes(_system_bytes(_SEED_BYTES)) if a is None else a, version)
 
 
+def _configure_logging(**options: Any) -> None:
+    """Configure logging as if vnet had no handler; it stays."""
+    root = logging.getLogger()
+    ours = [handler for handler in root.handlers if getattr(handler, "is_vnets", False)]
+    for handler in ours:
+        root.removeHandler(handler)
+    try:
+        _basic_config(**options)
+    finally:
+        for handler in ours:
+            root.addHandler(handler)
+
+
 def _signal_set(number: int, handler: Any) -> Any:
     """Set a handler; of a program in another thread than the main one, as in a test, nothing, and no error."""
     if _drawing() is None or threading.current_thread() is threading.main_thread():
@@ -322,6 +336,7 @@ def _of_chance() -> list[tuple[Any, str, Any, Any]]:
         (tempfile, "_Random", random.Random, _Nobodys),
         (gc, "set_threshold", _set_threshold, _threshold_set),
         (signal, "signal", _signal, _signal_set),
+        (logging, "basicConfig", _basic_config, _configure_logging),
     ]
     for module, kind in (random, "python"), (np.random, "numpy"), (np.random.mtrand, "numpy"):
         shared = _python_state if module is random else _numpy_state

@@ -1,6 +1,8 @@
 """Hosting programs on a loop: mailboxes, endings, and programs that misbehave."""
 
 import asyncio
+import io
+import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -287,6 +289,24 @@ def test_a_number_of_decimals_is_its_programs_alone() -> None:
 
     World("v1", "v2").run(program)
     assert [len(str(thirds[node])) for node in ("v1", "v2")] == [5, 30]
+
+
+def test_a_program_may_configure_logging_in_main() -> None:
+    root = logging.getLogger()
+    before, root.handlers = root.handlers, []
+
+    async def program(node: Node) -> None:
+        logging.basicConfig(level=logging.INFO, stream=io.StringIO(), force=node.id == "v2")
+        logging.info("told by %s", node.id)
+
+    world = World("v1", "v2")
+    try:
+        world.run(program)
+    finally:
+        root.handlers = before
+        root.setLevel(logging.WARNING)
+    notes = [(note.node, note.text.removeprefix("root: ")) for traffic in world.traffic for note in traffic.notes]
+    assert notes == [("v1", "told by v1"), ("v2", "told by v2")]
 
 
 def test_an_early_exit_takes_the_nodes_other_tasks_with_it() -> None:
