@@ -19,12 +19,12 @@ import secrets
 import socket
 import sys
 import threading
-import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+from time import monotonic, monotonic_ns  # by name: a program may put emulated time in their place
 from typing import TYPE_CHECKING, NoReturn
 
 import zenoh
@@ -142,7 +142,7 @@ class Attachment:
         if payload == _WHERE:  # the program's thread may be stuck: this one answers
             self.say(wire.StackDump(self.nonce, self._stack(), self.time_ns(), self.frames_seq))
             return
-        self.inbox.put((payload, time.monotonic_ns()))
+        self.inbox.put((payload, monotonic_ns()))
         self.on_message(payload)
 
     def _on_emulator(self, sample: zenoh.Sample) -> None:
@@ -175,9 +175,9 @@ class Attachment:
         if traffic is None:
             return
         self.say(wire.Final(self.nonce, traffic, provisional=True))
-        deadline = time.monotonic() + TOLD_S
+        deadline = monotonic() + TOLD_S
         with suppress(RunOverError, TransportError):
-            while (wait_s := deadline - time.monotonic()) > 0:
+            while (wait_s := deadline - monotonic()) > 0:
                 self._next(wait_s)
 
     def publish(self, traffic: wire.Traffic) -> None:
@@ -209,11 +209,11 @@ class Attachment:
         Raises TransportError on refusal, after `timeout_s`, and if the emulator speaks another version.
         """
         welcomes: dict[str, wire.Welcome] = {}
-        deadline = time.monotonic() + timeout_s
+        deadline = monotonic() + timeout_s
         while True:
             self.say_hello()
-            next_hello = time.monotonic() + HELLO_PERIOD_S
-            while (wait_s := next_hello - time.monotonic()) > 0:
+            next_hello = monotonic() + HELLO_PERIOD_S
+            while (wait_s := next_hello - monotonic()) > 0:
                 message = self._next(wait_s)
                 if isinstance(message, wire.Welcome) and message.nonce == self.nonce:
                     if message.version != wire.VERSION:
@@ -222,7 +222,7 @@ class Attachment:
                 if len(welcomes) == len(self.nodes):
                     self.orphan_timeout_s = message.orphan_timeout_s  # type: ignore[union-attr]
                     return [welcomes[node] for node in self.nodes]
-            if time.monotonic() > deadline:
+            if monotonic() > deadline:
                 missing = ", ".join(node for node in self.nodes if node not in welcomes)
                 raise TransportError(f"no welcome for {missing} within {timeout_s:g} s: is the emulator running?")
 
@@ -269,7 +269,7 @@ class Attachment:
                 )
             return None
         if isinstance(message, wire.Await):
-            self._patience_until = time.monotonic() + message.within_s
+            self._patience_until = monotonic() + message.within_s
             return None
         if isinstance(message, wire.End) and message.nonce in (None, self.nonce):
             if message.refused:
@@ -285,13 +285,13 @@ class Attachment:
     @property
     def patience_s(self) -> float:
         """Seconds to wait for an emulator that is gone: longer if it has announced it."""
-        return max(self.orphan_timeout_s, self._patience_until - time.monotonic())
+        return max(self.orphan_timeout_s, self._patience_until - monotonic())
 
     def _wait_as_orphan(self) -> None:
         """Wait until the emulator is back; its first messages may be faster than the news of it."""
         patience_s = self.patience_s
-        deadline = time.monotonic() + patience_s
-        while (wait_s := deadline - time.monotonic()) > 0:
+        deadline = monotonic() + patience_s
+        while (wait_s := deadline - monotonic()) > 0:
             try:
                 item = self.inbox.get(timeout=wait_s)
             except queue.Empty:
@@ -495,7 +495,7 @@ class _WallClockLoop(SkewedLoop):
     @property
     def now_ns(self) -> int:
         """Nanoseconds since the start of the run."""
-        return max(time.monotonic_ns() - self.origin_ns, 0)
+        return max(monotonic_ns() - self.origin_ns, 0)
 
 
 class _RealTimeAgent:
@@ -507,7 +507,7 @@ class _RealTimeAgent:
         self._attachment = attachment
         self._programs = programs
         self._boot_id = welcomes[0].boot_id
-        self._origin_ns = time.monotonic_ns()
+        self._origin_ns = monotonic_ns()
         self._host = Host(welcomes, self._now_ns, self._schedule_flush, write_line, disks)
         self._wake_pending = False
         self._flush_pending = False
@@ -520,7 +520,7 @@ class _RealTimeAgent:
         self._orphan_timer: asyncio.TimerHandle | None = None
 
     def _now_ns(self) -> int:
-        return max(time.monotonic_ns() - self._origin_ns, 0)
+        return max(monotonic_ns() - self._origin_ns, 0)
 
     async def main(self) -> None:
         """From the start of the run to its end."""
@@ -599,10 +599,10 @@ class _RealTimeAgent:
         if batch.origin_ns is not None and not self._started:
             same_machine = self._boot_id != "" and self._boot_id == wire.boot_id()
             head_start_ns = 0 if batch.start_ns else wire.HEAD_START_NS
-            here_ns = time.monotonic_ns() + head_start_ns - batch.start_ns
+            here_ns = monotonic_ns() + head_start_ns - batch.start_ns
             self._origin_ns = self._loop.origin_ns = batch.origin_ns if same_machine else here_ns
             self._started = True
-            head_start_s = max(0.0, (self._origin_ns + batch.start_ns - time.monotonic_ns()) / 1e9)
+            head_start_s = max(0.0, (self._origin_ns + batch.start_ns - monotonic_ns()) / 1e9)
             self._loop.call_later(head_start_s, self._host.start, self._loop, self._programs)
         now_ns = arrived_ns - self._origin_ns
         self._host.apply_clock_error(batch.clocks, self._loop)
@@ -635,7 +635,7 @@ class _RealTimeAgent:
     def _take_overdue(self) -> list[MessageRef]:
         """Return references to messages that have not come for `UNSEEN_NS`, and await them no longer."""
         self._deliver_messages()  # a program that has computed for long has looked at none
-        now_ns = time.monotonic_ns()
+        now_ns = monotonic_ns()
         overdue = [ref for ref, since_ns in self._unseen.items() if now_ns - since_ns >= UNSEEN_NS]
         for ref in overdue:
             del self._unseen[ref]

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from agents import host
 from agents.host import UNSEEN_NS, Attachment, Found, Lost, _RealTimeAgent
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import TransportError
@@ -133,3 +134,9 @@ def test_a_message_of_the_backbone_that_has_come_while_the_program_computed_is_n
     there.append(MessageRef("v01", 0))
     agent._flush()
     assert said[0].unseen == [MessageRef("v01", 1)]
+
+
+def test_a_program_may_put_emulated_time_in_place_of_the_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("monotonic", "monotonic_ns"):
+        monkeypatch.setattr(time, name, lambda: 0)
+        assert vars(host)[name]() > 0
