@@ -96,7 +96,7 @@ def _print(metrics: RadioMetrics, unicast: UnicastFigures | None, console: Conso
     if unicast is not None:
         console.print(f"{'frames to one vehicle':24}{unicast}", highlight=False)
     if not totals["pairs"]:
-        console.print("nobody sent anything to anybody in range")
+        console.print("nobody broadcast anything to anybody in range")
         return
     counts = f"{totals['pairs']:,} pairs on {totals['links']:,} links, {totals['delivered']:,} delivered"
     console.print(f"{counts}: {totals['delivery_ratio']:.2%}", highlight=False)

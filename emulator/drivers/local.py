@@ -51,7 +51,7 @@ from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.error_text import NOT_THE_PROGRAM, error_line
 from vnet.runtime.host import Disks, Host
 from vnet.runtime.outside_loop import caught, collected_by_schedule, present_node
-from vnet.runtime.programs import Programs, load_programs
+from vnet.runtime.programs import Programs, imports_noted, load_programs
 from vnet.runtime.ready_queue import CpuMeter
 from vnet.runtime.running_node import LOOK_S, Patience, RunningNode
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -324,7 +324,8 @@ def process_kept() -> Iterator[None]:
     )
     others: set[int | None] = set(_started_processes(os.getpid()))
     try:
-        yield
+        with imports_noted():
+            yield
     finally:
         tracker = getattr(sys.modules.get("multiprocessing.resource_tracker"), "_resource_tracker", None)
         others.add(getattr(tracker, "_pid", None))  # which ends by itself, once it has removed what others left

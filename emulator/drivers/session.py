@@ -41,7 +41,7 @@ from vnet.errors import ProgramError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.environment import SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
-from vnet.runtime.programs import load_program, search_programs_in
+from vnet.runtime.programs import forget_imports, load_program, search_programs_in
 from vnet.transport.access import Access
 from vnet.transport.session import quiet_zenoh
 
@@ -98,6 +98,7 @@ class Session:
     ) -> None:
         """`loads_programs` has live ones loaded in a process aside first, to tell of what is wrong with them."""
         scenario = with_order_steps(scenario)
+        forget_imports()
         is_local = isinstance(programs, Local)
         loads_programs = loads_programs and not is_local and bool(entries_of(scenario))
         with program_check(scenario) if loads_programs else nullcontext() as check:

@@ -34,6 +34,7 @@ from typing import Any, NoReturn, TypeVar
 from emulator.scenario.program import Program
 from vnet.errors import ScenarioError, VnetError, printable
 from vnet.extras import missed_by
+from vnet.runtime.programs import imports_noted
 
 LONGEST_ERROR = 300
 CONSTANT = "DECLARES"
@@ -64,7 +65,8 @@ def load_function(key: str, entry: str, program: Program, usage: str) -> Callabl
     if name in {each.entry.partition(":")[0] for each in (program, *program.exceptions)}:
         raise ScenarioError(f"{problem}: is in the program's module: put it into a module of its own")
     try:
-        module = importlib.import_module(name)
+        with imports_noted():
+            module = importlib.import_module(name)
     except (Exception, SystemExit) as error:
         raise ScenarioError(f"{problem}: cannot import: {in_words(error)}") from error
     found = getattr(module, function, None)
@@ -141,7 +143,8 @@ def _modules(program: Program) -> list[str]:
 
 def _imported(name: str) -> ModuleType:
     try:
-        return importlib.import_module(name)
+        with imports_noted():
+            return importlib.import_module(name)
     except (Exception, SystemExit) as error:
         raise ScenarioError(f"{CONSTANT}: cannot import {name!r}: {in_words(error)}") from error
 

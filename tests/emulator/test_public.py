@@ -70,6 +70,31 @@ def fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("emulator.api.is_fit", lambda: True)
 
 
+REMEMBERS = """
+async def main(node):
+    import remembers_more
+    async for fix in node.gnss:
+        for known in (KNOWN, remembers_more.KNOWN):
+            known[node.id] = known.get(node.id, 0) + 1
+        node.report(known=KNOWN[node.id] + remembers_more.KNOWN[node.id])
+
+KNOWN = {}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("fit")
+def test_a_run_finds_nothing_that_one_before_has_left_in_modules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "remembers.py").write_text(REMEMBERS)
+    (tmp_path / "remembers_more.py").write_text("KNOWN = {}\n")
+    runs = [emulator.simulate("beacon", program="remembers.py", duration_s=1, out=name) for name in ("one", "two")]
+    first, second = (run.reported("known") for run in runs)
+    assert first.tolist() == second.tolist() and first[-1, 0] > first[0, 0] == 2
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("fit")
 def test_simulate_gives_a_run_with_what_was_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,8 +45,7 @@ from weakref import WeakKeyDictionary, WeakSet
 import numpy as np
 
 from vnet.runtime import asyncio_internals
-from vnet.runtime.error_text import NOT_THE_PROGRAM
-from vnet.runtime.own_packages import OWN
+from vnet.runtime.own_packages import is_users
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -365,6 +364,11 @@ def attach() -> None:
         asyncio_internals.hash_gatherings_by(number_of)
 
 
+def are_attached() -> bool:
+    """Return whether programs run in this process."""
+    return _users > 0
+
+
 def detach() -> None:
     """Give the names their own values back when no programs run any more."""
     global _users
@@ -401,11 +405,10 @@ def _use_in_modules() -> None:
         if not issubclass(type(module), ModuleType) or module in _seen:
             continue
         _seen.add(module)
-        names = object.__getattribute__(module, "__dict__")  # without loading one that is lazy
-        file = names.get("__file__")
+        names = object.__getattribute__(module, "__dict__")
         if name.startswith("scipy.stats."):
             for value in names.values():
                 if getattr(value, "__dict__", {}).get("_random_state") is _numpy_state:
                     value._random_state = _shared_numpy
-        elif isinstance(file, str) and not file.startswith(NOT_THE_PROGRAM) and name.partition(".")[0] not in OWN:
+        elif is_users(name):
             _use_in(names)

@@ -12,6 +12,8 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 
+from vnet.runtime.error_text import NOT_THE_PROGRAM
+
 OWN = ("agents", "emulator", "vnet")
 ROOT = Path(__file__).resolve().parents[2]
 """The folder that holds vnet's own packages."""
@@ -50,6 +52,14 @@ def name_clash(module: str, folder: Path) -> str:
         hider = _hider(package, file)
         return f"{hider}: rename {file}" if hider else ""
     return ""
+
+
+def is_users(name: str) -> bool:
+    """Return whether a module of this process is from a file that is not vnet's, Python's or installed."""
+    module = sys.modules.get(name)
+    names = object.__getattribute__(module, "__dict__") if isinstance(module, ModuleType) else {}
+    file = names.get("__file__")  # without loading a module that is lazy
+    return isinstance(file, str) and not file.startswith(NOT_THE_PROGRAM) and name.partition(".")[0] not in OWN
 
 
 def another_file(module: ModuleType) -> Path | None:

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 from vnet.errors import ProgramError, did_you_mean
 from vnet.extras import missed_by
 from vnet.runtime.error_text import error_line
-from vnet.runtime.own_packages import another_file, name_clash
+from vnet.runtime.own_packages import another_file, is_users, name_clash
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -59,7 +59,8 @@ def load_program(entry: str) -> Program:
     own_asyncio.attach()
     is_new, context = module_name not in sys.modules, copy_context()
     try:
-        module = context.run(importlib.import_module, module_name)
+        with imports_noted():
+            module = context.run(importlib.import_module, module_name)
     except Exception as error:
         if needed := missed_by(error):
             raise ProgramError(f"program.entry = {entry!r} {needed}") from error
@@ -83,6 +84,33 @@ def load_program(entry: str) -> Program:
         raise _load_error(entry, f"called with the node: {error}; async def {name}(node)", module_name) from None
     own_asyncio.use_stand_ins(program)
     return program  # type: ignore[no-any-return]
+
+
+_imported: list[str] = []
+"""Names of the user's modules that were imported on behalf of runs."""
+
+
+@contextmanager
+def imports_noted() -> Iterator[None]:
+    """Note which of the user's modules are imported within the block, on behalf of a run."""
+    before = set(sys.modules)
+    try:
+        yield
+    finally:
+        _imported.extend(name for name in sys.modules if name not in before and is_users(name))
+
+
+def forget_imports() -> None:
+    """Have the next run import its modules again, as in a process of its own: they keep nothing of other runs.
+
+    Modules that somebody else has imported stay, as do all while programs run.
+    """
+    from vnet.runtime import own_asyncio
+
+    if not own_asyncio.are_attached():
+        for name in _imported:
+            sys.modules.pop(name, None)
+        _imported.clear()
 
 
 def context_of(program: Program) -> Context:
