@@ -319,8 +319,8 @@ def _signal_set(number: int, handler: Any) -> Any:
 
 
 def _threshold_set(*thresholds: int) -> None:
-    """Leave it to the loops when garbage is collected, where a program asks."""
-    if _drawing() is None:
+    """Leave it to a loop in virtual time when garbage is collected, where its program asks."""
+    if _drawing() is None or not hasattr(asyncio._get_running_loop(), "start_at"):
         _set_threshold(*thresholds)
 
 

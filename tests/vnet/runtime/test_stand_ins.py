@@ -144,8 +144,14 @@ def test_names_that_a_process_shares_are_nobodys_draws() -> None:
     assert first[0] != other[0] and first[1] == other[1]
 
 
-def test_a_program_leaves_to_the_loop_when_garbage_is_collected() -> None:
+def test_a_program_in_virtual_time_leaves_to_the_loop_when_garbage_is_collected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     before = gc.get_threshold()
+    as_node(Fake(1), lambda: gc.set_threshold(before[0] + 1))
+    assert gc.get_threshold()[0] == before[0] + 1, "in real time they are its own"
+    gc.set_threshold(*before)
+    monkeypatch.setattr(asyncio.SelectorEventLoop, "start_at", 0, raising=False)
     as_node(Fake(1), lambda: gc.set_threshold(7))
     assert gc.get_threshold() == before
 
