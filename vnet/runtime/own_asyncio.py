@@ -349,7 +349,8 @@ _STAND_INS: list[tuple[Any, str, Any, Any]] = [
     *((module, *each) for module in (asyncio, asyncio.futures, asyncio.tasks) for each in STAND_INS),
     *_of_chance(),
 ]
-_OTHER = {id(own): other for _, _, own, other in _STAND_INS}
+_OTHER = {id(own): other for owner, _, own, other in _STAND_INS if owner is not tempfile}
+"""Stand-ins by the identity of what they stand for, under whatever name; `random.Random` stays itself."""
 _lock = threading.Lock()
 _users = 0
 

@@ -14,7 +14,7 @@ import uuid
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from random import gauss
+from random import Random, gauss
 from random import random as drawn_by_name
 from types import ModuleType
 from typing import Any
@@ -36,6 +36,7 @@ DRAWS: dict[str, Callable[[], Any]] = {
     "by name": lambda: drawn_by_name(),
     "gauss": lambda: gauss(0, 1),
     "Random()": lambda: random.Random().random(),
+    "class by name": lambda: Random().random(),
     "SystemRandom": lambda: random.SystemRandom().random(),
     "urandom": lambda: os.urandom(8).hex(),
     "secrets": lambda: secrets.token_hex(),
@@ -189,6 +190,10 @@ def test_each_function_draws_as_that_of_a_generator_with_its_seed(module: Module
             continue
         module.seed(7)
         assert repr(drawn) == repr(ours[name](*given)), name
+
+
+def test_a_class_by_name_is_itself() -> None:
+    assert Random is random.Random and type(random.Random(1)) is Random
 
 
 def test_functions_can_be_pickled() -> None:
