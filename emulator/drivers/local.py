@@ -324,7 +324,7 @@ def process_kept() -> Iterator[None]:
     )
     others: set[int | None] = set(_started_processes(os.getpid()))
     try:
-        with imports_noted():
+        with imports_noted(lambda: present_node() is not None):
             yield
     finally:
         tracker = getattr(sys.modules.get("multiprocessing.resource_tracker"), "_resource_tracker", None)

@@ -13,7 +13,6 @@ into a library nothing is interrupted before it returns.
 from __future__ import annotations
 
 import ast
-import importlib
 import inspect
 import signal
 import sys
@@ -34,7 +33,7 @@ from typing import Any, NoReturn, TypeVar
 from emulator.scenario.program import Program
 from vnet.errors import ScenarioError, VnetError, printable
 from vnet.extras import missed_by
-from vnet.runtime.programs import imports_noted
+from vnet.runtime.programs import import_for_run
 
 LONGEST_ERROR = 300
 CONSTANT = "DECLARES"
@@ -65,8 +64,7 @@ def load_function(key: str, entry: str, program: Program, usage: str) -> Callabl
     if name in {each.entry.partition(":")[0] for each in (program, *program.exceptions)}:
         raise ScenarioError(f"{problem}: is in the program's module: put it into a module of its own")
     try:
-        with imports_noted():
-            module = importlib.import_module(name)
+        module = import_for_run(name)
     except (Exception, SystemExit) as error:
         raise ScenarioError(f"{problem}: cannot import: {in_words(error)}") from error
     found = getattr(module, function, None)
@@ -143,8 +141,7 @@ def _modules(program: Program) -> list[str]:
 
 def _imported(name: str) -> ModuleType:
     try:
-        with imports_noted():
-            return importlib.import_module(name)
+        return import_for_run(name)
     except (Exception, SystemExit) as error:
         raise ScenarioError(f"{CONSTANT}: cannot import {name!r}: {in_words(error)}") from error
 

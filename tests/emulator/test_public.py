@@ -73,10 +73,11 @@ def fit(monkeypatch: pytest.MonkeyPatch) -> None:
 REMEMBERS = """
 async def main(node):
     import remembers_more
+    from remembered import part
     async for fix in node.gnss:
-        for known in (KNOWN, remembers_more.KNOWN):
+        for known in (KNOWN, remembers_more.KNOWN, part.KNOWN):
             known[node.id] = known.get(node.id, 0) + 1
-        node.report(known=KNOWN[node.id] + remembers_more.KNOWN[node.id])
+        node.report(known=KNOWN[node.id] + remembers_more.KNOWN[node.id] + part.KNOWN[node.id])
 
 KNOWN = {}
 """
@@ -89,10 +90,12 @@ def test_a_run_finds_nothing_that_one_before_has_left_in_modules(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "remembers.py").write_text(REMEMBERS)
-    (tmp_path / "remembers_more.py").write_text("KNOWN = {}\n")
+    (tmp_path / "remembered").mkdir()
+    for name in ("remembers_more.py", "remembered/part.py"):
+        (tmp_path / name).write_text("KNOWN = {}\n")
     runs = [emulator.simulate("beacon", program="remembers.py", duration_s=1, out=name) for name in ("one", "two")]
     first, second = (run.reported("known") for run in runs)
-    assert first.tolist() == second.tolist() and first[-1, 0] > first[0, 0] == 2
+    assert first.tolist() == second.tolist() and first[-1, 0] > first[0, 0] == 3
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ from weakref import WeakKeyDictionary, WeakSet
 import numpy as np
 
 from vnet.runtime import asyncio_internals
-from vnet.runtime.own_packages import is_users
+from vnet.runtime.own_packages import users_file
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -227,7 +227,8 @@ def _imported_module() -> ModuleType | None:
     """Return the module of this process that runs because the present callback imports it; None if none does."""
     frame: FrameType | None = sys._getframe()
     while frame is not None and frame.f_code is not _CALLBACK:
-        module = sys.modules.get(frame.f_globals["__name__"]) if frame.f_code.co_name == "<module>" else None
+        name = frame.f_globals.get("__name__", "") if frame.f_code.co_name == "<module>" else ""
+        module = sys.modules.get(name)
         if module is not None and vars(module) is frame.f_globals and module.__name__ != "__main__":
             return module
         frame = frame.f_back
@@ -365,11 +366,6 @@ def attach() -> None:
         asyncio_internals.hash_gatherings_by(number_of)
 
 
-def are_attached() -> bool:
-    """Return whether programs run in this process."""
-    return _users > 0
-
-
 def detach() -> None:
     """Give the names their own values back when no programs run any more."""
     global _users
@@ -411,5 +407,5 @@ def _use_in_modules() -> None:
             for value in names.values():
                 if getattr(value, "__dict__", {}).get("_random_state") is _numpy_state:
                     value._random_state = _shared_numpy
-        elif is_users(name):
+        elif users_file(name) is not None:
             _use_in(names)

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 
 from vnet.runtime.error_text import NOT_THE_PROGRAM
 
 OWN = ("agents", "emulator", "vnet")
+INSTALLED = {"site-packages", "dist-packages"}
+"""Folders of installed packages, of whatever interpreter."""
 ROOT = Path(__file__).resolve().parents[2]
 """The folder that holds vnet's own packages."""
 
@@ -54,12 +56,19 @@ def name_clash(module: str, folder: Path) -> str:
     return ""
 
 
-def is_users(name: str) -> bool:
-    """Return whether a module of this process is from a file that is not vnet's, Python's or installed."""
+def users_file(name: str) -> Path | None:
+    """Return the file of a module of this process; None if it is vnet's, Python's or installed, or has none."""
     module = sys.modules.get(name)
     names = object.__getattribute__(module, "__dict__") if isinstance(module, ModuleType) else {}
     file = names.get("__file__")  # without loading a module that is lazy
-    return isinstance(file, str) and not file.startswith(NOT_THE_PROGRAM) and name.partition(".")[0] not in OWN
+    if not isinstance(file, str) or file.startswith(NOT_THE_PROGRAM) or name.partition(".")[0] in OWN:
+        return None
+    return None if INSTALLED.intersection(Path(file).parts) else Path(file).resolve()
+
+
+def is_compiled(file: Path | None) -> bool:
+    """Return whether a module's file is no Python source."""
+    return file is not None and file.name.endswith(tuple(EXTENSION_SUFFIXES))
 
 
 def another_file(module: ModuleType) -> Path | None:

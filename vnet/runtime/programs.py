@@ -10,6 +10,7 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import Context, ContextVar, copy_context
 from pathlib import Path
+from threading import get_ident
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
@@ -17,7 +18,7 @@ from weakref import WeakKeyDictionary
 from vnet.errors import ProgramError, did_you_mean
 from vnet.extras import missed_by
 from vnet.runtime.error_text import error_line
-from vnet.runtime.own_packages import another_file, is_users, name_clash
+from vnet.runtime.own_packages import another_file, is_compiled, name_clash, users_file
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -59,8 +60,7 @@ def load_program(entry: str) -> Program:
     own_asyncio.attach()
     is_new, context = module_name not in sys.modules, copy_context()
     try:
-        with imports_noted():
-            module = context.run(importlib.import_module, module_name)
+        module = context.run(import_for_run, module_name)
     except Exception as error:
         if needed := missed_by(error):
             raise ProgramError(f"program.entry = {entry!r} {needed}") from error
@@ -87,30 +87,52 @@ def load_program(entry: str) -> Program:
 
 
 _imported: list[str] = []
-"""Names of the user's modules that were imported on behalf of runs."""
+"""Names of the modules that were imported on behalf of runs."""
+_searched: set[str] = set()
+"""The folders in which programs have been looked for."""
 
 
 @contextmanager
-def imports_noted() -> Iterator[None]:
-    """Note which of the user's modules are imported within the block, on behalf of a run."""
-    before = set(sys.modules)
+def imports_noted(is_ours: Callable[[], bool]) -> Iterator[None]:
+    """Note within the block which modules are imported where `is_ours` says so, which knows the present thread."""
+
+    class Finder:
+        """Finds nothing: it is asked for each module first."""
+
+        @staticmethod
+        def find_spec(name: str, path: object = None, target: object = None) -> None:
+            if is_ours():
+                _imported.append(name)
+
+    sys.meta_path.insert(0, Finder)
     try:
         yield
     finally:
-        _imported.extend(name for name in sys.modules if name not in before and is_users(name))
+        sys.meta_path.remove(Finder)
+
+
+def import_for_run(name: str) -> ModuleType:
+    """Import a module, and note what it imports. Raises whatever its code does."""
+    thread = get_ident()
+    with imports_noted(lambda: get_ident() == thread):
+        return importlib.import_module(name)
 
 
 def forget_imports() -> None:
-    """Have the next run import its modules again, as in a process of its own: they keep nothing of other runs.
+    """Have the next run import the modules of its folders again, as in a process of its own: they keep nothing.
 
-    Modules that somebody else has imported stay, as do all while programs run.
+    Packages of which somebody else has imported a module stay, as do those with compiled parts, which are imported
+    once in a process.
     """
-    from vnet.runtime import own_asyncio
-
-    if not own_asyncio.are_attached():
-        for name in _imported:
+    files = {name: users_file(name) for name in _imported}
+    packages = {name: name.partition(".")[0] for name in [*sys.modules, *files]}
+    found = {packages[name] for name, file in files.items() if file and any(map(file.is_relative_to, _searched))}
+    compiled = {packages[name] for name, file in files.items() if is_compiled(file)}
+    of_others = {package for name, package in packages.items() if name in sys.modules and name not in files}
+    for name in files:
+        if packages[name] in found - compiled - of_others:
             sys.modules.pop(name, None)
-        _imported.clear()
+    _imported.clear()
 
 
 def context_of(program: Program) -> Context:
@@ -165,6 +187,7 @@ def search_programs_in(folders: Iterable[Path]) -> None:
     """
     sys.path[:] = path_without_programs()
     wanted = dict.fromkeys(str(folder) for folder in [*folders, Path.cwd()])
+    _searched.update(str(Path(folder).resolve()) for folder in wanted)
     _added[:] = [path for path in wanted if path not in sys.path]
     sys.path.extend(_added)
     importlib.invalidate_caches()

@@ -1,5 +1,7 @@
 """`emulator.environment`: PettingZoo's own tests, what agents see and do, and how episodes end."""
 
+import importlib
+import pickle
 import threading
 from collections.abc import Sequence
 from itertools import count
@@ -127,6 +129,18 @@ def test_an_episode_with_a_kill_that_ends_is_valid_and_one_that_is_left_early_is
     folders = sorted(path for path in tmp_path.iterdir() if path.is_dir())
     verdicts = [emulator.Run.open(folder).verdict for folder in folders]
     assert [verdict.value for verdict in verdicts] == ["valid", "unknown"]
+
+
+def test_what_the_user_imports_between_steps_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_policy.py").write_text("class Policy: ...\n")
+    env = make()
+    env.reset(seed=1)
+    policy = importlib.import_module("own_policy").Policy()
+    env.reset(seed=2)
+    env.close()
+    assert isinstance(pickle.loads(pickle.dumps(policy)), importlib.import_module("own_policy").Policy)
 
 
 def test_a_paused_vehicle_s_agent_has_its_last_observation() -> None:

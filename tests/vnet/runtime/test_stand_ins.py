@@ -115,6 +115,7 @@ def test_who_imports_a_module_draws_what_others_do_and_so_does_the_module(
 ) -> None:
     (tmp_path / "lucky.py").write_text(
         "import random, uuid\nfrom lucky_inner import draw\nX = uuid.uuid4(), draw()\n"
+        "exec('import random; random.random()', {})\n"
     )
     (tmp_path / "lucky_inner.py").write_text(
         "import random\nY = random.random()\ndef draw(): return random.random()\n"
