@@ -322,16 +322,13 @@ def process_kept() -> Iterator[None]:
     is_alone = here is threading.main_thread() and all(
         each.daemon or each is here for each in threading.enumerate()
     )
-    others: set[int | None] = set(_started_processes(os.getpid()))
+    others, finalizers = set(_started_processes(os.getpid())), {*_finalizers()}
     try:
         with imports_noted(lambda: present_node() is not None):
             yield
     finally:
-        tracker = getattr(sys.modules.get("multiprocessing.resource_tracker"), "_resource_tracker", None)
-        others.add(getattr(tracker, "_pid", None))  # which ends by itself, once it has removed what others left
-        for process in set(_started_processes(os.getpid())) - others if is_alone else ():
-            with suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
+        if is_alone:
+            _end_started(others, finalizers)
         os.chdir(folder)
         sys.path[:] = modules
         if os.environ != variables:
@@ -339,13 +336,34 @@ def process_kept() -> Iterator[None]:
             os.environ.update(variables)
 
 
+def _end_started(others: set[int], finalizers: set[Any]) -> None:
+    """End the processes beyond those that were there, and pools first: they would start others in their place."""
+    for key, finalizer in _finalizers().items():
+        if key not in finalizers:
+            with suppress(Exception):
+                finalizer()
+    tracker = getattr(sys.modules.get("multiprocessing.resource_tracker"), "_resource_tracker", None)
+    kept = {*others, getattr(tracker, "_pid", None)}  # it ends by itself, once it has removed what others left
+    for process in {*_started_processes(os.getpid())} - kept:
+        with suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+
+
+def _finalizers() -> dict[Any, Callable[[], object]]:
+    """Return what multiprocessing does first at the end of a process: it ends pools and managers."""
+    registry = getattr(sys.modules.get("multiprocessing.util"), "_finalizer_registry", {})
+    first = [key for key in registry if key[0] is not None and key[0] >= 0]
+    return {key: registry[key] for key in sorted(first, reverse=True)}
+
+
 def _started_processes(by: int) -> Iterator[int]:
     """Yield the processes of this session that one has started, and that these have; none if no file tells."""
-    with suppress(OSError):
-        for file in Path(f"/proc/{by}/task").glob("*/children"):
+    for file in Path(f"/proc/{by}/task").glob("*/children"):
+        with suppress(OSError):
             for process in map(int, file.read_text().split()):
-                if os.getsid(process) == os.getsid(0):
-                    yield from (process, *_started_processes(process))
+                with suppress(ProcessLookupError):
+                    if os.getsid(process) == os.getsid(0):
+                        yield from (process, *_started_processes(process))
 
 
 # What simulated programs print goes to the terminal, and to `logs/NODE.log` as in a run of many processes.

@@ -171,7 +171,7 @@ def attach() -> None:
         threading.Thread.start = _start_noted  # type: ignore[assignment, method-assign]
     if _thread.start_new_thread is _start_new_thread:
         _thread.start_new_thread = _start_new_noted
-    Executor.__init_subclass__ = classmethod(_note_pools)  # type: ignore[assignment, method-assign]
+    Executor.__init_subclass__ = classmethod(_note_defined)  # type: ignore[assignment, method-assign]
     for kind in (ThreadPoolExecutor, *Executor.__subclasses__()):
         _note_pools(kind)
     if sys.unraisablehook is not _unraisable:
@@ -272,6 +272,11 @@ def _note_pools(kind: type[Executor]) -> None:
     """Note the jobs of Python's own executors; that of processes is slow to import, and few programs do."""
     if kind.__module__.startswith("concurrent.futures.") and not hasattr(kind.submit, "__wrapped__"):
         kind.submit = _noted(kind.submit)  # type: ignore[method-assign]
+
+
+def _note_defined(kind: type[Executor], /, **options: Any) -> None:
+    super(Executor, kind).__init_subclass__(**options)
+    _note_pools(kind)
 
 
 def _on_behalf_of(owner: Node, job: Callable[..., Any], /, *args: Any, **options: Any) -> Any:

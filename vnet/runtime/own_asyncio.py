@@ -40,7 +40,7 @@ from functools import wraps
 from itertools import count
 from types import FrameType, FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any, cast
-from weakref import WeakKeyDictionary, WeakSet
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -393,15 +393,16 @@ def _use_in(names: dict[str, Any]) -> None:
         names[name] = _OTHER.get(id(value), value)
 
 
-_seen: WeakSet[ModuleType] = WeakSet()
+_seen: set[str] = set()
 
 
 def _use_in_modules() -> None:
     """Let modules of the user's that were imported before, as a test's may be, and scipy's generators use these."""
-    for name, module in list(sys.modules.items()):
-        if not issubclass(type(module), ModuleType) or module in _seen:
+    for name in sys.modules.keys() - _seen:
+        _seen.add(name)
+        module = sys.modules.get(name)
+        if not issubclass(type(module), ModuleType):
             continue
-        _seen.add(module)
         names = object.__getattribute__(module, "__dict__")
         if name.startswith("scipy.stats."):
             for value in names.values():

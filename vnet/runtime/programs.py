@@ -124,6 +124,8 @@ def forget_imports() -> None:
     Packages of which somebody else has imported a module stay, as do those with compiled parts, which are imported
     once in a process.
     """
+    if not _imported:
+        return
     files = {name: users_file(name) for name in _imported}
     packages = {name: name.partition(".")[0] for name in [*sys.modules, *files]}
     found = {packages[name] for name, file in files.items() if file and any(map(file.is_relative_to, _searched))}

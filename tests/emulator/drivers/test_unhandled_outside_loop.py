@@ -127,9 +127,11 @@ async def submits_and_forgets(node: Node) -> None:
 async def imports_an_executor_and_forgets(node: Node) -> None:
     await asyncio.sleep(0.5)
 
-    class Pool(Executor):
-        __module__ = "concurrent.futures.process"
+    class Named:
+        def __init_subclass__(cls, name: str) -> None:
+            cls.__module__ = name
 
+    class Pool(Executor, Named, name="concurrent.futures.process"):
         def submit(self, *_: Any, **__: Any) -> Future[Any]:
             job: Future[Any] = Future()
             job.set_exception(ValueError("boom"))
