@@ -259,6 +259,7 @@ def _serve(descriptor: int, shown: int) -> None:
     threading.Thread(target=_receive, args=(connection, jobs), daemon=True).start()
     while True:
         job = jobs.get()
+        running_node.running.show("")
         try:
             function, arguments = pickle.loads(job)
             answer = True, function(*arguments)

@@ -390,7 +390,8 @@ def use_stand_ins(function: Callable[..., Any]) -> None:
 
 def _use_in(names: dict[str, Any]) -> None:
     for name, value in list(names.items()):
-        names[name] = _OTHER.get(id(value), value)
+        if (other := _OTHER.get(id(value))) is not None:
+            names[name] = other
 
 
 _seen: set[str] = set()

@@ -42,9 +42,9 @@ METRES = ("x_m", "y_m")
 DEGREES = ("lat_deg", "lon_deg")
 """Columns of positions in degrees."""
 OPTIONAL = ("heading_rad", "speed_mps")
+"""Columns that a file may lack."""
 MOST_TURNED_RAD = 4 * np.pi
 """Heading beyond which it is probably in degrees: whoever unwinds headings rarely counts more turns."""
-"""Columns that a file may lack."""
 _BOUND = {
     "time_s": FAR_S,
     "x_m": MAX_COORDINATE_M,
