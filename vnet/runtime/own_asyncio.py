@@ -45,7 +45,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from vnet.runtime import asyncio_internals
-from vnet.runtime.own_packages import users_file
+from vnet.runtime.own_packages import names_of, users_file
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -334,9 +334,6 @@ def _of_chance() -> list[tuple[Any, str, Any, Any]]:
         (np.random.mtrand, "_rand", _numpy_state, _shared_numpy),
         (random, "_inst", _python_state, _shared_python),
         (tempfile, "_Random", random.Random, _Nobodys),
-        (gc, "set_threshold", _set_threshold, _threshold_set),
-        (signal, "signal", _signal, _signal_set),
-        (logging, "basicConfig", _basic_config, _configure_logging),
     ]
     for module, kind in (random, "python"), (np.random, "numpy"), (np.random.mtrand, "numpy"):
         shared = _python_state if module is random else _numpy_state
@@ -349,6 +346,9 @@ def _of_chance() -> list[tuple[Any, str, Any, Any]]:
 _STAND_INS: list[tuple[Any, str, Any, Any]] = [
     *((module, *each) for module in (asyncio, asyncio.futures, asyncio.tasks) for each in STAND_INS),
     *_of_chance(),
+    (gc, "set_threshold", _set_threshold, _threshold_set),
+    (signal, "signal", _signal, _signal_set),
+    (logging, "basicConfig", _basic_config, _configure_logging),
 ]
 _OTHER = {id(own): other for owner, _, own, other in _STAND_INS if owner is not tempfile}
 """Stand-ins by the identity of what they stand for, under whatever name; `random.Random` stays itself."""
@@ -401,10 +401,7 @@ def _use_in_modules() -> None:
     """Let modules of the user's that were imported before, as a test's may be, and scipy's generators use these."""
     for name in sys.modules.keys() - _seen:
         _seen.add(name)
-        module = sys.modules.get(name)
-        if not issubclass(type(module), ModuleType):
-            continue
-        names = object.__getattribute__(module, "__dict__")
+        names = names_of(name)
         if name.startswith("scipy.stats."):
             for value in names.values():
                 if getattr(value, "__dict__", {}).get("_random_state") is _numpy_state:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from vnet.runtime.error_text import NOT_THE_PROGRAM
 
@@ -56,11 +57,15 @@ def name_clash(module: str, folder: Path) -> str:
     return ""
 
 
+def names_of(name: str) -> dict[str, Any]:
+    """Return what a module of this process defines, without loading one that is lazy."""
+    module = sys.modules.get(name)
+    return object.__getattribute__(module, "__dict__") if issubclass(type(module), ModuleType) else {}
+
+
 def users_file(name: str) -> Path | None:
     """Return the file of a module of this process; None if it is vnet's, Python's or installed, or has none."""
-    module = sys.modules.get(name)
-    names = object.__getattribute__(module, "__dict__") if isinstance(module, ModuleType) else {}
-    file = names.get("__file__")  # without loading a module that is lazy
+    file = names_of(name).get("__file__")
     if not isinstance(file, str) or file.startswith(NOT_THE_PROGRAM) or name.partition(".")[0] in OWN:
         return None
     return None if INSTALLED.intersection(Path(file).parts) else Path(file).resolve()
