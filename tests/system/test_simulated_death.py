@@ -113,7 +113,7 @@ def test_what_a_program_has_started_ends_with_the_simulation(tmp_path: Path, pro
 LATER = """
 import atexit, ctypes, os, pathlib, threading
 def end():
-    while not pathlib.Path("run/states.parquet").exists():
+    while not pathlib.Path("run/world.npz").exists():  # the first of the files that are written after a run
         pass
     END
 async def main(node):
