@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
+
+from emulator.scenario.sections import validated
 
 MOST_VEHICLES = 100
 """Vehicles that are listed, those that took most CPU time first: verdict.json stays small."""
@@ -110,12 +111,9 @@ class RunCost:
         return "; ".join(parts)
 
 
-_COST = TypeAdapter(RunCost)
-
-
 def read_cost(value: object) -> RunCost:
     """Return the costs that verdict.json holds under `cost`."""
-    return _COST.validate_python(value)
+    return validated(RunCost, value)
 
 
 def run_cost(

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from emulator.records.run_folder import (
     EVENTS_FILE,
@@ -24,13 +24,13 @@ from emulator.records.run_folder import (
 )
 from emulator.records.tables import TABLES
 from emulator.records.tape import TAPE_FILE
+from emulator.scenario.sections import validated
 from vnet.bounded import open_regular, read_regular
 from vnet.errors import VnetError, printable
 
 LARGEST_BYTES = 1 << 26
 UNLISTED = ("logs/checks.txt", "logs/checks.log", "logs/programs.log")
 """Output of own checks, which judge a folder again, and logs of checks and programs of earlier vnets."""
-_MANIFEST = TypeAdapter(dict[str, str])
 
 
 def _evidence() -> list[str]:
@@ -49,7 +49,7 @@ def read_manifest(folder: Path) -> dict[str, str] | None:
     """Return the digests by path, or None if there is no manifest. Raises VnetError for anything else."""
     path = folder / MANIFEST_FILE
     try:
-        return _MANIFEST.validate_python(json.loads(read_regular(path, LARGEST_BYTES)), strict=True)
+        return validated(dict[str, str], json.loads(read_regular(path, LARGEST_BYTES)), strict=True)
     except FileNotFoundError:
         return None
     except OSError as error:

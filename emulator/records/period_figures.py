@@ -15,11 +15,11 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from emulator.scenario.own_functions import CONSTANT, declared, load_entry
 from emulator.scenario.program import Program
-from emulator.scenario.sections import FAR_M, first_problem
+from emulator.scenario.sections import FAR_M, first_problem, validated
 from emulator.world.world import Instant
 from vnet.errors import ScenarioError, VnetError, printable
 from vnet.types import Array
@@ -160,15 +160,14 @@ class Views:
 
 
 NO_VIEWS = Views()
-_VIEWS = TypeAdapter(Views)
 
 
 def views_of(data: Mapping[str, Any]) -> Views:
     """Return views that are given as data. Raises VnetError for what cannot be."""
     try:
-        return _VIEWS.validate_python(data)
+        return validated(Views, data)
     except ValidationError as error:
-        raise VnetError(f"views: {first_problem(error, _VIEWS)}") from None
+        raise VnetError(f"views: {first_problem(error, Views)}") from None
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from emulator.records.costs import RunCost
 from emulator.records.period_figures import POSITION_FIGURES, KeyFigure, Views, shown_figures
 from emulator.records.reported import ReportedFigure
-from emulator.scenario.sections import first_problem
+from emulator.scenario.sections import first_problem, validated
 from vnet.bounded import read_regular
 from vnet.errors import VnetError
 from vnet.units import title_of
@@ -190,16 +190,13 @@ class Record:
         return self.frames_by_outcome.get(outcome, 0) / self.in_range if self.in_range else None
 
 
-_RECORD = TypeAdapter(Record)
-
-
 def read_record(path: Path) -> Record:
     """Read a verdict.json. Raises OSError, and VnetError where it is not what vnet writes."""
     try:
         data = json.loads(read_regular(path, LARGEST_BYTES))
-        record = _RECORD.validate_python(data)
+        record = validated(Record, data)
     except ValidationError as error:
-        raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
+        raise VnetError(f"{path}: {first_problem(error, Record)}") from None
     except (ValueError, RecursionError) as error:
         raise VnetError(f"{path}: not JSON: {error}") from None
     if "key_figures" not in data:  # of an earlier vnet, whose figures have no titles

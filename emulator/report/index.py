@@ -14,14 +14,14 @@ from typing import Any
 from urllib.parse import quote
 
 import pyarrow as pa
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from emulator.pages.page import put_page, render
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE, is_run_folder
 from emulator.records.tables import open_table
 from emulator.records.verdicts import Record, Verdict
-from emulator.scenario.sections import first_problem
+from emulator.scenario.sections import first_problem, validated
 from vnet.bounded import read_bounded
 from vnet.errors import VnetError, first_names, printable
 
@@ -52,18 +52,15 @@ class CampaignRecord:
         return sum("failed" in result for result in self.results)
 
 
-_RECORD = TypeAdapter(CampaignRecord)
-
-
 def read_campaign(folder: Path) -> CampaignRecord:
     """Read the campaign.json of a folder. Raises VnetError where it is not what vnet writes."""
     path = folder / CAMPAIGN_FILE
     try:
-        return _RECORD.validate_python(json.loads(read_bounded(path, LARGEST_BYTES)))
+        return validated(CampaignRecord, json.loads(read_bounded(path, LARGEST_BYTES)))
     except OSError as error:
         raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
-        raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
+        raise VnetError(f"{path}: {first_problem(error, CampaignRecord)}") from None
     except (ValueError, RecursionError) as error:
         raise VnetError(f"{path}: not JSON: {error}") from None
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -19,6 +20,8 @@ from pydantic import (
 from pydantic_core import ErrorDetails, InitErrorDetails
 
 from vnet.errors import did_you_mean, printable, shown
+
+T = TypeVar("T")
 
 DAY_S = 86_400
 """No time in a scenario is longer, so that nanoseconds stay far within 64 bits."""
@@ -68,7 +71,7 @@ class Section(BaseModel):
     kinds: ClassVar[Mapping[str, type[Section]]] = {}
     """The classes of a section that has several kinds, told apart by the key `kind`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     @model_validator(mode="wrap")
     @classmethod
@@ -91,7 +94,17 @@ def _of_another_type(given: Any, made: Any) -> Literal["", "int_type", "float_ty
     return "float_type" if type(made) is float and isinstance(given, bool | str) else ""
 
 
-def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]) -> str:
+_validator: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
+"""The validator of a type, which takes some milliseconds to make: it is made when it is needed."""
+
+
+def validated(of: type[T], data: object, strict: bool | None = None) -> T:
+    """Return plain data, as of JSON, as a value `of` this type. Raises ValidationError."""
+    value: T = _validator(of).validate_python(data, strict=strict)
+    return value
+
+
+def first_problem(error: ValidationError, of: type[Any]) -> str:
     """Return the first problem of a value `of` this type, as `key = value: what is allowed`."""
     problems = error.errors()
     # A key that is misspelt is unknown, and the one that was meant may be missing.
@@ -136,9 +149,7 @@ def _worded(problem: ErrorDetails) -> str:
     return message[:1].lower() + message[1:]
 
 
-def _followed(
-    of: type[BaseModel] | TypeAdapter[Any], path: Sequence[int | str]
-) -> tuple[list[int | str], list[type[BaseModel]]]:
+def _followed(of: type[Any], path: Sequence[int | str]) -> tuple[list[int | str], list[type[BaseModel]]]:
     """Return the keys of a `path`, without the kinds that pydantic puts in, and the sections at its end.
 
     Numbers are indices of lists. Names that are neither a key nor a kind are the user's own, of a table such as
@@ -158,8 +169,6 @@ def _followed(
 
 def _sections_in(annotation: Any) -> Iterator[type[BaseModel]]:
     """Yield the sections that an annotation names, and all kinds of those that have several."""
-    if isinstance(annotation, TypeAdapter):
-        annotation = annotation._type
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
         if issubclass(annotation, Section):
