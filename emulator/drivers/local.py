@@ -24,7 +24,7 @@ import warnings
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection, Coroutine, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -270,11 +270,10 @@ class HostedPrograms:
         with process_kept(), output_kept(self._owns, self._logs), caught(self._host.process_ended):
             asyncio.set_event_loop(self.loop)
             try:
-                with collected_by_schedule():  # to the end, at which nothing is collected any more
+                with collected_by_schedule(), closing(self.loop):  # at the end nothing is collected any more
                     self._run()
             finally:
                 asyncio.set_event_loop(None)
-                self.loop.close()
                 self._host.discard_abandoned(running_node.running.show)
                 if (ordered := self._host.mail.ordered) is not None:
                     self._order_steps = ordered.steps
