@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -66,12 +66,23 @@ PLACEHOLDER = re.compile(r"\{[a-z_]+\}", re.IGNORECASE)
 """A word that is meant to be filled in. Within a word braces may be a program's own."""
 
 
+_Variable = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+
+
+def _check_filled_in(words: Iterable[str]) -> None:
+    """Raise ValueError for a word that is meant to be filled in, and is none of those that are."""
+    if unknown := [word for word in words if PLACEHOLDER.fullmatch(word) and word not in FILLED_IN]:
+        raise ValueError(f"{unknown[0]} is none of {', '.join(FILLED_IN)}, which are filled in")
+
+
 class OneProgram(Section):
     """A program as `package.module:function`, and the options it is given."""
 
     command: tuple[tuple[str, ...], ...] | None = None
     """`kind = "zenoh"`: the words of the command that starts a program that speaks Zenoh, or a list of such lists.
     `{id}`, `{endpoint}` and `{port}` are filled in; `python` is vnet's own. If left out, others start them."""
+    environment: dict[_Variable, str] = Field(default_factory=dict)
+    """Variables that its commands find in their environment. The same is filled in."""
     entry: Entry = _ENTRY
     """An async function of one argument, the `Node`: `package.module:function` or `file.py:function`; a file's is
     `main` if left out."""
@@ -86,10 +97,15 @@ class OneProgram(Section):
         for words in commands or ():
             if not isinstance(words, list | tuple) or not words or not all(isinstance(word, str) for word in words):
                 raise ValueError('write its words, as ["python", "talker.py", "{id}"], or a list of such lists')
-            unknown = [word for word in words if PLACEHOLDER.fullmatch(word) and word not in FILLED_IN]
-            if unknown:
-                raise ValueError(f"{unknown[0]} is none of {', '.join(FILLED_IN)}, which are filled in")
+            _check_filled_in(words)
         return commands
+
+    @model_validator(mode="after")
+    def _variables_are_of_commands(self) -> Self:
+        if self.environment and self.command is None:
+            raise ValueError("environment goes with a command")
+        _check_filled_in(self.environment.values())
+        return self
 
     @property
     def commands(self) -> tuple[tuple[str, ...], ...]:

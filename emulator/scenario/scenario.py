@@ -536,6 +536,7 @@ class Scenario(Section):
         sessions = self.program.sessions
         own: dict[str, Any] = {
             "command": self.program.commands_of(node),
+            "environment": self.program.of(node).environment,
             "query_s": sessions.query_s,
             "liveliness_s": sessions.liveliness_s,
             "queue_frames": self.radio.queue_frames,

@@ -3,6 +3,7 @@
 import json
 import re
 import socket
+import sys
 import threading
 from collections import Counter
 from pathlib import Path
@@ -306,7 +307,9 @@ def test_users_and_several_commands_of_one_vehicle(vnet: Vnet, tmp_path: Path, p
     """A command has the first user's password; one without it is not let in."""
     (tmp_path / "users.txt").write_text("car:secret\n")
     secured = ('kind = "zenoh"', 'kind = "zenoh"\nzenoh = { users = "users.txt" }')
-    both = '[["python", "talker.py", "{id}"], ["python", "talker.py", "{id}"]]'
+    again = '["sh", "-c", "exec $TALKER $NAME"]'
+    variables = f'environment = {{ TALKER = "{sys.executable} {tmp_path}/talker.py", NAME = "{{id}}" }}'
+    both = f'[["python", "talker.py", "{{id}}"], {again}]\n{variables}'
     alone = '["sh", "-c", "unset ZENOH_CONFIG; exec sleep 100"]'
     words = both if program == "talker.py" else alone
     limit = [] if words == both else ["--set", "run.join_timeout_s=1"]
@@ -314,4 +317,4 @@ def test_users_and_several_commands_of_one_vehicle(vnet: Vnet, tmp_path: Path, p
     assert done.status in (SLOW if words == both else (2,))
     if words == both:
         assert heard(done, "v01")["v01"] > 0
-        assert (done.folder / "logs/v01~2.log").read_text()
+        assert "heard car/v01/pose" in (done.folder / "logs/v01~2.log").read_text()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ PYTHON_FLAGS = frozenset(["-u", "-B", "-E", "-s", "-S", "-q"])
 """Options of Python's command line that change nothing on virtual time."""
 
 
-def filled_in(words: Sequence[str], node: str, endpoint: str) -> list[str]:
+def filled_in(words: Iterable[str], node: str, endpoint: str) -> list[str]:
     """Return the words of a command of the vehicle `node`, whose endpoint is PROTOCOL/HOST:PORT."""
     values = node, endpoint, endpoint.rpartition(":")[2]
     filled = list(words)

@@ -372,6 +372,8 @@ class Gateways:
     def _start_commands(self, node: str, vehicle: _Vehicle) -> None:
         folder, endpoint = Path(self._folder.name), self.endpoints[node]
         inherited = {name: value for name, value in os.environ.items() if name != RUNTIME_VARIABLE}
+        own = self._program.of(node).environment
+        inherited |= zip(own, filled_in(own.values(), node, endpoint), strict=True)
         environment = session_environment(node, endpoint, self._program, folder, inherited)
         environment |= {STARTED_BY_VNET: "1", "PYTHONUNBUFFERED": "1"}
         if self._ros2 is not None:

@@ -133,6 +133,42 @@ def test_configuration_is_where_a_gateway_gives_it(drive: Drive) -> None:
     assert json.loads(CLIENT_CONFIG.read_text()) == client_config(ENDPOINT)
 
 
+def test_variables_of_the_scenario_are_in_the_environment_of_each_vehicles_commands(
+    drive: Drive, tmp_path: Path
+) -> None:
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "wheel.py").write_text("SIZE = 3\n")
+    variables = {"NAME": "car-{id}", "ROUTER": "{endpoint}", "PYTHONPATH": str(tmp_path / "parts")}
+    run = drive(
+        """
+        import os, subprocess, sys, wheel
+        print(os.environ["NAME"], os.environ["ROUTER"], wheel.SIZE)
+        os.environ["NAME"] = "another"
+        child = "import os, wheel; print(os.environ['NAME'], wheel.SIZE)"
+        print(subprocess.run([sys.executable, "-c", child], capture_output=True, text=True).stdout)
+        """,
+        vehicles=2,
+        program={"environment": variables},
+    )
+    for node in ("v01", "v02"):
+        assert log(run, node)[0] == f"car-{node} {ENDPOINT} 3"
+        assert "another 3" in log(run, node)
+
+
+@pytest.mark.parametrize(
+    ("environment", "text"),
+    [({"A": "{name}"}, "{name} is none of {id}"), ({"A=B": "c"}, "A=B"), ({"": "c"}, "environment")],
+)
+def test_variables_that_cannot_be_are_refused_when_the_scenario_is_read(
+    environment: dict[str, str], text: str
+) -> None:
+    command = ["python", "talker.py"]
+    with pytest.raises(ValueError, match=text):
+        Scenario.model_validate({"program": {"kind": "zenoh", "command": command, "environment": environment}})
+    with pytest.raises(ValueError, match="environment goes with a command"):
+        Scenario.model_validate({"program": {"environment": {"A": "b"}}})
+
+
 def test_chance_of_numpy_is_the_vehicles_own(drive: Drive) -> None:
     text = """
         import numpy as np, sys

@@ -107,13 +107,15 @@ def zenoh_modules(vehicle: Vehicle, program: ProgramModules) -> dict[str, Module
 async def main(node: Node) -> None:
     """Run the programs of a scenario with `program.kind = "zenoh"` until all have ended.
 
-    `node.options` has their commands (`command`), `keys` that cross the radio, `query_s` and `liveliness_s`, and
-    `ros2`: the options of `[radio.ros2]`.
+    `node.options` has their commands (`command`), variables of their `environment`, `keys` that cross the radio,
+    `query_s` and `liveliness_s`, and `ros2`: the options of `[radio.ros2]`.
     """
     loop = asyncio.get_running_loop()
     if not isinstance(loop, VirtualTimeLoop):
         raise ProgramError('vnet.gateway.emulated needs run.pacing = "lockstep": in real time Zenoh itself runs')
     commands: Sequence[Sequence[str]] = node.options["command"]
+    variables: Mapping[str, str] = node.options.get("environment", {})
+    environment = dict(zip(variables, filled_in(variables.values(), node.id, ENDPOINT), strict=True))
     topics: Mapping[str, Any] | None = node.options.get("ros2")
     ros2 = None if topics is None else Ros2(node.id, topics["inside"], topics["domain"])
     query_s, liveliness_s = (node.options.get(name, 1.0) for name in ("query_s", "liveliness_s"))
@@ -124,7 +126,7 @@ async def main(node: Node) -> None:
         with children_outside():
             async with asyncio.TaskGroup() as tasks:
                 for words in commands:
-                    tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT)))
+                    tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT), environment))
     except ExceptionGroup as errors:
         error = errors.exceptions[0]
         raise error.with_traceback(_of_program(error.__traceback__)) from None
@@ -153,13 +155,13 @@ def _is_import(frame: FrameType) -> bool:
     return module == ProgramModules.__module__ or module.startswith("importlib._bootstrap")
 
 
-async def run_program(vehicle: Vehicle, words: Sequence[str]) -> None:
+async def run_program(vehicle: Vehicle, words: Sequence[str], environment: Mapping[str, str]) -> None:
     """Run a program of a vehicle to its end. Raises what ends it, ProgramError for a status other than 0."""
     python = Path(words[0])
     if len(python.parts) > 1 and python.parent.resolve() != Path(sys.executable).parent.resolve():
         text = f"{python} is taken for {sys.executable}: on virtual time programs have this Python and its packages"
         vehicle.node.log(text, "warning")
-    modules = ProgramModules(vehicle.node)
+    modules = ProgramModules(vehicle.node, environment)
     modules.modules.update(zenoh_modules(vehicle, modules))
     try:
         await modules.threads.run_main(partial(modules.run, words))

@@ -23,7 +23,7 @@ import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from copy import copy
 from functools import cache, partial
@@ -153,7 +153,7 @@ class Variables(dict[str, str]):
 class ProgramModules:
     """The modules of one program of a vehicle, as `sys.modules` has them."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, environment: Mapping[str, str]) -> None:
         self.node = node
         self.threads = Threads()
         self.process = OwnProcess(self.threads)
@@ -166,7 +166,9 @@ class ProgramModules:
         self.path: list[str] = []
         self.argv: list[str] = []
         own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)
-        self.environ = Variables(os.environ | own)
+        self.environ = Variables(os.environ | environment | own)
+        searched = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
+        self._searched = [*searched, *sys.path]
         if "ros2" in node.options:
             self.environ["ROS_DOMAIN_ID"] = str(node.options["ros2"]["domain"])
         has_children = "child processes are outside of the emulation: Zenoh in Python opens no session there"
@@ -246,13 +248,13 @@ class ProgramModules:
         here = str(Path.cwd())
         words = [words[0], *python_words(words)]
         if words[1] == "-m":
-            self.path[:] = [here, *sys.path]
+            self.path[:] = [here, *self._searched]
             spec = self._find_module(words[2])
             self.argv[:] = [spec.origin or "", *words[3:]]
             assert isinstance(spec.loader, SourceFileLoader)
             return spec.loader.get_code(spec.name), spec.origin or "", spec
         if words[1] == "-c":
-            self.path[:] = [here, *sys.path]
+            self.path[:] = [here, *self._searched]
             self.argv[:] = ["-c", *words[3:]]
             return compile(words[2], "<string>", "exec", dont_inherit=True), "", None
         script = words[1]
@@ -261,7 +263,7 @@ class ProgramModules:
             source = path.read_bytes()
         except OSError as error:
             raise ProgramError(f"program.command: {shown(script)}: {error.strerror}") from None
-        self.path[:] = [str(path.resolve().parent), *sys.path]
+        self.path[:] = [str(path.resolve().parent), *self._searched]
         self.argv[:] = list(words[1:])
         return compile(source, script, "exec", dont_inherit=True), script, None
 
