@@ -806,6 +806,28 @@ def test_the_end_of_a_run_is_no_failure_of_a_thread(drive: Drive) -> None:
     assert log(run) == ["failed ZeroDivisionError"]
 
 
+def test_the_end_of_a_run_is_no_failure_of_a_task_that_blocks(drive: Drive) -> None:
+    """A coroutine that waits for a channel, and so holds its loop up, as public programs have them."""
+    run = drive(
+        """
+        import asyncio, zenoh
+
+        async def watch(subscriber):
+            for sample in subscriber:
+                print("heard")
+
+        async def main():
+            session = zenoh.open(zenoh.Config())
+            asyncio.create_task(watch(session.declare_subscriber("a")))
+            print("begins", flush=True)
+            await asyncio.sleep(9)
+
+        asyncio.run(main())
+        """
+    )
+    assert log(run) == ["begins"]
+
+
 @pytest.mark.parametrize(
     ("words", "fault", "text"),
     [

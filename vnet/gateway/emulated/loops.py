@@ -10,6 +10,8 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
+from greenlet import GreenletExit
+
 from vnet.gateway.emulated.strands import Lock, Threads, fail
 from vnet.node import Node
 from vnet.runtime.outside_loop import collector
@@ -60,7 +62,7 @@ def prepare_asyncio(module: Any, node: Node, threads: Threads, set_handler: Call
 
         def default_exception_handler(self, context: dict[str, Any]) -> None:
             error = context.get("exception")
-            if threads.are_over:
+            if threads.are_over or isinstance(error, GreenletExit):
                 return
             if isinstance(error, Exception) and not collector.runs:
                 fail(error, "in a task or a callback of asyncio")
