@@ -170,8 +170,8 @@ _LOOKS: Mapping[str, tuple[str, str, str]] = {
 
 
 @styled
-def draw(points: Sequence[Point]) -> Figure:
-    """Delivery against peers, a panel for each size of frame."""
+def draw(points: Sequence[Point], path: Path) -> None:
+    """Delivery against peers, a panel for each size of frame: `path`.png and `path`.svg."""
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
     panels = figure.subplots(1, len(SIZES), sharey=True)
     for axes, size_bytes in zip(panels, SIZES, strict=True):
@@ -181,7 +181,7 @@ def draw(points: Sequence[Point]) -> Figure:
     figure.suptitle(
         f"Delivery within {reach_m():.0f} m against the number of others there, {RATE_HZ} frames a second"
     )
-    return figure
+    save(figure, path)
 
 
 def _draw_size(axes: Axes, points: Sequence[Point], size_bytes: int) -> None:
@@ -197,12 +197,3 @@ def _draw_size(axes: Axes, points: Sequence[Point], size_bytes: int) -> None:
     axes.set_xlabel("others in range")
     axes.set_ylim(0, 1.1)
     axes.set_xlim(0, None)
-
-
-def run_capacity(seconds: float, seeds: Sequence[int], folder: Path) -> Path:
-    """The study with its picture, written to `folder`; returns the path of the Markdown."""
-    points = study(seconds, seeds)
-    path = folder / "capacity.md"
-    path.write_text(report(points))
-    save(draw(points), folder / "capacity")
-    return path

@@ -302,12 +302,12 @@ def draw_figures(
 @app.command()
 def consensus(networks: NetworksOption = None, seeds: SeedsOption = 3, out: OutOption = None) -> None:
     """Consensus alone: against rounds, loss, delay, one-way links and churn, beside the linear model."""
-    from studies.consensus import run_consensus
+    from studies.consensus import study_network
 
     with one_line_errors():
-        path = run_consensus(networks, range(1, seeds + 1), _folder(out, "consensus"))
-        Console().print(Markdown(path.read_text()))
-        print(path)
+        folder = _folder(out, "consensus")
+        markdown = study_network(paper.network_sections(networks)["n1"], range(1, seeds + 1), folder)
+        _show(markdown, folder / "consensus.md")
 
 
 @app.command()
@@ -317,12 +317,13 @@ def capacity(
     out: OutOption = None,
 ) -> None:
     """Capacity of an 802.11p channel: packet delivery ratio against the number of senders in range."""
-    from studies.capacity import run_capacity
+    from studies import capacity as study
 
     with one_line_errors():
-        path = run_capacity(seconds, range(1, seeds + 1), _folder(out, "capacity"))
-        Console().print(Markdown(path.read_text()))
-        print(path)
+        folder = _folder(out, "capacity")
+        points = study.study(seconds, range(1, seeds + 1))
+        study.draw(points, folder / "capacity")
+        _show(study.report(points), folder / "capacity.md")
 
 
 def _map_section(sigma_m: float, aside_m: float, datum: str | None, datum_sigma_m: float) -> dict[str, Any]:

@@ -266,11 +266,11 @@ def _rows(results: Sequence[Result]) -> Iterator[list[str]]:
             _ratio(rows),
             shown_interval(column(rows, "position_rmse_m")),
             shown_interval([value for row in rows for value in row["anees_batches"]], 2),
-            _mean(rows, "reference_common_error_anees", 2),
+            _of_known(rows, "reference_common_error_anees", ".2f"),
             f"{_percent(rows, 'coverage_95')} / {_percent(rows, 'position_coverage_95')}",
             f"{_percent(rows, 'within_05_m')} / {_percent(rows, 'within_15_m')}",
-            _median(rows, "converged_s"),
-            _mean(rows, "bytes"),
+            _of_known(rows, "converged_s", ".1f", np.median),
+            _of_known(rows, "bytes", ".0f"),
             f"{sum(column(rows, 'divergent'))} / {sum(column(rows, 'divergent_sigmas'))}",
         ]
 
@@ -294,23 +294,13 @@ def _ratio(rows: Sequence[Result]) -> str:
     return MISSING if np.isnan(ratio) else f"{ratio:.2f}"
 
 
-def _known(rows: Sequence[Result], name: str) -> list[float]:
-    return [row[name] for row in rows if row.get(name) is not None]
+def _of_known(rows: Sequence[Result], name: str, form: str, figure: Callable[[list[float]], Any] = np.mean) -> str:
+    known = [row[name] for row in rows if row.get(name) is not None]
+    return format(figure(known), form) if known else MISSING
 
 
 def _percent(rows: Sequence[Result], name: str) -> str:
-    known = _known(rows, name)
-    return f"{100 * np.mean(known):.1f} %" if known else MISSING
-
-
-def _mean(rows: Sequence[Result], name: str, digits: int = 0) -> str:
-    known = _known(rows, name)
-    return f"{np.mean(known):.{digits}f}" if known else MISSING
-
-
-def _median(rows: Sequence[Result], name: str) -> str:
-    known = _known(rows, name)
-    return f"{np.median(known):.1f}" if known else MISSING
+    return _of_known(rows, name, ".1%").replace("%", " %")
 
 
 def _tests(results: Sequence[Result]) -> str:

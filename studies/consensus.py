@@ -33,7 +33,7 @@ from emulator.pages.palette import PALETTE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.measure import study_cell
-from studies.paper import PAPER_RANGE_M, network_sections
+from studies.paper import PAPER_RANGE_M
 from vnet.errors import VnetError
 from vnet.types import Array
 
@@ -77,17 +77,12 @@ class Study:
         return np.array([e for label, e in pairs if all(label[k] == v for k, v in wanted.items())])
 
 
-def run_consensus(networks_folder: Path | None, seeds: Sequence[int], out: Path) -> Path:
-    """Run the study on N1 of `networks_folder`, or on a generated network of its character.
+def study_network(network: dict[str, Any], seeds: Sequence[int], out: Path, rounds: int = ROUNDS) -> str:
+    """Run the study on a `[network]`, for so many rounds; returns its tables in Markdown.
 
-    Writes consensus.md, consensus.parquet, consensus.png and consensus.svg into `out`, goes on where it was
-    interrupted, and returns the path of consensus.md. Raises VnetError if a cell cannot be run.
+    Writes consensus.parquet, consensus.png and consensus.svg into `out`, and goes on where it was interrupted.
+    Raises VnetError if the network is not connected, or a cell cannot be run.
     """
-    return study_network(network_sections(networks_folder)["n1"], seeds, out)
-
-
-def study_network(network: dict[str, Any], seeds: Sequence[int], out: Path, rounds: int = ROUNDS) -> Path:
-    """The same on any `[network]`, and for so many rounds. Raises VnetError if the network is not connected."""
     _, linked = graph(network)
     if not is_connected(linked):
         raise VnetError("the consensus study needs a network that is connected: its error is that of one mean")
@@ -101,9 +96,7 @@ def study_network(network: dict[str, Any], seeds: Sequence[int], out: Path, roun
     write_results(results, out, "consensus")
     models = model_matrices(linked)
     draw(study, models, out / "consensus")
-    path = out / "consensus.md"
-    path.write_text(_markdown(study, results, models, seeds))
-    return path
+    return _markdown(study, results, models, seeds)
 
 
 # Cells.
@@ -268,9 +261,9 @@ def model_error(weights: Array, rounds: int) -> Array:
     return np.array(errors)
 
 
-def rounds_to(error: Array, level: float = 0.01) -> int | None:
-    """After how many rounds `error` (rounds + 1,) stays below `level`; None if it does not."""
-    above = np.flatnonzero(~(error < level))
+def rounds_to_percent(error: Array) -> int | None:
+    """After how many rounds `error` (rounds + 1,) stays below 1 %; None if it does not."""
+    above = np.flatnonzero(~(error < 0.01))
     first = int(above.max(initial=-1)) + 1
     return first if first < len(error) else None
 
@@ -406,10 +399,10 @@ def _factor_table(study: Study, models: dict[str, Array], rounds: int) -> list[s
         errors = study.select(study="loss", rule=rule, loss=0.0)
         factors = [factor for error in errors if (factor := measured_factor(error)) is not None]
         measured = f"{np.mean(factors):.4f}" if factors else "–"
-        needed = [rounds_to(error) for error in errors]
+        needed = [rounds_to_percent(error) for error in errors]
         known = [value for value in needed if value is not None]
         took = f"{np.mean(known):.0f}" if known and len(known) == len(needed) else "–"
-        expected = rounds_to(model_error(matrix, max(rounds, 1000)))
+        expected = rounds_to_percent(model_error(matrix, max(rounds, 1000)))
         model = [f"{convergence_factor(matrix):.4f}", "–" if expected is None else str(expected)]
         lines.append(_row([rule, measured, model[0], took, model[1]]))
     return lines if FASTEST in models else [*lines, "", NO_CVXPY]

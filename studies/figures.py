@@ -1,7 +1,7 @@
 """The figures of the experiments: their style, errors against time, and the paper's Table I.
 
-Each function writes a PNG and an SVG next to each other and returns the PNG's path; its `draw_…` only makes the
-figure. Colours are those of Okabe and Ito, and nothing is told by colour alone. A mechanism has one colour and line
+Each function writes a PNG and an SVG next to each other and returns the PNG's path. Colours are those of Okabe and
+Ito, and nothing is told by colour alone. A mechanism has one colour and line
 in all figures; its variants ("random, one hop") keep the colour. No pyplot: no window, no state that lasts.
 """
 
@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from emulator.pages.palette import PALETTE
 from studies.reports import mean_and_standard_error
@@ -50,6 +49,7 @@ TIME_COLUMNS = {
     "common_error_rmse_m": "RMSE of the\ncommon error (m)",
     "deviation_m": "deviation across\nthe network (m)",
 }
+NO_REFERENCES: Mapping[str, float] = {}
 
 
 @dataclass(frozen=True)
@@ -132,12 +132,12 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
     return looks
 
 
+@styled
 def against_time(
     series: Mapping[str, Sequence[pa.Table]],
     out: Path,
     title: str,
-    references: Mapping[str, float] | None = None,
-    log: bool = False,
+    references: Mapping[str, float] = NO_REFERENCES,
     columns: Mapping[str, str] = TIME_COLUMNS,
 ) -> Path:
     """RMSE of the common error and network deviation (m) against time (s): means over seeds ± 1 standard error.
@@ -146,17 +146,6 @@ def against_time(
     the paper's; one whose label ends with a mechanism's name has its colour. `columns` are those of the metrics
     that are drawn, a panel each, with its title.
     """
-    return save(draw_against_time(series, title, references or {}, log, columns), out)
-
-
-@styled
-def draw_against_time(
-    series: Mapping[str, Sequence[pa.Table]],
-    title: str,
-    references: Mapping[str, float],
-    log: bool,
-    columns: Mapping[str, str] = TIME_COLUMNS,
-) -> Figure:
     figure = Figure(figsize=(9, 6.4), layout="constrained")
     panels = figure.subplots(len(columns), 1, sharex=True)
     looks = looks_of(list(series))
@@ -169,17 +158,13 @@ def draw_against_time(
         named = [looks[mechanism].colour for mechanism in series if label.endswith(mechanism)]
         panels[0].axhline(value, color=(named or [GREY])[-1], linewidth=1, linestyle=(0, (1, 2)), zorder=1.5)
     for axes in panels:
-        if log:
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        else:
-            axes.set_ylim(0, None)
+        axes.set_ylim(0, None)
     labels = {value: f"{label} {value:.2f} m" for label, value in references.items()}
     label_levels(panels[0], list(references.values()), [labels[value] for value in references.values()])
     panels[-1].set_xlabel("time (s)")
     figure.suptitle(f"{title}\n{_seeds_note(series)}")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, handlelength=3.5)
-    return figure
+    return save(figure, out)
 
 
 def _draw_band(axes: Axes, tables: Sequence[pa.Table], column: str, look: Look, label: str, shift: float) -> None:
@@ -215,28 +200,19 @@ def _seeds_note(series: Mapping[str, Sequence[pa.Table]]) -> str:
     return f"mean of {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} seeds, band ± 1 standard error"
 
 
+@styled
 def alpha_curve(
-    rows: Sequence[Mapping[str, Any]],
-    paper: Mapping[float | str, tuple[float, float]],
-    out: Path,
-    columns: tuple[str, str] = ("stacked_deviation_m", "stacked_rmse_m"),
+    rows: Sequence[Mapping[str, Any]], paper: Mapping[float | str, tuple[float, float]], out: Path
 ) -> Path:
     """Table I: √variance and √MSE (m) against constant α, and with optimized weights.
 
-    `rows` are results with `weights` ("optimized" or a number), `seed` and the two `columns`; `paper` has the
-    paper's √variance and √MSE (m) by α, and by "optimized" if wanted.
+    `rows` are results with `weights` ("optimized" or a number), `seed`, `stacked_deviation_m` and `stacked_rmse_m`;
+    `paper` has the paper's √variance and √MSE (m) by α, and by "optimized" if wanted.
     """
-    return save(draw_alpha_curve(rows, paper, columns), out)
-
-
-@styled
-def draw_alpha_curve(
-    rows: Sequence[Mapping[str, Any]], paper: Mapping[float | str, tuple[float, float]], columns: tuple[str, str]
-) -> Figure:
     figure = Figure(figsize=(8.5, 5.2), layout="constrained")
     axes = figure.subplots()
     names = (("√variance", BLUE, "o", (0, (5, 2))), ("√MSE", RED, "s", (0, (1, 1.5))))
-    for column, (name, colour, marker, line) in zip(columns, names, strict=True):
+    for column, (name, colour, marker, line) in zip(("stacked_deviation_m", "stacked_rmse_m"), names, strict=True):
         found = _by_weights(rows, column)
         constant = {weights: pair for weights, pair in found.items() if weights != OPTIMIZED_AT}
         solid: dict[str, Any] = {"color": colour, "marker": marker, "capsize": 3, "linewidth": 1.6}
@@ -262,7 +238,7 @@ def draw_alpha_curve(
     axes.set_ylabel("√variance and √MSE (m)")
     axes.set_title("Fusion weights on the ring of four vehicles: spread and error, ± 1 standard error", pad=10)
     figure.legend(loc="outside lower center", ncols=2, handlelength=3)
-    return figure
+    return save(figure, out)
 
 
 OPTIMIZED_AT = 1.12

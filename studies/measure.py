@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -64,6 +64,7 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
 
     states = emulation.metrics.states_table()
     recorded = _recorded(emulation, states)
+    common_m = recorded.vectors("common_error_estimate_m") - recorded.vectors("common_error_m")
     reference, metrics = _reference(recorded), emulation.metrics.metrics_table()
     figures = {
         "rmse_m": rms("common_error_rmse_m"),
@@ -77,8 +78,8 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
         "consensus_error_m": rms("consensus_error_m"),
         "common_error_anees": mean("common_error_anees"),
         "position_anees": mean("position_anees"),
-        "divergent": _divergent(states, len(emulation.world.node_ids), emulation.world.period_ns),
-        "bytes": _mean_value(states, "bytes"),
+        "divergent": len(first_divergences(np.linalg.norm(common_m, axis=2), emulation.world.period_ns)),
+        "bytes": sent.mean if (sent := reported_figures(states).get("bytes")) else None,
         "not_finite": sum(row.not_finite for row in rows),
         "metrics_sha256": emulation.metrics.sha256(),
         **consistency_figures(recorded, from_s),
@@ -114,21 +115,6 @@ def _rms_columns(rows: list[list[float | None]]) -> list[float]:
     return [float(value) for value in np.sqrt(np.mean(table**2, axis=0))]
 
 
-def _points(states: pa.Table, name: str) -> Array:
-    return np.array([(np.nan, np.nan) if p is None else p for p in states[name].to_pylist()], dtype=float)
-
-
-def _divergent(states: pa.Table, vehicles: int, period_ns: int) -> int:
-    """The number of vehicles that diverged at any time."""
-    error_m = np.hypot(*(_points(states, "common_error_estimate_m") - _points(states, "common_error_m")).T)
-    return len(first_divergences(error_m.reshape(-1, vehicles), period_ns))
-
-
-def _mean_value(states: pa.Table, name: str) -> float | None:
-    figure = reported_figures(states).get(name)
-    return None if figure is None else figure.mean
-
-
 study_cell = partial(Cell, measure=measure)
 """A cell whose figures are those of `measure`."""
 
@@ -147,10 +133,17 @@ def after(series: Mapping[str, Array], first: int) -> dict[str, float | list[flo
 
 
 def _settled(name: str, values: Array) -> float | None:
+    return _of_known(_root_of_mean, values**2) if name.endswith("_m") else _of_known(np.mean, values)
+
+
+def _of_known(figure: Callable[[Array], Any], values: Array) -> float | None:
+    """Return a figure of those values that are finite; None if none is."""
     known = values[np.isfinite(values)]
-    if not len(known):
-        return None
-    return math.sqrt((known**2).mean()) if name.endswith("_m") else float(known.mean())
+    return float(figure(known)) if len(known) else None
+
+
+def _root_of_mean(squares: Array) -> float:
+    return math.sqrt(squares.mean())
 
 
 def consistency_figures(recorded: RecordedRun, from_s: float) -> dict[str, Any]:
@@ -173,9 +166,9 @@ def consistency_figures(recorded: RecordedRun, from_s: float) -> dict[str, Any]:
     inside = chi2_quantile(COVERED, 2)
     away_m = np.linalg.norm(position_m[first:], axis=2)
     return {
-        "median_error_m": _median(np.linalg.norm(common_m[first:], axis=2)),
-        "median_position_error_m": _median(away_m),
-        "median_anees": _median(common_nees[first:] / chi2_quantile(0.5, 2)),
+        "median_error_m": _of_known(np.median, np.linalg.norm(common_m[first:], axis=2)),
+        "median_position_error_m": _of_known(np.median, away_m),
+        "median_anees": _of_known(np.median, common_nees[first:] / chi2_quantile(0.5, 2)),
         "coverage_95": _share(common_nees[first:], inside),
         "position_coverage_95": _share(position_nees[first:], inside),
         "anees_batches": batch_means(common_nees[first:] / 2, max(1, round(BATCH_S * NS_PER_S / period_ns))),
@@ -202,9 +195,9 @@ def others_figures(recorded: RecordedRun, from_s: float) -> dict[str, Any]:
     divergent = first_divergences(np.linalg.norm(common_m, axis=2), period_ns)
     divergent |= first_divergences(np.sqrt(squares), period_ns, DIVERGENT_SIGMAS)
     return {
-        "others_rmse_m": _root_mean_square(common_m[first:]),
-        "others_position_rmse_m": _root_mean_square(position_m[first:]),
-        "others_anees": _mean(squares[first:] / 2),
+        "others_rmse_m": _of_known(_root_of_mean, np.sum(common_m[first:] ** 2, axis=2)),
+        "others_position_rmse_m": _of_known(_root_of_mean, np.sum(position_m[first:] ** 2, axis=2)),
+        "others_anees": _of_known(np.mean, squares[first:] / 2),
         "others_divergent": len(divergent),
     }
 
@@ -220,23 +213,7 @@ def normalized(error_m: Array, covariance_m2: Array) -> Array:
 
 
 def _share(values: Array, limit: float) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.mean(known <= limit)) if len(known) else None
-
-
-def _mean(values: Array) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.mean(known)) if len(known) else None
-
-
-def _root_mean_square(errors_m: Array) -> float | None:
-    mean = _mean(np.sum(errors_m**2, axis=2))
-    return None if mean is None else math.sqrt(mean)
-
-
-def _median(values: Array) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else None
+    return _of_known(lambda known: np.mean(known <= limit), values)
 
 
 def batch_means(values: Array, periods: int) -> list[float]:

@@ -73,14 +73,12 @@ def table2_cells(
     return cells
 
 
-def default_cells(
-    networks: dict[str, dict[str, Any]], seeds: Sequence[int], rows: dict[str, dict[str, Any]] | None = None
-) -> list[Cell]:
+def default_cells(networks: dict[str, dict[str, Any]], seeds: Sequence[int]) -> list[Cell]:
     """vnet's own profile on the same networks; each run has the figures of its bound."""
     cells = []
     for network, section in networks.items():
         for seed in seeds:
-            for mechanism, options in (rows or DEFAULT_ROWS | ONE_HOP_ROWS).items():
+            for mechanism, options in (DEFAULT_ROWS | ONE_HOP_ROWS).items():
                 labels: Labels = {"network": network, "mechanism": mechanism, "seed": seed}
                 cells.append(study_cell(labels, default_scenario(section, seed, options), SETTLED_S))
     return cells

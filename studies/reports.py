@@ -128,20 +128,11 @@ CONFIDENCE = 0.95
 
 def interval_95(values: Values) -> tuple[float, float]:
     """Return the mean (NaN of no value) and half the width of its 95 % interval (NaN of fewer than two)."""
-    known = as_floats(values)
-    known = known[~np.isnan(known)]
-    if not len(known):
-        return math.nan, math.nan
-    return float(known.mean()), _half_width(known)
-
-
-def _half_width(known: np.ndarray) -> float:
     from scipy.special import stdtrit
 
-    if len(known) < 2:
-        return math.nan
-    quantile = float(stdtrit(len(known) - 1, (1 + CONFIDENCE) / 2))
-    return quantile * float(np.std(known, ddof=1)) / math.sqrt(len(known))
+    mean, error = mean_and_standard_error(values)
+    known = np.count_nonzero(~np.isnan(as_floats(values)))
+    return mean, float(stdtrit(known - 1, (1 + CONFIDENCE) / 2)) * error
 
 
 def shown_interval(values: Values, digits: int = 3) -> str:
@@ -192,9 +183,9 @@ def _paired(values: Values, reference: Values) -> tuple[int, float, float, float
     difference = as_floats(values) - as_floats(reference)
     known = difference[~np.isnan(difference)]
     mean, half_width = interval_95(known.tolist())
-    if len(known) < 2:
+    error = _standard_error(known)
+    if math.isnan(error):
         return len(known), mean, half_width, math.nan
-    error = float(np.std(known, ddof=1)) / math.sqrt(len(known))
     if error == 0:
         return len(known), mean, half_width, 1.0 if mean == 0 else 0.0
     return len(known), mean, half_width, 2 * float(stdtr(len(known) - 1, -abs(mean) / error))
