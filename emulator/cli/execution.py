@@ -20,7 +20,7 @@ import typer
 from emulator.checks.own import load_checks
 from emulator.cli.access import create_access, load_or_create_access
 from emulator.cli.folders import report_at_end
-from emulator.cli.options import DEFAULT_ADDRESS, DEFAULT_LISTEN, OutputOptions
+from emulator.cli.options import DEFAULT_ADDRESS, DEFAULT_LISTEN, RunOptions
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.determinism import calls_recorded, run_again
 from emulator.drivers.emulation import Emulation
@@ -42,6 +42,7 @@ from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import World
 from vnet.errors import VnetError, did_you_mean, printable
+from vnet.runtime.debug_target import DebugTarget
 
 
 def prepare_folder(
@@ -68,14 +69,15 @@ def prepare_folder(
 
 @dataclass(frozen=True)
 class Request:
-    """A run that was asked for: its scenario, the file that this was read from, and what is wanted of the run."""
+    """A run that was asked for: its scenario, and what is wanted of the run."""
 
     scenario: Scenario
-    file: Path
-    out: Path | None
+    asked: RunOptions
     sinks: Sinks | None
-    asked: OutputOptions
     output: StandardOutput
+    check_determinism: str | None = None
+    """Compared ways of making the run: "layouts" or "portable"; None if it is made once."""
+    debug: DebugTarget | None = None
 
     def session(self, programs: Programs, loads_programs: bool = True) -> Session:
         """Return the run, with a folder that is not made yet. Raises VnetError for what cannot be done."""
@@ -84,10 +86,10 @@ class Request:
     def _folder(self, scenario: Scenario, world: World) -> RunFolder:
         if self.sinks is not None and self.sinks.vehicle is not None and self.sinks.vehicle not in world.node_ids:
             raise VnetError(f"--rerun-vehicle {self.sinks.vehicle}: no such vehicle")
-        if (debug := self.asked.debug) is not None and debug.node not in world.node_ids:
+        if (debug := self.debug) is not None and debug.node not in world.node_ids:
             meant = did_you_mean(debug.node, world.node_ids)
             raise VnetError(f"--debug {printable(debug.node)}: no such vehicle{meant}")
-        return prepare_folder(self.out, self.file, scenario, self.asked.log_format, world.notes)
+        return prepare_folder(self.asked.out, self.asked.scenario, scenario, self.asked.log_format, world.notes)
 
 
 def run_with_processes(
@@ -111,12 +113,12 @@ def run_with_processes(
                 router=separate,
                 record=request.sinks,
                 start_hosts=True,
-                debug=request.asked.debug,
+                debug=request.debug,
                 agent=words,
             )
 
         session = request.session(programs, loads_programs=not words).open()
-        _run_live(session, request.asked, request.output)
+        _run_live(session, request)
 
 
 def _agent_words(command: str, scenario: Scenario) -> list[str]:
@@ -140,23 +142,24 @@ def run_simulated(request: Request, processes: str, on_folder: Callable[[Path], 
 
     `on_folder` is told the run's folder once it is made; `apart` is a vehicle that needs a process of its own.
     """
-    session = request.session(Local(processes, request.asked.debug, apart)).open()
+    session = request.session(Local(processes, request.debug, apart)).open()
     emulation = session.emulation
     on_folder(emulation.folder.path)
     request.output.keep_in(emulation.folder.logs)
-    with _progress(emulation, request.asked) as progress:
+    with _progress(emulation, request) as progress:
         with ExitStack() as stack:
             if request.sinks is not None:
                 _record_here(emulation, request.sinks, stack)
-            say = partial(_say, request.asked, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
-            stack.enter_context(calls_recorded(emulation.folder.path, request.asked.check_determinism is not None))
+            say = partial(_say, request, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
+            stack.enter_context(calls_recorded(emulation.folder.path, request.check_determinism is not None))
             session.run(on_interrupt=say)
-        _finish(session, progress, request.asked, request.output)
+        _finish(session, progress, request)
 
 
-def _progress(emulation: Emulation, asked: OutputOptions) -> Progress:
+def _progress(emulation: Emulation, request: Request) -> Progress:
     """Return the display of a run's progress; a debugger and a picture do not share a terminal."""
-    return show_progress(emulation, asked.log_format, asked.quiet, picture=asked.debug is None)
+    asked = request.asked
+    return show_progress(emulation, asked.log_format, asked.quiet, picture=request.debug is None)
 
 
 def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
@@ -199,12 +202,10 @@ def run_for_agents(
         who, file = ("hosts", "host-NAME.json") if options.access.hosts else ("agents", "NODE.json")
         return f"credentials of the {who}: {place}/credentials/{file}"
 
-    _run_live(session, request.asked, request.output, create)
+    _run_live(session, request, create)
 
 
-def _run_live(
-    session: Session, asked: OutputOptions, output: StandardOutput, create: Callable[[], str] = lambda: ""
-) -> None:
+def _run_live(session: Session, request: Request, create: Callable[[], str] = lambda: "") -> None:
     """A live run to its summary; exits with the verdict's status.
 
     `create` makes the run's folder, if it is not there yet, once the emulator's endpoint is open; it returns a line
@@ -212,41 +213,41 @@ def _run_live(
     """
     assert session.live is not None
     record, folder = session.live.record, session.folder
-    with _progress(session.emulation, asked) as progress:
+    with _progress(session.emulation, request) as progress:
 
         def on_open() -> None:
             if line := create():
                 progress.state(line)
-            output.keep_in(folder.logs)
+            request.output.keep_in(folder.logs)
 
         if record is not None and record.serve is not None:
             progress.state(record.serve.announcement())
         with signals_ignored():  # a second Ctrl-C must not lose the records
-            with calls_recorded(folder.path, asked.check_determinism is not None):
+            with calls_recorded(folder.path, request.check_determinism is not None):
                 session.run(on_state=progress.state, on_missing=progress.awaits, on_open=on_open)
-            _finish(session, progress, asked, output)
+            _finish(session, progress, request)
 
 
-def _finish(session: Session, progress: Progress, asked: OutputOptions, output: StandardOutput) -> None:
+def _finish(session: Session, progress: Progress, request: Request) -> None:
     """Judge a run and print its summary; exits with the verdict's status. A second Ctrl-C ends that, too."""
-    say = partial(_say, asked, "the run is being judged and written; Ctrl-C again ends without")
+    asked, how = request.asked, request.check_determinism
+    say = partial(_say, request, "the run is being judged and written; Ctrl-C again ends without")
     with first_interrupt_told(say):
         progress.judging()
         judgement, verdict = session.close()
         progress.close()
         for line in session.folder.unkept:
             tell(line, asked.log_format)
-        if asked.check_determinism is not None and not session.interrupted:
+        if how is not None and not session.interrupted:
             again = ["--quiet"] if asked.only_the_result else []
-            how = asked.check_determinism
             verdict = run_again(session.emulation, judgement, verdict, session.command, how, again)
         status = 130 if session.interrupted else judgement.exit_status
         folder = session.folder.path
         progress.ended(verdict, str(folder), status)
         if asked.log_format is LogFormat.JSON:
-            output.print(json.dumps(verdict))
+            request.output.print(json.dumps(verdict))
         elif asked.quiet:
-            output.print(f"verdict: {judgement.verdict}  {folder}")
+            request.output.print(f"verdict: {judgement.verdict}  {folder}")
         else:
             print_summary(judgement, verdict, session.folder, SafeConsole(), asked.report, asked.verbose)
         if asked.report:
@@ -254,7 +255,7 @@ def _finish(session: Session, progress: Progress, asked: OutputOptions, output: 
     raise typer.Exit(status)
 
 
-def _say(asked: OutputOptions, line: str) -> None:
+def _say(request: Request, line: str) -> None:
     """Print a line on stderr for who has pressed Ctrl-C, with `--quiet` too: nothing else shows that it came."""
-    if asked.log_format is not LogFormat.JSON:
+    if request.asked.log_format is not LogFormat.JSON:
         say_first(f"vnet: {line}")

@@ -69,24 +69,6 @@ class Pacing(StrEnum):
     REALTIME = "realtime"
 
 
-@dataclass(frozen=True)
-class OutputOptions:
-    """Output that was asked for beside the run itself."""
-
-    log_format: LogFormat
-    quiet: bool
-    check_determinism: str | None = None
-    """Compared ways of making the run: "layouts" or "portable"; None if it is made once."""
-    report: bool = True
-    verbose: bool = False
-    debug: DebugTarget | None = None
-
-    @property
-    def only_the_result(self) -> bool:
-        """True if standard output is for the result alone, and not for what programs print."""
-        return self.quiet or self.log_format is LogFormat.JSON
-
-
 ScenarioArgument = Annotated[
     Path,
     typer.Argument(
@@ -237,11 +219,10 @@ class RunOptions:
     verbose: VerboseOption = False
     report: ReportOption = True
 
-    def output(self, check_determinism: Compared | None = None) -> OutputOptions:
-        """Return the output that is asked for."""
-        return OutputOptions(
-            self.log_format, self.quiet, check_determinism, report=self.report, verbose=self.verbose
-        )
+    @property
+    def only_the_result(self) -> bool:
+        """True if standard output is for the result alone, and not for what programs print."""
+        return self.quiet or self.log_format is LogFormat.JSON
 
     def load(self, pacing: Pacing | None) -> Scenario:
         """Load the scenario as these options change it. Raises VnetError."""

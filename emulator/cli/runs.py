@@ -5,7 +5,6 @@ What runs it is imported once it has been read, and the user told so: that takes
 
 from __future__ import annotations
 
-from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +20,6 @@ from emulator.cli.options import (
     HostsOption,
     LiveOptions,
     OutOption,
-    OutputOptions,
     Pacing,
     ProcessesOption,
     RunOptions,
@@ -64,8 +62,7 @@ def run(
     debug: DebugOption = None,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
-    output = asked.output(check_determinism)
-    with one_line_errors(asked.log_format), result_only(output.only_the_result) as stdout:
+    with one_line_errors(asked.log_format), result_only(asked.only_the_result) as stdout:
         loaded = asked.load(asked.pacing)
         if check_determinism is not None and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
@@ -76,12 +73,12 @@ def run(
             raise VnetError("--debug and --hosts exclude each other")
         if agent is not None and (debug is not None or hosts is not None or check_determinism is not None):
             raise VnetError("--agent excludes --debug, --hosts and --check-determinism")
-        output = replace(output, debug=debug_target(debug, loaded, output.only_the_result))
-        _announce(loaded, output)
+        target = debug_target(debug, loaded, asked.only_the_result)
+        _announce(loaded, asked)
         with ended_at_once():
             from emulator.cli.execution import Request, run_with_processes
 
-        request = Request(loaded, asked.scenario, asked.out, sinks, output, stdout)
+        request = Request(loaded, asked, sinks, stdout, check_determinism, target)
         own_hosts = [str(1 + number) for number in range(hosts or 0)]
         run_with_processes(request, router is RouterKind.SEPARATE, own_hosts, agent)
 
@@ -94,25 +91,23 @@ def simulate(
     debug: DebugOption = None,
 ) -> None:
     """Run a scenario without Zenoh, in lockstep, in one process or in a few: the same trace, faster."""
-    output = asked.output(check_determinism)
-    with one_line_errors(asked.log_format), result_only(output.only_the_result) as stdout:
+    with one_line_errors(asked.log_format), result_only(asked.only_the_result) as stdout:
         loaded = asked.load(Pacing.LOCKSTEP)
         sinks = choose_sinks(asked.rerun or (), vehicle=asked.rerun_vehicle, live=False)
         if debug is not None and processes != "1":
             raise VnetError("--debug and --processes exclude each other")
-        output = replace(output, debug=debug_target(debug, loaded, output.only_the_result))
-        _announce(loaded, output)
+        target = debug_target(debug, loaded, asked.only_the_result)
+        _announce(loaded, asked)
         child, apart = OwnChild(), None
-        if processes == "1" and output.debug is None and may_fork():
+        if processes == "1" and target is None and may_fork():
             apart = child.fork(loaded.run.stall_timeout_s)
-        if apart is not None and not output.only_the_result:
+        if apart is not None and not asked.only_the_result:
             say_first(f"{apart or 'a program'} {child.ending} the process of all: again, with a process a vehicle")
         with ended_at_once():
             from emulator.cli.execution import Request, run_simulated
 
-        run_simulated(
-            Request(loaded, asked.scenario, asked.out, sinks, output, stdout), processes, child.told, apart
-        )
+        request = Request(loaded, asked, sinks, stdout, check_determinism, target)
+        run_simulated(request, processes, child.told, apart)
 
 
 @spread
@@ -137,23 +132,22 @@ def emulator(
     hosts: HostsOption = None,
 ) -> None:
     """Run a scenario for hosts, or for agents that are started by hand, here or on other machines."""
-    output = asked.output()
-    with one_line_errors(asked.log_format), result_only(output.only_the_result) as stdout:
+    with one_line_errors(asked.log_format), result_only(asked.only_the_result) as stdout:
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
         loaded = asked.load(asked.pacing)
         if not loaded.has_gateways:
             refuse_router_restart(loaded.fault)
         sinks = choose_sinks(asked.rerun or (), asked.rerun_bind, asked.rerun_port, asked.rerun_vehicle)
-        _announce(loaded, output)
+        _announce(loaded, asked)
         with ended_at_once():
             from emulator.cli.execution import Request, run_for_agents
 
-        request = Request(loaded, asked.scenario, asked.out, sinks, output, stdout)
+        request = Request(loaded, asked, sinks, stdout)
         run_for_agents(request, listen, connect, access, host_names(hosts))
 
 
-def _announce(scenario: Scenario, asked: OutputOptions) -> None:
+def _announce(scenario: Scenario, asked: RunOptions) -> None:
     """Say what is going to run, before anything that takes time. Raises ScenarioError where an extra is missing."""
     scenario.require_extras()
     run = scenario.run

@@ -34,11 +34,6 @@ def test_a_tape_is_that_of_the_present_folder(tmp_path: Path) -> None:
     assert RunOptions(scenario=BEACON, tape=tape).load(None).run.tape == tape
 
 
-def test_what_is_shown_is_what_was_asked_for() -> None:
-    shown = RunOptions(scenario=BEACON, quiet=True, verbose=True, report=False).output()
-    assert (shown.quiet, shown.verbose, shown.report) == (True, True, False)
-
-
 def test_seed_of_an_order_is_refused_where_the_order_is_fifo(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="--order-seed 3: the order is FIFO"):
         load(Path("beacon"), None, order_seed=3)
