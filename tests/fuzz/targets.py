@@ -61,7 +61,6 @@ from tests.fuzz.seeds import (
     SUMO,
     SUMO_POLYGONS,
     TOML_WORDS,
-    TRAFFIC,
     TRIPS,
     TX,
     UNIT_SENT,
@@ -128,10 +127,6 @@ def _read_rx(data: bytes) -> None:
         for fix in message.fixes:
             fix.fix()
     _comes_back(message, wire.decode_rx)
-
-
-def _read_report(data: bytes) -> None:
-    _comes_back(wire.decode_report(data), wire.decode_report)
 
 
 def _comes_back(message: Any, decode: Callable[[bytes], Any]) -> None:
@@ -311,7 +306,6 @@ TARGETS = (  # the slowest first
     Target(
         "observation", _read_observation, WireError, (wire.encode_observation({"a": [1, b"x"]}),), MSGPACK_WORDS
     ),
-    Target("report", _read_report, WireError, (wire.encode(TRAFFIC.reports[0]),), MSGPACK_WORDS),
     Target("tx", _read_tx, WireError, tuple(map(wire.encode, TX)), MSGPACK_WORDS),
     Target("host tx", _read_host_tx, WireError, tuple(map(messages.encode, HOST_TX)), MSGPACK_WORDS),
     Target("unit tx", _read_unit_tx, WireError, (wire.encode(UNIT_SENT),), MSGPACK_WORDS),

@@ -213,7 +213,7 @@ def _start_new_noted(function: Callable[..., object], *arguments: Any) -> int:
         try:
             function(*args, **options)
         except Exception as error:
-            if not _taken(owner, error, "in a thread"):
+            if not taken(owner, error, "in a thread"):
                 raise
 
     return _start_new_thread(run, *arguments)
@@ -290,7 +290,7 @@ def _on_behalf_of(owner: Node, job: Callable[..., Any], /, *args: Any, **options
 def _job_done(owner: Node, job: Future[Any]) -> None:
     error = None if job.cancelled() else Future.exception(job)
     if isinstance(job, ExecutorJob) and error is not None:
-        _taken(owner, error, "in an executor job", job)
+        taken(owner, error, "in an executor job", job)
 
 
 def present_node() -> Node | None:
@@ -307,22 +307,18 @@ def awaited_node() -> Node | None:
 def _unraisable(ignored: sys.UnraisableHookArgs) -> None:
     error = ignored.exc_value or ignored.exc_type()
     name = getattr(ignored.object, "__name__", "")
-    if collector.runs or not _taken(present_node(), error, f"in {name}" if name else "where Python ignores it"):
+    if collector.runs or not taken(present_node(), error, f"in {name}" if name else "where Python ignores it"):
         _before[0](ignored)
 
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:
     owner = None if failed.thread is None else _started_by.get(failed.thread)
-    if not _taken(owner, failed.exc_value or failed.exc_type(), "in a thread"):
+    if not taken(owner, failed.exc_value or failed.exc_type(), "in a thread"):
         _before[1](failed)
 
 
-def tell_failed_thread(owner: Node | None, error: BaseException, place: str) -> None:
-    """Tell of an exception of `owner` that has ended one of its threads, which is none of the interpreter's."""
-    _taken(owner, error, place)
-
-
-def _taken(owner: Node | None, error: BaseException, place: str, job: ExecutorJob | None = None) -> bool:
+def taken(owner: Node | None, error: BaseException, place: str, job: ExecutorJob | None = None) -> bool:
+    """Hand an exception of `owner` to who watches that; return whether anybody has taken it."""
     reference = None if owner is None else _takers.get(owner)
     taker = None if reference is None else reference()
     if owner is None or taker is None or isinstance(error, KeyboardInterrupt | SystemExit):

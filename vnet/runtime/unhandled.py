@@ -149,7 +149,8 @@ class UnhandledExceptions:
     def close(self) -> None:
         """Watch nothing any more."""
         if self._loop is not None:
-            self._loop.on_failed, self._loop.on_unhandled, self._loop.owner_of = _ignore, _only_log, _nobody
+            self._loop.on_failed, self._loop.on_unhandled = lambda future: None, lambda context: True
+            self._loop.owner_of = lambda context: None
             self._loop = None
             outside_loop.detach()
 
@@ -257,16 +258,3 @@ def line_of_task(task: asyncio.Task[Any]) -> str:
 
 def _nothing() -> None:
     """Stand in for the reference to a future that nobody asks for."""
-
-
-def _ignore(future: asyncio.Future[Any]) -> None:
-    """Take no note."""
-
-
-def _nobody(context: dict[str, Any]) -> None:
-    """Stand in for the owner, whose programs are over."""
-
-
-def _only_log(context: dict[str, Any]) -> bool:
-    """Have asyncio log it, and no more."""
-    return True

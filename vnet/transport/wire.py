@@ -510,7 +510,6 @@ _M = TypeVar("_M")
 _encoder = msgspec.msgpack.Encoder()
 _agent_decoder: msgspec.msgpack.Decoder[AgentMessage] = msgspec.msgpack.Decoder(AgentMessage)
 _emulator_decoder: msgspec.msgpack.Decoder[EmulatorMessage] = msgspec.msgpack.Decoder(EmulatorMessage)
-_report_decoder: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Report)
 
 
 def encode(message: AgentMessage | EmulatorMessage | Report | Sent | Arrived) -> bytes:
@@ -527,12 +526,6 @@ def decode_tx(data: bytes) -> AgentMessage:
 def decode_rx(data: bytes) -> EmulatorMessage:
     """Decode a message of the emulator. Raise WireError for a bad one."""
     return decode(_emulator_decoder, data)
-
-
-def decode_report(data: bytes) -> Report:
-    """Decode a copy of a report. Raise WireError for a bad one, or one above `LARGEST_MESSAGE_BYTES`."""
-    check_size(data)
-    return decode(_report_decoder, data)
 
 
 def encode_observation(message: dict[str, Any]) -> bytes:

@@ -147,7 +147,7 @@ def test_what_the_emulator_says_comes_back(message: wire.EmulatorMessage) -> Non
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=200))
 def test_arbitrary_bytes_never_do_harm(data: bytes) -> None:
-    for decode in (wire.decode_tx, wire.decode_rx, wire.decode_report, wire.decode_observation):
+    for decode in (wire.decode_tx, wire.decode_rx, wire.decode_sent, wire.decode_observation):
         try:
             decode(data)
         except WireError:
@@ -182,7 +182,7 @@ def test_a_histogram_of_another_length_is_refused(bins: int) -> None:
         wire.decode_tx(wire.encode(frames))
 
 
-@pytest.mark.parametrize("decode", [wire.decode_tx, wire.decode_report])
+@pytest.mark.parametrize("decode", [wire.decode_tx, wire.decode_sent])
 def test_what_is_too_large_is_not_even_decoded(decode: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wire, "LARGEST_MESSAGE_BYTES", 10)
     with pytest.raises(WireError, match="message of 11 bytes: at most 10 allowed"):

@@ -27,7 +27,7 @@ from greenlet import GreenletExit, getcurrent, greenlet
 
 from vnet.gateway.emulated.shown import facade
 from vnet.runtime.asyncio_internals import note_greenlet
-from vnet.runtime.outside_loop import tell_failed_thread
+from vnet.runtime.outside_loop import taken
 from vnet.runtime.own_asyncio import Task, present_node
 
 T = TypeVar("T")
@@ -562,4 +562,4 @@ def _thread_failed(failed: threading.ExceptHookArgs) -> None:
 
 def fail(error: BaseException, place: str = "in a thread") -> None:
     """Have the run tell of an exception that has ended a thread or a callback; the vehicle's log has its lines."""
-    tell_failed_thread(present_node(), error, place)
+    taken(present_node(), error, place)
