@@ -129,10 +129,6 @@ class FrameError(ValueError):
     """A payload that is no frame of this program; the message is the reason by which it is counted."""
 
 
-def _nothing_relayed() -> NDArray[np.void]:
-    return np.empty(0, dtype=RELAYED)
-
-
 @dataclass(frozen=True)
 class CooperativeFrame:
     """The contents of a frame; names are `short_name`s.
@@ -152,7 +148,7 @@ class CooperativeFrame:
     running_sum: tuple[float, float, float]
     heard: dict[str, bool]
     cloud_m: Array
-    relayed: NDArray[np.void] = field(default_factory=_nothing_relayed)
+    relayed: NDArray[np.void] = field(default_factory=lambda: np.empty(0, dtype=RELAYED))
     largest_degree: int = 0
     name: str = "00000000"
 

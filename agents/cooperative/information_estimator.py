@@ -43,10 +43,9 @@ from agents.cooperative.cmm.plausibility import (
 )
 from agents.cooperative.cmm.rbpf import Observation
 from agents.cooperative.estimator import FusionRule, mean_consensus, usable
-from agents.cooperative.frame import MAX_DEGREE, NAME_BYTES, Admission, VehicleCache, short_name
+from agents.cooperative.frame import MAX_DEGREE, MAX_HEARD, NAME_BYTES, Admission, VehicleCache, short_name
 from agents.cooperative.information_frame import (
     INCREMENT_LIMIT,
-    MAX_HEARD,
     PASSED,
     HeardFrames,
     InformationFrame,

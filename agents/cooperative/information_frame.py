@@ -35,8 +35,6 @@ INCREMENT_LIMIT = 6e4
 """Largest number of an increment: those who pass it on have half precision, which ends at 65 504."""
 PASSED_LIMIT = 255
 """Number of increments in a frame: it is one byte."""
-MAX_HEARD = 255
-"""Number of names in a frame: it is one byte."""
 
 # version, heard, passed on, largest degree, name, fix time, prior (Λ, η), increment (δΛ, δη), epoch, running sums
 _HEADER = struct.Struct("<BBBBIq5f5fI3d")
@@ -46,10 +44,6 @@ PASSED = np.dtype([("name", "<u4"), ("information", "<f2", (5,))])
 """An increment that is passed on: its origin, and its five numbers with half precision."""
 _RECORD = struct.Struct("<I5e")
 _AS_BYTES = struct.Struct(f"{_RECORD.size}s")
-
-
-def _nothing_passed() -> NDArray[np.void]:
-    return np.empty(0, dtype=PASSED)
 
 
 @dataclass(frozen=True)
@@ -70,7 +64,7 @@ class InformationFrame:
     epoch: int
     running_sum: tuple[float, float, float]
     heard: Mapping[str, bool]
-    passed: NDArray[np.void] = field(default_factory=_nothing_passed)
+    passed: NDArray[np.void] = field(default_factory=lambda: np.empty(0, dtype=PASSED))
     largest_degree: int = 0
 
     # In a process of many vehicles a frame is decoded once and read by each receiver, so these are computed once.

@@ -108,19 +108,15 @@ def plain_moments(a: float, b: float, d: float, x: float, y: float) -> Five:
 def inverse(matrix: Array) -> Array:
     """Return the inverse of a symmetric matrix (2, 2), in closed form: numpy's takes longer than all else here."""
     (a, b), (_, d) = matrix.tolist()
-    determinant = a * d - b * b
-    return np.array([[d / determinant, -b / determinant], [-b / determinant, a / determinant]])
+    a, b, d = inverted(a, b, d)
+    return np.array([[a, b], [b, d]])
 
 
 def square_root(matrix: Array) -> Array:
-    """Return the symmetric square root of a positive definite matrix M (2, 2).
-
-    In closed form (M + √det M · I) / √(tr M + 2 √det M).
-    """
+    """Return the symmetric square root of a positive definite matrix (2, 2)."""
     (a, b), (_, d) = matrix.tolist()
-    root = math.sqrt(max(a * d - b * b, 0.0))
-    scale = math.sqrt(a + d + 2 * root)
-    return np.array([[(a + root) / scale, b / scale], [b / scale, (d + root) / scale]])
+    a, b, d = rooted(a, b, d)
+    return np.array([[a, b], [b, d]])
 
 
 def transport(covariance_m2: Array, new_covariance_m2: Array) -> Array:

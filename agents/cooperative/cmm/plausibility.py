@@ -102,32 +102,6 @@ def rooted_triangle(xx: float, xy: float, yy: float) -> Three:
     return root_xx, root_yx, math.sqrt(max(yy - root_yx * root_yx, 0.0))
 
 
-def deviation(information: Five, belief: Belief) -> float:
-    """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for what is said about c ~ N(x, P)."""
-    (mean_x, mean_y), covariance_m2 = belief
-    c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
-    a, b, d, x, y = information
-    x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
-    return _squared(a * c_xx + b * c_yx, b * c_yy, b * c_xx + d * c_yx, d * c_yy, x, y, a, b, d)
-
-
-def _squared(
-    m_xx: float, m_xy: float, m_yx: float, m_yy: float, x: float, y: float, a: float, b: float, d: float
-) -> float:
-    """Return rᵀ S⁻¹ r with S = Λ + (Λ C)(Λ C)ᵀ.
-
-    A lane says nothing along itself: a ten thousandth of the trace is added to S, so that rounding there is not
-    counted.
-    """
-    a += m_xx * m_xx + m_xy * m_xy
-    b += m_xx * m_yx + m_xy * m_yy
-    d += m_yx * m_yx + m_yy * m_yy
-    more = 1e-4 * (a + d) + 1e-9
-    a += more
-    d += more
-    return (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
-
-
 def prior_shares(priors: Sequence[Five], own: Five) -> list[float]:
     """Return the share (n,) of its weight that each prior has: 1 within `PRIOR_GATE`, beyond it gate : rᵀ S⁻¹ r.
 
@@ -239,7 +213,9 @@ class Origins:
             n_x, n_y, count = x + keep * n_x, y + keep * n_y, 1.0 + keep * count
             n_a, n_b, n_d = a + keep_2 * n_a, b + keep_2 * n_b, d + keep_2 * n_d
             sums[code] = now_s, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count
-            # `_squared` of the sum and of the increment, written out: it would be called most of all functions.
+            # rᵀ S⁻¹ r with S = Λ + (Λ C)(Λ C)ᵀ, of the sum and of the increment, written out: a function would be
+            # called most of all. A lane says nothing along itself: a ten thousandth of the trace is added to S, so
+            # that rounding there is not counted.
             n_a += n_xx * n_xx + n_xy * n_xy
             n_b += n_xx * n_yx + n_xy * n_yy
             n_d += n_yx * n_yx + n_yy * n_yy

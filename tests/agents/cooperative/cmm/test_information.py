@@ -19,10 +19,14 @@ from agents.cooperative.cmm.information import (
     transport,
 )
 from agents.cooperative.cmm.plausibility import (
+    FAR,
+    INCREMENT_GATE,
+    MANY,
     PRIOR_GATE,
+    SUM_GATE,
+    Belief,
     Origins,
     cut_to,
-    deviation,
     median_belief,
     moved,
     prior_shares,
@@ -75,8 +79,8 @@ def test_a_deviation_is_that_of_matrices(
     total = matrix + matrix @ covariance_m2 @ matrix
     total += (1e-4 * np.trace(total) + 1e-9) * np.eye(2)
     off = vector - matrix @ np.array(mean)
-    value = deviation(information, (mean, _entries(covariance_m2)))
-    assert value == pytest.approx(off @ np.linalg.solve(total, off), rel=1e-5, abs=1e-9)
+    share = _share_of_first(information, (mean, _entries(covariance_m2)))
+    assert share == pytest.approx(_share_at(off @ np.linalg.solve(total, off)), rel=1e-5)
 
 
 @pytest.mark.slow
@@ -125,20 +129,36 @@ def test_what_says_too_much_is_scaled_and_keeps_its_mean() -> None:
     assert_allclose(plain_moments(*scaled[0])[:2], [4.0, 2.0])
 
 
+def _share_of_first(increment: Five, belief: Belief) -> float:
+    """Return the share of an origin's first increment that is used."""
+    return Origins().shares([1], [increment], belief, 0.0)[0]
+
+
+def _share_at(deviation: float) -> float:
+    """Return the same for its squared deviation, which is also that of the sum of one."""
+    gate = INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) / MANY
+    if deviation < gate:
+        return 1.0
+    return min(1.0, INCREMENT_GATE / deviation, (gate / deviation) ** 0.5, FAR * gate / deviation)
+
+
 def test_deviation_is_the_mahalanobis_distance_of_a_fix() -> None:
     """An increment of a vehicle that knows where it is: a measurement of c with noise R."""
     mean_m, covariance_m2, noise_m2 = np.array([1.0, 2.0]), np.diag([0.5, 0.2]), 4.0
-    increment = _information((3.0, 1.0), noise_m2)
-    off = np.array([2.0, -1.0])
-    expected = off @ np.linalg.solve(covariance_m2 + noise_m2 * np.eye(2), off)
-    assert deviation(increment, (mean_m.tolist(), _entries(covariance_m2))) == pytest.approx(expected, rel=1e-3)
+    increment = _information((23.0, -9.0), noise_m2)
+    off = np.array([22.0, -11.0])
+    expected = _share_at(float(off @ np.linalg.solve(covariance_m2 + noise_m2 * np.eye(2), off)))
+    assert expected < 0.5
+    assert _share_of_first(increment, (mean_m.tolist(), _entries(covariance_m2))) == pytest.approx(
+        expected, rel=1e-3
+    )
 
 
 def test_a_lane_that_says_nothing_along_itself_may_not_move_c_along_it() -> None:
     belief = (0.0, 0.0), (0.1, 0.0, 0.1)
-    assert deviation((0.5, 0.0, 0.0, 0.2, 0.0), belief) < 1
-    assert deviation((0.5, 0.0, 0.0, 0.2, 0.5), belief) > 1000
-    assert deviation((0.0, 0.0, 0.0, 0.0, 0.0), belief) == 0
+    assert _share_of_first((0.5, 0.0, 0.0, 0.2, 0.0), belief) == 1
+    assert _share_of_first((0.5, 0.0, 0.0, 0.2, 0.5), belief) < _share_at(1000)
+    assert _share_of_first((0.0, 0.0, 0.0, 0.0, 0.0), belief) == 1
 
 
 def test_a_small_lie_is_found_in_the_sum_counts_for_less_and_is_forgiven_later() -> None:
