@@ -17,11 +17,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from pydantic import ValidationError
 
-from emulator.cells.cells import Cell, has_result, has_states, read_series, read_states
+from emulator.cells.cells import Cell, has_states, read_states
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
-from studies.figures import against_time, save, styled
+from studies.figures import ERROR_COLUMNS, against_time, save, series_of, styled
 from studies.measure import study_cell
 from studies.paper import PAPER_RANGE_M, SETTLED_S, everybody
 from studies.reports import MISSING, Result, column, in_seeds, markdown_table, mean_and_error, select, unique
@@ -190,15 +190,8 @@ def draw_errors_by_place(states: pa.Table, lanes: Array, title: str) -> Figure:
 
 def draw_against_time(cells: Sequence[Cell], folder: Path) -> Path:
     """Errors of each mechanism against time; returns the PNG."""
-    series: dict[str, list[pa.Table]] = {}
-    for cell in cells:
-        if has_result(cell, folder):
-            series.setdefault(str(cell.labels["mechanism"]), []).append(read_series(cell, folder))
-    columns = {
-        "common_error_rmse_m": "RMSE of the\ncommon error (m)",
-        "position_rmse_m": "RMSE of the\nposition (m)",
-    }
-    return against_time(series, folder / "city_against_time", "Driving through a city", columns=columns)
+    series = series_of(cells, folder)
+    return against_time(series, folder / "city_against_time", "Driving through a city", columns=ERROR_COLUMNS)
 
 
 def draw_errors(cells: Sequence[Cell], folder: Path) -> Path | None:

@@ -10,12 +10,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
-import pyarrow as pa
 import typer
 from rich.console import Console
 from rich.markdown import Markdown
 
-from emulator.cells.cells import Cell, read_series, run_cells, write_results
+from emulator.cells.cells import Cell, run_cells, write_results
 from emulator.cli.application import group
 from emulator.cli.options import pair
 from emulator.scenario.sections import DAY_S
@@ -374,16 +373,8 @@ def _draw_against_time(cells: Sequence[Cell], cells_from: Path, folder: Path) ->
     for network in ("n2", "n3"):
         title = f"{network.upper()}, the paper's profile, lanes bounded on one side"
         references = {f"the paper's {m}": rmse[network] for m, rmse in PAPER_RMSE_M.items()}
-        series = _series(cells, cells_from, network)
+        series = figures.series_of(cells, cells_from, network=network, sides=1)
         print(figures.against_time(series, folder / f"{network}_against_time", title, references))
-
-
-def _series(cells: Sequence[Cell], folder: Path, network: str) -> dict[str, list[pa.Table]]:
-    series: dict[str, list[pa.Table]] = {}
-    for cell in cells:
-        if cell.labels["network"] == network and cell.labels.get("sides", 1) == 1:
-            series.setdefault(str(cell.labels["mechanism"]), []).append(read_series(cell, folder))
-    return series
 
 
 def _show(markdown: str, path: Path) -> None:

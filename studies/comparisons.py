@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from emulator.cells.cells import Cell, has_result, read_series
+from emulator.cells.cells import Cell
 from emulator.scenario.loading import scenario_of
 from emulator.scenario.scenario import Scenario
-from studies.figures import against_time
+from studies.figures import ERROR_COLUMNS, against_time, series_of
 from studies.measure import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS, study_cell
 from studies.paper import BOUND, BOUND_POSITION, PAPER_RANGE_M, Labels, counted_from
 from studies.reports import (
@@ -39,11 +39,6 @@ REFERENCE_OPTIONS: dict[str, Any] = {"exchange": "information", "particles": 100
 """Options of the first variant of each study."""
 EQUAL_RIDGE_M2 = 1e6
 """Ridge of the quadratic program beside which nothing else counts: all weights are equal."""
-COLUMNS = {
-    "common_error_rmse_m": "RMSE of the\ncommon error (m)",
-    "position_rmse_m": "RMSE of the\nposition (m)",
-}
-"""Columns of the metrics that are drawn, and their titles."""
 COMMON_APART_S = 300.0
 """Time in the file of a recorded common error from the beginning of one seed's run to that of the next one's."""
 CHURN_S = 900.0
@@ -211,14 +206,10 @@ def _churn(duration_s: float) -> Iterator[dict[str, Any]]:
 def draw(cells: Sequence[Cell], folder: Path) -> Iterator[Path]:
     """Draw the errors of each variant against time, and the bound's where all have the same; yield the PNGs."""
     for network in dict.fromkeys(cell.labels["network"] for cell in cells):
-        series: dict[str, list[pa.Table]] = {}
-        for cell in cells:
-            if cell.labels["network"] == network and has_result(cell, folder):
-                series.setdefault(str(cell.labels["mechanism"]), []).append(read_series(cell, folder))
-        if series:
+        if series := series_of(cells, folder, network=network):
             title = f"{str(network).upper()}: errors against time"
             path = folder / f"{network}_against_time"
-            yield against_time(_with_bound(series), path, title, columns=COLUMNS)
+            yield against_time(_with_bound(series), path, title, columns=ERROR_COLUMNS)
 
 
 def _with_bound(series: Mapping[str, list[pa.Table]]) -> dict[str, list[pa.Table]]:
@@ -226,7 +217,7 @@ def _with_bound(series: Mapping[str, list[pa.Table]]) -> dict[str, list[pa.Table
     first, *others = series.values()
     if BOUND not in first[0].column_names or any(_bounds(each) != _bounds(first[: len(each)]) for each in others):
         return dict(series)
-    names = ["time_ns", *COLUMNS]
+    names = ["time_ns", *ERROR_COLUMNS]
     bound = [table.select(["time_ns", BOUND, BOUND_POSITION]).rename_columns(names) for table in first]
     return {**series, "bound": bound}
 

@@ -197,11 +197,8 @@ def silent_vehicles(node_ids: Sequence[str], linked: Links, seed: int) -> dict[s
 
 def _relative_error(cell: Cell, folder: Path) -> Array:
     table = read_series(cell, folder)
-    error, spread = (
-        np.array([np.nan if value is None else value for value in table[name].to_pylist()], dtype=float)
-        for name in ("consensus_error_m", "deviation_m")
-    )
-    return np.asarray(error / spread)
+    error, spread = (table[name].to_numpy() for name in ("consensus_error_m", "deviation_m"))
+    return np.asarray(error / spread, dtype=float)
 
 
 def _at(error: Array, after: int) -> float | None:

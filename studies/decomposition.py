@@ -254,9 +254,8 @@ class Exchange:
         for age, (increments, used) in enumerate(zip(self._increments, self._used, strict=True), 1):
             if age >= self._rules.hops:
                 break
-            listed = used.copy()
-            new = ((heard @ listed) > 0) & (used == 0)
-            shares = np.where(new, self._rules.passed_share * (1 - weights @ listed), 0.0)
+            new = ((heard @ used) > 0) & (used == 0)
+            shares = np.where(new, self._rules.passed_share * (1 - weights @ used), 0.0)
             if self._rules.is_cut:
                 traces = _trace(increments)[:, None]
                 shares = shares * np.minimum(1.0, limit[:, :, None] / np.maximum(shares * traces, 1e-12))

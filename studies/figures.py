@@ -18,6 +18,7 @@ import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from emulator.cells.cells import Cell, has_result, read_series
 from emulator.pages.palette import PALETTE
 from studies.reports import mean_and_standard_error
 from vnet.types import Array
@@ -49,6 +50,12 @@ TIME_COLUMNS = {
     "common_error_rmse_m": "RMSE of the\ncommon error (m)",
     "deviation_m": "deviation across\nthe network (m)",
 }
+"""Columns of the metrics that are drawn by default, and their titles."""
+ERROR_COLUMNS = {
+    "common_error_rmse_m": "RMSE of the\ncommon error (m)",
+    "position_rmse_m": "RMSE of the\nposition (m)",
+}
+"""Those of studies in which positions count as well."""
 NO_REFERENCES: Mapping[str, float] = {}
 
 
@@ -132,6 +139,15 @@ def looks_of(names: Sequence[str]) -> dict[str, Look]:
     return looks
 
 
+def series_of(cells: Sequence[Cell], folder: Path, **labels: object) -> dict[str, list[pa.Table]]:
+    """The metrics of each seed for each mechanism, of those cells with these labels that have been simulated."""
+    series: dict[str, list[pa.Table]] = {}
+    for cell in cells:
+        if labels.items() <= cell.labels.items() and has_result(cell, folder):
+            series.setdefault(str(cell.labels["mechanism"]), []).append(read_series(cell, folder))
+    return series
+
+
 @styled
 def against_time(
     series: Mapping[str, Sequence[pa.Table]],
@@ -159,8 +175,8 @@ def against_time(
         panels[0].axhline(value, color=(named or [GREY])[-1], linewidth=1, linestyle=(0, (1, 2)), zorder=1.5)
     for axes in panels:
         axes.set_ylim(0, None)
-    labels = {value: f"{label} {value:.2f} m" for label, value in references.items()}
-    label_levels(panels[0], list(references.values()), [labels[value] for value in references.values()])
+    labels = [f"{label} {value:.2f} m" for label, value in references.items()]
+    label_levels(panels[0], list(references.values()), labels)
     panels[-1].set_xlabel("time (s)")
     figure.suptitle(f"{title}\n{_seeds_note(series)}")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, handlelength=3.5)
