@@ -255,7 +255,7 @@ class _Rows:
         """The last ones, the newest at the foot; if `steady`, all the rows, for those to come."""
         lines = [
             Text.assemble(
-                ("".ljust(self._label) if number else "events".ljust(self._label), DIM),
+                (("" if number else "events").ljust(self._label), DIM),
                 (f"{event.time_ns / 1e9:>6.1f} s  ", DIM),
                 (printable(event.text, 300), BAD if event.is_bad else PLAIN),
             )
@@ -436,26 +436,26 @@ class _Lines(Progress):
         return True
 
     def _period(self, view: PeriodView) -> None:
-        self._tell_events()
+        self._catch_up()
         if view.instant.period and self._is_time():  # the first period includes every program's own start
             self._progress(self._course.snapshot())
 
-    def _tell_events(self) -> None:
-        for event in self._course.news(self._told_events):
-            self._event(event)
+    def _catch_up(self) -> None:
+        news = self._course.news(self._told_events)
         self._told_events = len(self._emulation.folder.events)
+        self._tell_events(news)
 
     def close(self) -> None:
         """Tell what happened last."""
         if not self._closed:
             self._closed = True
-            self._tell_events()
+            self._catch_up()
 
     def _progress(self, shot: Snapshot) -> None:
         """Print the run's progress."""
 
-    def _event(self, event: Event) -> None:
-        """Print an event."""
+    def _tell_events(self, news: Sequence[Event]) -> None:
+        """Print what has happened."""
 
 
 class PlainLines(_Lines):
@@ -492,10 +492,8 @@ class PlainLines(_Lines):
         receptions = f"delivered {delivered:,} of {delivered + lost:,}"
         self._write(f"{shot.emulated_s:6.1f} s  {factor}  {first}{receptions}{down}")
 
-    def _tell_events(self) -> None:
+    def _tell_events(self, news: Sequence[Event]) -> None:
         """A line for each event, and one for each kind of failure, however many vehicles it befalls."""
-        news = self._course.news(self._told_events)
-        self._told_events = len(self._emulation.folder.events)
         for kind in kinds_of(event for event in news if event.has(GROUPED)):
             if (key := key_of(kind.first)) not in self._told_kinds:
                 self._told_kinds.add(key)
@@ -558,6 +556,7 @@ class JsonLines(_Lines):
         fields = {key: value for key, value in asdict(shot).items() if key not in left_out} | shot.figures
         self._say("progress", **fields, vehicles=len(shot.node_ids), faults_acting=acting)
 
-    def _event(self, event: Event) -> None:
-        line = {"time_ns": event.time_ns, "kind": event.kind, "node": event.node, **event.details}
-        self._say("event", event=line)
+    def _tell_events(self, news: Sequence[Event]) -> None:
+        for event in news:
+            line = {"time_ns": event.time_ns, "kind": event.kind, "node": event.node, **event.details}
+            self._say("event", event=line)

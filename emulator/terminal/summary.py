@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.measure import Measurement
 from rich.padding import Padding
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from emulator.checks.judge import Judgement, Verdict
@@ -143,10 +143,7 @@ def _is_told(check: CheckResult) -> bool:
 
 
 def _listed(checks: Sequence[CheckResult]) -> Table:
-    table = Table()
-    table.add_column("check")
-    table.add_column("verdict")
-    table.add_column("what was seen", overflow="fold")
+    table = Table("check", "verdict", Column("what was seen", overflow="fold"))
     for check in checks:
         verdict = Text(check.verdict.value, style=STYLE[check.verdict])
         table.add_row(as_text(check.name), verdict, Text(as_text(check.text)))
@@ -166,10 +163,9 @@ def print_offending(rows: Sequence[Mapping[str, Any]], console: Console) -> None
 
 def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The rows that a failed check holds against the run."""
-    table = Table(box=None, padding=(0, 1, 0, 0))
     columns = dict.fromkeys(key for row in rows for key in row if row[key] not in (None, ""))
-    for column in columns:
-        table.add_column(as_text(column), overflow="fold")
+    heads = (Column(as_text(column), overflow="fold") for column in columns)
+    table = Table(*heads, box=None, padding=(0, 1, 0, 0))
     for row in rows:
         table.add_row(*(Text(cell(row.get(column))) for column in columns))
     return table
@@ -194,28 +190,25 @@ def _print_cost(cost: RunCost, console: Console, verbose: bool) -> None:
     if line := cost.line():
         console.print(Text(f"cost         {line}"), soft_wrap=True)
     if verbose and cost.vehicles:
-        table = Table(*HEADS[:1])
-        for head in HEADS[1:]:
-            table.add_column(head, justify="right")
+        table = Table(HEADS[0], *map(_of_numbers, HEADS[1:]))
         for vehicle in cost.vehicles[:SLOWEST]:
             table.add_row(*map(Text, vehicle.words()))
         _print_table(f"cost by vehicle: CPU time of its {cost.measured}, the slowest first", table, console)
 
 
+def _of_numbers(head: str = "") -> Column:
+    return Column(head, justify="right")
+
+
 def _reported(reported: Mapping[str, Mapping[str, Any]]) -> Table:
-    table = Table()
-    table.add_column("figure")
-    for head in ("mean", "5 – 95 %", "at the end"):
-        table.add_column(head, justify="right")
+    table = Table("figure", *map(_of_numbers, ("mean", "5 – 95 %", "at the end")))
     for name, figure in reported.items():
         table.add_row(*map(Text, ReportedFigure(**figure).words(name)))
     return table
 
 
 def _figures(verdict: dict[str, Any]) -> Table:
-    table = Table(show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
+    table = Table("", _of_numbers(), show_header=False)
     table.add_row("vehicles", str(verdict["vehicles"]))
     if verdict.get("roadside_units"):
         table.add_row("roadside units", str(verdict["roadside_units"]))
@@ -236,10 +229,7 @@ def _figures(verdict: dict[str, Any]) -> Table:
 
 def _frames(counts: dict[str, int]) -> Table:
     in_range = sum(count for outcome, count in counts.items() if outcome != "out_of_range")
-    table = Table(show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
-    table.add_column(justify="right")
+    table = Table("", _of_numbers(), _of_numbers(), show_header=False)
     for outcome, count in counts.items():
         if count and outcome != "out_of_range":
             table.add_row(outcome, f"{count:,}", f"{count / in_range:.2%}")
