@@ -145,7 +145,7 @@ def _position(bits: _Bits) -> tuple[int, int]:
 
 def _long_position(sender: int, time_ns: int, station: Station) -> bytes:
     """Return a long position vector: address (a car's), time, place, speed and heading."""
-    address = struct.pack(">BB", 5 << 2, 0) + b"\x02\x00" + struct.pack(">I", sender + 1)
+    address = struct.pack(">BB", 5 << 2, 0) + _address(sender)
     milliseconds = time_ns // 1_000_000 % 2**32
     place = struct.pack(">Iii", milliseconds, station.latitude, station.longitude)
     return address + place + struct.pack(">HH", 0x8000 | min(station.speed, 0x3FFF), station.heading)
@@ -212,9 +212,8 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
             file.write(_packet_block(packet, headers.of_ack(packet.row), b"", 0, comments.of(packet)))
             continue
         sender, seq, size_bytes = (int(column[packet.row]) for column in columns)
-        kept = recorded.payloads
         payload = None
-        if kept is not None:
+        if (kept := recorded.payloads) is not None:
             payload = kept.of(recorded.node_ids[sender], seq, comments.digests(packet))
         ethertype, routed = ETHERTYPE, None
         if routers is not None and payload is not None:

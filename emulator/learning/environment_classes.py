@@ -7,8 +7,8 @@ they then are; an agent observes what has arrived by the step's end.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from operator import index
 from pathlib import Path
@@ -93,7 +93,8 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         out = None if self._out is None else self._out / str(self._episodes)
         self._episode = Episode(self._scenario.model_copy(update={"run": run}), self._behaviour, out)
         self._scenes = Scenes(self._episode.emulation)
-        turn = self._next_turn(self._episode)
+        with self._ended_by_an_error():
+            turn = self._episode.next_turn()
         self._scenes.moment(turn.time_ns, {})
         self._observed = dict(turn.observed)
         self.agents = [agent for agent in self.possible_agents if agent in turn.observed]
@@ -112,22 +113,22 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         if unknown := sorted(set(actions) - set(self.agents)):
             raise VnetError(f"step: {unknown[0]} is no living agent; there are: {', '.join(self.agents)}")
         self._episode.answer(actions)
-        turn = self._next_turn(self._episode)
-        try:
+        with self._ended_by_an_error():
+            turn = self._episode.next_turn()
             return self._step(self._episode, turn, self._scenes.moment(turn.time_ns, actions))
-        except BaseException:
-            self._give_up()
-            raise
 
     def _step(
         self, episode: Episode, turn: Turn, moment: Moment
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Return what a step returns, that ends with this turn and this moment."""
         self._observed |= turn.observed
-        entered = [agent for agent in turn.observed if agent not in self.agents and self._is_new(agent)]
+        entered = [agent for agent in turn.observed if agent not in {*self.agents, *episode.finished}]
         at_end = [*self.agents, *entered]
         rewards = {agent: float(self._behaviour.reward(agent, moment)) for agent in at_end}
-        ended = {agent: self._is_gone(agent, turn) or self._behaviour.terminated(agent, moment) for agent in at_end}
+        # Without a fix, and not up: the vehicle is gone, or its program has ended.
+        gone = {agent for agent in at_end if agent not in turn.observed and not episode.emulation.up[agent]}
+        gone = set() if turn.over else gone
+        ended = {agent: agent in gone or self._behaviour.terminated(agent, moment) for agent in at_end}
         truncated = {agent: turn.over and not ended[agent] for agent in at_end}
         episode.finished |= {agent for agent in at_end if ended[agent] or turn.over}
         self.agents = [agent for agent in at_end if agent not in episode.finished]
@@ -136,25 +137,15 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
             self.close()
         return observations, rewards, ended, truncated, {agent: {} for agent in at_end}
 
-    def _next_turn(self, episode: Episode) -> Turn:
+    @contextmanager
+    def _ended_by_an_error(self) -> Iterator[None]:
+        """End the episode if there is an error in the block."""
         try:
-            return episode.next_turn()
+            yield
         except BaseException:
-            self._give_up()
+            self.agents = []
+            self.close()
             raise
-
-    def _give_up(self) -> None:
-        """End the episode after an error."""
-        self.agents = []
-        self.close()
-
-    def _is_new(self, agent: str) -> bool:
-        return self._episode is not None and agent not in self._episode.finished
-
-    def _is_gone(self, agent: str, turn: Turn) -> bool:
-        """Return whether an agent's vehicle is gone, or its program has ended."""
-        assert self._episode is not None
-        return not turn.over and agent not in turn.observed and not self._episode.emulation.up[agent]
 
     def close(self) -> None:
         """End the episode, if one is on."""

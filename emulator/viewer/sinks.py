@@ -243,7 +243,6 @@ def open_recording(sinks: Sinks, name: str) -> Iterator[rerun.RecordingStream]:
         recording.send_recording_name(name)
         if sinks.serve is not None:
             _wait_until_served(recording, sinks.serve)
-        if sinks.serve is not None:
             stack.enter_context(_looked_at(sinks.serve, sinks.spawn))
         yield recording
 
