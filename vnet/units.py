@@ -77,6 +77,13 @@ def title_of(name: str) -> str:
     return words + name.removeprefix(stem)
 
 
+def label_of(name: str, title: str = "") -> str:
+    """Return a name's title, or the one given, with its unit: "warning delay (ms)" for `warning_delay_ms`."""
+    unit = unit_of(name)
+    title = title or title_of(name)
+    return f"{title} ({unit})" if unit else title
+
+
 def _stem(name: str) -> str:
     """Return what is before the dot of a reported value's name, and any other name as it is."""
     before = name.partition(".")[0]

@@ -195,15 +195,14 @@ def compare(
 
     Status 0: nothing differs; 1: they part; 2: error.
     """
-    from emulator.report.comparison import Comparison, print_comparison
+    from emulator.pages.page import put_page
+    from emulator.report.comparison import Comparison, comparison_page, print_comparison
 
     with one_line_errors():
         comparison = Comparison.of(first, second)
         print_comparison(comparison, SafeConsole())
         if out is not None:
-            from emulator.report.comparison import write_comparison
-
-            print(write_comparison(comparison, out))
+            print(put_page(out, comparison_page(comparison)))
         raise typer.Exit(0 if comparison.same_trace and not comparison.partings else 1)
 
 

@@ -23,7 +23,7 @@ from emulator.scenario.sections import FAR_M, first_problem, validated
 from emulator.world.world import Instant
 from vnet.errors import ScenarioError, VnetError, printable
 from vnet.types import Array
-from vnet.units import unit_of
+from vnet.units import label_of, unit_of
 
 VECTORS = {"estimate_m": 2, "covariance_m2": 4}
 """Columns of the states of which vnet's own figures are made, and the numbers that each entry has."""
@@ -84,8 +84,7 @@ class KeyFigure:
     @property
     def heading(self) -> str:
         """The title with the unit, as in the heading of a column."""
-        unit = unit_of(self.name)
-        return f"{self.title} ({unit})" if unit else self.title
+        return label_of(self.name, self.title)
 
     def text(self, value: float) -> str:
         """Return a value with its unit, for people."""

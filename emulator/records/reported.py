@@ -21,7 +21,7 @@ from emulator.records.period_figures import ProgramFigures
 from emulator.records.tables import STATES, TRUTH
 from vnet.reports import Value
 from vnet.types import Array
-from vnet.units import title_of, unit_of
+from vnet.units import label_of
 
 MOST_COLUMNS = 64
 """Names that have a column: a table of thousands of columns would help nobody."""
@@ -162,8 +162,7 @@ class ReportedFigure:
 
     def words(self, name: str) -> tuple[str, str, str, str]:
         """Return its title with the unit, mean, 5 to 95 %, and the end of the run, for people."""
-        unit = unit_of(name)
-        title = f"{title_of(name)} ({unit})" if unit else title_of(name)
+        title = label_of(name)
         if self.text is not None:
             return title, f"{self.text} ({self.share or 0:.0%})", "", ""
         if self.is_share:

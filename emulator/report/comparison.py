@@ -15,7 +15,7 @@ from rich.text import Text
 
 from emulator.checks.replay import compare_runs
 from emulator.pages.canvas import BLUE, RED, Canvas, FaultSpan, canvas, legend
-from emulator.pages.page import SIGNS, put_page, render, table
+from emulator.pages.page import SIGNS, render, table
 from emulator.pages.text import cell
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -23,12 +23,12 @@ from emulator.records.reported import ReportedFigure, figure_text
 from emulator.records.run_folder import check_is_run
 from emulator.records.verdicts import CheckResult, Record, Verdict
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
-from emulator.report.program_figures import MOST_CHARTS, is_number, label_of, mean_over_time
+from emulator.report.program_figures import MOST_CHARTS, is_number, mean_over_time
 from emulator.report.radio_figures import bin_width_ns, broadcasts, decided, latencies_ms
 from emulator.report.source import NothingToShow, Source
 from emulator.scenario.loading import parse_toml
 from vnet.errors import VnetError, printable
-from vnet.units import NS_PER_S, title_of
+from vnet.units import NS_PER_S, label_of, title_of
 
 A, B = "A", "B"
 NOT_APPLICABLE = "not applicable"
@@ -234,11 +234,6 @@ def _verdict_style(value: object) -> str:
 
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
 REPORTED = "reported by the programs: means and 5 to 95 % of all reports of all vehicles"
-
-
-def write_comparison(comparison: Comparison, path: Path) -> Path:
-    """Write the page. Raises VnetError if it cannot be written."""
-    return put_page(path, comparison_page(comparison))
 
 
 def comparison_page(comparison: Comparison) -> str:

@@ -14,12 +14,12 @@ from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, 
 from emulator.records.reported import figure_text, is_text
 from emulator.records.tables import BACKGROUND, positions_by_time
 from emulator.report.drawing import Drawing
-from emulator.report.program_figures import Drawers, label_of
+from emulator.report.program_figures import Drawers
 from emulator.report.source import NothingToShow, Source
 from emulator.world.buildings import Buildings
 from vnet.errors import counted, printable
 from vnet.types import Array, Mask
-from vnet.units import title_of
+from vnet.units import label_of, title_of
 
 INNER_PX = 334
 """Width of a map inside its axes, at the size that it is drawn for."""

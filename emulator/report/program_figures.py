@@ -14,7 +14,7 @@ from emulator.records.reported import is_text
 from emulator.report.drawing import DASHES, TIME, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source
 from vnet.types import Array
-from vnet.units import title_of, unit_of
+from vnet.units import label_of, title_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,12 +36,6 @@ def program_charts(source: Source) -> Drawers:
         draw = partial(_texts if is_text(kind) else _numbers, source, name)
         drawers[f"own-{number}"] = (title_of(name), draw)
     return drawers
-
-
-def label_of(name: str) -> str:
-    """Return the label of an axis: the name in words, with its unit."""
-    unit = unit_of(name)
-    return f"{title_of(name)} ({unit})" if unit else title_of(name)
 
 
 def _numbers(source: Source, name: str) -> Drawing:

@@ -23,7 +23,7 @@ from emulator.report.drawing import DASHES, Drawing, draw_charts
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Run
 from vnet.errors import counted
-from vnet.units import title_of, unit_of
+from vnet.units import label_of
 
 CONFIDENCE = 0.95
 FEWEST_SEEDS = 5
@@ -135,11 +135,9 @@ def _changing(rows: Rows, names: Sequence[str]) -> list[str]:
 
 def heading(name: str, key: Sequence[KeyFigure] = ()) -> str:
     """Return the title of a figure, with its unit."""
-    last = name.startswith("last.")
     plain = name.removeprefix("last.")
-    unit = unit_of(plain)
-    title = next((each.title for each in key if each.name == plain), title_of(plain))
-    return f"{title}{f' ({unit})' if unit else ''}{', at the end' if last else ''}"
+    title = next((each.title for each in key if each.name == plain), "")
+    return label_of(plain, title) + (", at the end" if plain != name else "")
 
 
 def _is_number(value: Any) -> bool:

@@ -50,7 +50,7 @@ from emulator.viewer.drawing import (
 )
 from vnet.errors import VnetError, first_names
 from vnet.types import Array
-from vnet.units import title_of, unit_of
+from vnet.units import label_of
 
 WINDOW_S = 5.0
 """Shares, histograms and loads are those of so many last seconds, and redrawn as often."""
@@ -417,8 +417,7 @@ SCALE = np.array([(40, 90, 220), (0, 158, 115), (255, 205, 40)], dtype=float)
 
 def titled(name: str) -> str:
     """Return the title of a value, with its unit."""
-    unit = unit_of(name)
-    return drawable(f"{title_of(name)} ({unit})" if unit else title_of(name))
+    return drawable(label_of(name))
 
 
 def entity(kind: str, name: str) -> str:
