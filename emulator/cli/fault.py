@@ -14,6 +14,7 @@ from msgspec import convert
 from rich.table import Table
 
 from emulator.cli.application import group
+from emulator.cli.options import LATEST
 from emulator.drivers.control import ask
 from emulator.drivers.status import Snapshot
 from emulator.scenario.faults import KINDS, OwnRule, parse_fault
@@ -25,7 +26,6 @@ from vnet.errors import ScenarioError, VnetError, first_names
 app = group("Inject faults into a running emulator, and heal them.")
 
 RunOption = Annotated[Path, typer.Option("--run", metavar="FOLDER", help="The folder of the run.")]
-LATEST = Path("runs/latest")
 INJECTED = [name for name, kind in KINDS.items() if not issubclass(kind, OwnRule)]
 """Kinds that an operator may inject: rules are code, which a scenario brings."""
 WATCH_EVERY_S = 1.0
@@ -141,7 +141,6 @@ def _set(fault: dict[str, Any], parameter: str) -> None:
 def _show(faults: list[dict[str, Any]]) -> None:
     table = Table("fault", "state", "from", "to", "nodes")
     for fault in faults:
-        nodes = fault["nodes"]
-        shown = first_names(nodes, 6, with_total=True)
+        shown = first_names(fault["nodes"], 6, with_total=True)
         table.add_row(fault["fault"], fault["state"], f"{fault['start_s']:.3f} s", f"{fault['end_s']:.3f} s", shown)
     SafeConsole().print(table)

@@ -295,26 +295,26 @@ def load(
 ) -> Scenario:
     """Load a scenario as the options of a command change it. Raises VnetError."""
     options = {
-        "program.entry": program and json.dumps(from_here(program)),
-        "run.pacing": pacing and f'"{pacing.value}"',
-        "run.seed": seed,
-        "run.duration_s": duration,
-        "run.order": order and f'"{order.value}"',
-        "run.order_seed": order_seed,
-        "run.tape": tape and json.dumps(str(tape.absolute())),
+        "program.entry": ("--program", program and json.dumps(from_here(program))),
+        "run.pacing": ("--pacing", pacing and f'"{pacing.value}"'),
+        "run.seed": ("--seed", seed),
+        "run.duration_s": ("--duration", duration),
+        "run.order": ("--order", order and f'"{order.value}"'),
+        "run.order_seed": ("--order-seed", order_seed),
+        "run.tape": ("--tape", tape and json.dumps(str(tape.absolute()))),
     }
-    given = [f"{key}={value}" for key, value in options.items() if value is not None]
+    given = {key: pair for key, pair in options.items() if pair[1] is not None}
     own = [_program_option(option) for option in program_options or ()]
     if not all(map(str.strip, checks or ())):
         raise ScenarioError("--check '': write it as my_checks.py:check")
     try:
         scenario = load_scenario(
-            path, [*(overrides or []), *own, *given], [from_here(each) for each in checks or ()]
+            path,
+            [*(overrides or []), *own, *(f"{key}={value}" for key, (_, value) in given.items())],
+            [from_here(each) for each in checks or ()],
         )
     except OverrideError as error:
-        chosen = next(
-            (option for key, option in _OPTIONS.items() if options[key] is not None and error.key == key), "--set"
-        )
+        chosen, _ = given.get(error.key, ("--set", None))
         if any(each.startswith(f"{error.key}=") for each in own):
             chosen = "--option"
         raise ScenarioError(f"{chosen}: {error}") from None
@@ -323,18 +323,6 @@ def load(
         kind, hint = ("FIFO", "; add --order shuffle") if is_fifo else ("that of the tape", "")
         raise ScenarioError(f"--order-seed {order_seed}: the order is {kind}, which has no seed{hint}")
     return scenario
-
-
-_OPTIONS = {
-    "program.entry": "--program",
-    "run.pacing": "--pacing",
-    "run.seed": "--seed",
-    "run.duration_s": "--duration",
-    "run.order": "--order",
-    "run.order_seed": "--order-seed",
-    "run.tape": "--tape",
-}
-"""Options that are short for a change of a key."""
 
 
 def _program_option(option: str) -> str:
