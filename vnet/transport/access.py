@@ -289,24 +289,36 @@ def router_config(
 
 
 def _node_rules(run: str, nodes: Sequence[str]) -> list[Rule]:
-    process_id = nodes[0]
-    tx = [keys.node_tx(run, node) for node in nodes]
-    rx = [keys.node_rx(run, node) for node in nodes]
-    report = [keys.node_report(run, node) for node in nodes]
-    alive = [keys.node_alive(run, node) for node in nodes]
+    tx, rx, report, alive = (
+        [key(run, node) for node in nodes]
+        for key in (keys.node_tx, keys.node_rx, keys.node_report, keys.node_alive)
+    )
+    matched = [keys.node_tx(run, "*"), keys.node_report(run, "*")]
+    return _client_rules(nodes[0], run, tx + report, rx, alive, matched)
+
+
+def _host_rules(run: str, host: str) -> list[Rule]:
+    tx, rx, alive = ([key(run, host)] for key in (keys.host_tx, keys.host_rx, keys.host_alive))
+    return _client_rules(host_user(host), run, tx, rx, alive, [keys.host_tx(run, "*")])
+
+
+def _client_rules(
+    name: str, run: str, tx: list[str], rx: list[str], alive: list[str], matched: list[str]
+) -> list[Rule]:
+    """Rules of a process or host: keys on which it sends and receives, and those of its tokens.
+
+    A publisher sends only once it knows the subscriptions of the emulator and observers, which are for all nodes:
+    `matched`.
+    """
     emulator = [keys.emulator_alive(run)]
     return [
-        _rule(f"{process_id}-put", ["ingress"], ["put"], tx + report),
-        _rule(f"{process_id}-token", ["ingress"], ["liveliness_token"], alive),
-        _rule(f"{process_id}-subscribe", ["ingress"], SUBSCRIBE, rx),
-        _rule(f"{process_id}-receive", ["egress"], ["put"], rx),
-        # A publisher sends only once it knows the subscriptions of the emulator and observers, which match all
-        # nodes.
-        _rule(
-            f"{process_id}-matching", ["egress"], SUBSCRIBE, [keys.node_tx(run, "*"), keys.node_report(run, "*")]
-        ),
-        _rule(f"{process_id}-watch", ["ingress"], WATCH_TOKENS, emulator),
-        _rule(f"{process_id}-watched", ["egress"], ["liveliness_token"], emulator),
+        _rule(f"{name}-put", ["ingress"], ["put"], tx),
+        _rule(f"{name}-token", ["ingress"], ["liveliness_token"], alive),
+        _rule(f"{name}-subscribe", ["ingress"], SUBSCRIBE, rx),
+        _rule(f"{name}-receive", ["egress"], ["put"], rx),
+        _rule(f"{name}-matching", ["egress"], SUBSCRIBE, matched),
+        _rule(f"{name}-watch", ["ingress"], WATCH_TOKENS, emulator),
+        _rule(f"{name}-watched", ["egress"], ["liveliness_token"], emulator),
     ]
 
 
@@ -318,20 +330,6 @@ def _unit_rules(run: str, process_id: str, units: Sequence[str]) -> list[Rule]:
         _rule(f"{process_id}-listen", ["ingress"], SUBSCRIBE, rx),
         _rule(f"{process_id}-hear", ["egress"], ["put"], rx),
         _rule(f"{process_id}-matched", ["egress"], SUBSCRIBE, [keys.backbone_tx(run, "*")]),
-    ]
-
-
-def _host_rules(run: str, host: str) -> list[Rule]:
-    emulator = [keys.emulator_alive(run)]
-    rx = [keys.host_rx(run, host)]
-    return [
-        _rule(f"host-{host}-put", ["ingress"], ["put"], [keys.host_tx(run, host)]),
-        _rule(f"host-{host}-token", ["ingress"], ["liveliness_token"], [keys.host_alive(run, host)]),
-        _rule(f"host-{host}-subscribe", ["ingress"], SUBSCRIBE, rx),
-        _rule(f"host-{host}-receive", ["egress"], ["put"], rx),
-        _rule(f"host-{host}-matching", ["egress"], SUBSCRIBE, [keys.host_tx(run, "*")]),
-        _rule(f"host-{host}-watch", ["ingress"], WATCH_TOKENS, emulator),
-        _rule(f"host-{host}-watched", ["egress"], ["liveliness_token"], emulator),
     ]
 
 
