@@ -91,8 +91,9 @@ def table2(
         folder = _folder(out, "table2")
         cells = paper.table2_cells(paper.network_sections(networks), range(1, seeds + 1))
         results = _run(cells, folder, "table2", only, live)
-        if only is None:
+        if only is None and not live:  # of live runs no series are kept
             _draw_against_time(cells, folder, folder)
+        if only is None:
             _show(reports.table2(results), folder / "table2.md")
 
 

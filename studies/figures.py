@@ -1,8 +1,8 @@
 """The figures of the experiments: their style, errors against time, and the paper's Table I.
 
 Each function writes a PNG and an SVG next to each other and returns the PNG's path. Colours are those of Okabe and
-Ito, and nothing is told by colour alone. A mechanism has one colour and line
-in all figures; its variants ("random, one hop") keep the colour. No pyplot: no window, no state that lasts.
+Ito, and nothing is told by colour alone. A mechanism has one colour and line in all figures; its variants ("random,
+one hop") keep the colour. No pyplot: no window, no state that lasts.
 """
 
 from __future__ import annotations
