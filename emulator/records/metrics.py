@@ -26,7 +26,7 @@ from emulator.records.distributions import chi2_quantile
 from emulator.records.period_figures import NUMBER, Period, ProgramFigures, figures_of, program_figures, vectors
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import ValueColumns, figures_among
-from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, columns_of, schema_of
+from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, by_instant, columns_of, schema_of
 from emulator.scenario.own_functions import declared, load_entry
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
@@ -178,8 +178,7 @@ def _is_name(name: str) -> bool:
 
 def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa.Array]:
     """Return the columns of the states that reports have no part in."""
-    count, periods = len(node_ids), len(instants)
-    node = pa.array(np.tile(np.arange(count, dtype=np.int32), periods))
+    count = len(node_ids)
     common_m = np.array([instant.common_error_m for instant in instants])
     points = {
         "position_m": np.concatenate([instant.position_m for instant in instants]),
@@ -188,8 +187,7 @@ def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa
     }
     return {
         "period": pa.array(np.repeat(np.array([instant.period for instant in instants], np.int32), count)),
-        "time_ns": pa.array(np.repeat(np.array([instant.time_ns for instant in instants], np.int64), count)),
-        "node": pa.DictionaryArray.from_arrays(node, pa.array(node_ids, pa.string())),
+        **by_instant([instant.time_ns for instant in instants], node_ids),
         "heading_rad": pa.array(np.concatenate([instant.heading_rad for instant in instants])),
         **{name: pa.FixedSizeListArray.from_arrays(array.ravel(), 2) for name, array in points.items()},
     }

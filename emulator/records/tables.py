@@ -28,7 +28,7 @@ from emulator.world.driven.stepped import Background
 from emulator.world.driven.vehicles import Log
 from vnet.bounded import open_regular
 from vnet.errors import VnetError
-from vnet.types import Array
+from vnet.types import Array, IntArray
 
 BYTES_A_VALUE = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "BYTE_ARRAY": 4}
 """Memory of a value by its type in the file; texts are kept once, and have a number of 4 bytes each."""
@@ -161,17 +161,14 @@ STATES = Table(
         "node": Column(NAME, ID),
         "position_m": Column(POINT, "truth; NaN of a vehicle that is not there"),
         "heading_rad": Column(FLOAT, "truth, counter-clockwise from east; NaN of one that is not there, or that "
-                                     "nobody "
-                              "knows"),
+                              "nobody knows"),
         "fix_m": Column(POINT, "what the receiver gave; NaN in an outage"),
         "common_error_m": Column(POINT, "truth: the error that all receivers share"),
         "estimate_m": Column(POINT, "the position that the vehicle reported last in this period; null if it "
-                                    "reported "
-                             "none", True),
+                             "reported none", True),
         "covariance_m2": Column(MATRIX, "of `estimate_m`, as it reported: a 2 × 2 matrix by rows", True),
         "values": Column(pa.map_(TEXT, pa.list_(FLOAT)), "what it reported besides and has no column, by name: "
-                                                         "lists, "
-                         "and values of each pair of vehicles", True),
+                         "lists, and values of each pair of vehicles", True),
     },
     which=": truth and beliefs",
     further="Then the columns that the program declares for lists, and a column for each number (`double`), "
@@ -195,16 +192,13 @@ DRIVEN = Table(
         "time_ns": Column(INT, "the control instant"),
         "node": Column(NAME, ID),
         "along_m": Column(FLOAT, "truth: position of its centre along the road, or on a map its route; on a ring "
-                                 "it "
-                          "goes on counting. NaN once it has left. In SUMO the way since it was inserted"),
+                          "it goes on counting. NaN once it has left. In SUMO the way since it was inserted"),
         "left_m": Column(FLOAT, "truth: its distance to the left of the rightmost lane's centre; in SUMO of its "
-                                "own "
-                         "lane's"),
+                         "own lane's"),
         "speed_m_s": Column(FLOAT, "truth: its speed"),
         "acceleration_m_s2": Column(FLOAT, "truth: its acceleration"),
         "command_m_s2": Column(FLOAT, "the acceleration that it was told from this instant on, within its "
-                                      "limits; NaN "
-                               "if SUMO drives"),
+                               "limits; NaN if SUMO drives"),
     },
     which=", where programs drive", is_due=lambda scenario: scenario.network.programs_drive,
 )
@@ -255,21 +249,18 @@ TRACE = Table(
                           is_due=_with_mac),
         "rssi_dbm": Column(FLOAT, f"{_POWERS}received power; null if the frame was never on air", True, _never),
         "snr_db": Column(FLOAT, f"{_POWERS}received power over noise and interference, the mean of the payload",
-                                 True,
-                         _never),
+                         True, _never),
         "gain_db": Column(FLOAT, f"{_CHOSEN}power of the frame above that of the scenario", is_due=_never),
         "bitrate_mbps": Column(FLOAT, f"{_CHOSEN}its bit rate", is_due=_never),
         "period_ms": Column(pa.int16(), "on a sidelink where programs tell it: the period of the reservation, or 0",
                             is_due=_never),
         "attempt": Column(pa.int16(), f"{_UNICAST}number of the transmission, each of which has one row, that of "
-                                       "its "
-                          "addressee, with another `copy`; 0 for a broadcast", is_due=_never),
+                          "its addressee, with another `copy`; 0 for a broadcast", is_due=_never),
         "ack_on_air_ns": Column(INT, f"{_UNICAST}start of the acknowledgement; null without one", True, _never),
         "acked": Column(pa.bool_(), f"{_UNICAST}whether the sender received that", is_due=_never),
         "late_ns": Column(INT, "where, in real time, the machine delivered over 20 ms late: its part of "
-                               "`arrival_ns`, "
-                          "which is when the packet came; the radio's own arrival is `arrival_ns - late_ns`", True,
-                          _never),
+                          "`arrival_ns`, which is when the packet came; the radio's own arrival is "
+                          "`arrival_ns - late_ns`", True, _never),
     },
     about="In the order of `sent_ns`, sender, `seq`, receiver, `copy`.",
 )
@@ -359,18 +350,19 @@ def on_backbone(figures: Mapping[str, int]) -> str:
     return f"{figures.get('delivered', 0):,} of {sum(figures.values()):,} delivered"
 
 
+def by_instant(time_ns: Sequence[int] | IntArray, node_ids: Sequence[str]) -> dict[str, pa.Array]:
+    """Return the columns `time_ns` and `node` of a table with a row for each instant and node."""
+    node = pa.array(np.tile(np.arange(len(node_ids), dtype=np.int32), len(time_ns)))
+    return {
+        "time_ns": pa.array(np.repeat(np.array(time_ns, dtype=np.int64), len(node_ids))),
+        "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
+    }
+
+
 def busy_table(windows: Array, node_ids: Sequence[str]) -> pa.Table:
     """Busy ratios (windows, N) as a table, a row for each window and vehicle."""
-    count = len(windows)
-    node = pa.array(np.tile(np.arange(len(node_ids), dtype=np.int32), count))
-    return pa.table(
-        {
-            "time_ns": pa.array(np.repeat(np.arange(count, dtype=np.int64) * WINDOW_NS, len(node_ids))),
-            "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
-            "busy_ratio": pa.array(windows.ravel()),
-        },
-        BUSY.schema,
-    )
+    places = by_instant(np.arange(len(windows)) * WINDOW_NS, node_ids)
+    return pa.table({**places, "busy_ratio": pa.array(windows.ravel())}, BUSY.schema)
 
 
 def busy_windows(table: pa.Table | None, node_ids: Sequence[str]) -> Array:
@@ -468,18 +460,9 @@ _TIME, _NODE, *QUANTITIES = DRIVEN.columns
 
 def driven_table(log: Log, node_ids: Sequence[str]) -> pa.Table:
     """Return a row for each control instant and vehicle; NaN for a vehicle that has left."""
-    count, instants = len(node_ids), len(log.time_ns)
-    node = pa.array(np.tile(np.arange(count, dtype=np.int32), instants))
-    rows = np.array(log.rows).reshape(instants, len(QUANTITIES), count)
+    rows = np.array(log.rows).reshape(len(log.time_ns), len(QUANTITIES), len(node_ids))
     columns = {name: pa.array(rows[:, index].ravel()) for index, name in enumerate(QUANTITIES)}
-    return pa.table(
-        {
-            "time_ns": pa.array(np.repeat(np.array(log.time_ns, dtype=np.int64), count)),
-            "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
-            **columns,
-        },
-        DRIVEN.schema,
-    )
+    return pa.table({**by_instant(log.time_ns, node_ids), **columns}, DRIVEN.schema)
 
 
 def of_vehicles(table: pa.Table, name: str, count: int) -> tuple[Array, Array]:
