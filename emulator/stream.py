@@ -343,12 +343,12 @@ def _messages(run: OpenedRun, figures: Sequence[Any]) -> Iterator[Message]:
 def _periods(run: OpenedRun, figures: Sequence[Any], events: Sequence[Sequence[Event]]) -> Iterator[Message]:
     period_ns, table = run.scenario.period_ns, run.table(BUSY)
     busy, background = busy_windows(table, run.node_ids), positions_by_time(run.table(BACKGROUND))
-    down, trace = _Down(run), _Trace(run)
+    trace = _Trace(run)
     for now, happened, (instant, beliefs) in zip(figures, events, _states(run), strict=False):
         start_ns, end_ns = now.time_ns, now.time_ns + period_ns
         faults = [planned.label for planned in run.plan if planned.acts_between(start_ns, end_ns)]
         busy_ratio = mean_busy(busy, len(run.node_ids), start_ns, end_ns)
-        frames = trace.until(end_ns), ~down.at(end_ns - 1), faults, happened, busy_ratio
+        frames = trace.until(end_ns), ~run.down_at(end_ns - 1), faults, happened, busy_ratio
         beyond = background.get(start_ns, ())
         yield "period", period_message(run.node_ids, instant, end_ns, beliefs, now, *frames, beyond)
 
@@ -475,22 +475,6 @@ def _recorded_of_peers(column: pa.Array, prefix: str, number: Mapping[str, int])
         if other is not None:
             found.setdefault(place, np.zeros(len(number)))[other] = one_value
     return found
-
-
-class _Down:
-    """Spans in which vehicles were down."""
-
-    def __init__(self, recorded: RecordedRun) -> None:
-        self._count = len(recorded.node_ids)
-        self._node = np.array([span.node for span in recorded.down], dtype=np.intp)
-        self._start_ns = np.array([span.start_ns for span in recorded.down], dtype=np.int64)
-        self._end_ns = np.array([span.end_ns for span in recorded.down], dtype=np.int64)
-
-    def at(self, time_ns: int) -> NDArray[np.bool_]:
-        """Mask (n,) of the vehicles that were down at an instant."""
-        down = np.zeros(self._count, dtype=bool)
-        down[self._node[(self._start_ns <= time_ns) & (time_ns < self._end_ns)]] = True
-        return down
 
 
 def _by_period(events: Iterable[Event], period_ns: int, periods: int) -> list[list[Event]]:

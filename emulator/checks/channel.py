@@ -208,15 +208,13 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
     # Frames sent at the instant of a death may have been sent before or after it: they are not judged.
     judged = capped | recorded.outcome_is("fault", *ON_AIR)
     judged &= recorded.placed & ~recorded.is_unsure(recorded.sent_ns) & ~recorded.dropped_by_sender
-    everybody = np.arange(len(recorded.node_ids))
     edges = {0, END_OF_TIME_NS} | {edge for span in recorded.down for edge in (span.start_ns, span.end_ns)}
     edges |= set(recorded.places.starts_ns.tolist())
     wrong = np.zeros(len(capped), dtype=bool)
     for start_ns, end_ns in pairwise(sorted(edges)):
         rows = recorded.sent_between(start_ns, end_ns)
         if len(rows):
-            up = ~recorded.is_down(everybody, np.full(len(everybody), start_ns))
-            admitted = recorded.admitted(up, start_ns)
+            admitted = recorded.admitted(~recorded.down_at(start_ns), start_ns)
             is_admitted = admitted.contain(recorded.sender[rows], recorded.receiver[rows])
             wrong[rows] = judged[rows] & (is_admitted == capped[rows])
     return wrong
@@ -325,7 +323,8 @@ def check_isolation(recorded: RecordedRun) -> Finding:
 
 def _foreign(recorded: RecordedRun) -> Mask:
     """Arrivals with other bytes than their frame's that no fault changed."""
-    differs = recorded.arrived & ~recorded.caused_by("corrupt") & changed_bytes(recorded) & ~_ruled(recorded)
+    differs = recorded.arrived & ~recorded.caused_by("corrupt") & changed_bytes(recorded)
+    differs &= ~recorded.may_reach_of(Custom, CustomSender)
     replaced = _replaced(recorded)
     differs |= recorded.arrived & _not_of_that_age(recorded, replaced)
     # A frame that a stale one replaced is in no row of its own.
@@ -337,15 +336,6 @@ def _foreign(recorded: RecordedRun) -> Mask:
         described = zip(*(column[twice].tolist() for column in _what(recorded)), strict=True)
         differs[twice] = [what not in heard for what in described]
     return np.asarray(differs)
-
-
-def _ruled(recorded: RecordedRun) -> Mask:
-    """Rows whose bytes a rule of the user's own may have chosen, on the link or at the sender."""
-    ruled = np.zeros(len(recorded.trace), dtype=bool)
-    for planned in recorded.plan:
-        if isinstance(planned.fault, Custom | CustomSender):
-            ruled |= recorded.may_reach(planned)
-    return ruled
 
 
 def changed_bytes(recorded: RecordedRun) -> Mask:
@@ -370,14 +360,12 @@ def _replaced(recorded: RecordedRun) -> Mask:
 
     A sender's frames are remembered from when a fault first makes it misbehave.
     """
-    replaced = np.zeros(len(recorded.trace), dtype=bool)
+    replaced: Mask = recorded.may_reach_of(CustomSender) & (recorded.copy == 0)
     remembered_ns = np.full(len(recorded.node_ids), END_OF_TIME_NS)
     for planned in recorded.plan:
         if isinstance(planned.fault, SenderFault):
             remembered_ns[planned.nodes] = np.minimum(remembered_ns[planned.nodes], planned.start_ns)
     for planned in recorded.plan:
-        if isinstance(planned.fault, CustomSender):
-            replaced |= recorded.may_reach(planned) & (recorded.copy == 0)
         if isinstance(planned.fault, StaleMessages):
             old_ns = recorded.sent_ns - round(planned.fault.age_s * NS_PER_S) + recorded.guard_ns
             acts = recorded.may_reach(planned) & (recorded.copy == 0)

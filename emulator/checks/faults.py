@@ -75,7 +75,7 @@ def check_copies(recorded: RecordedRun) -> Finding:
     if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in recorded.plan):
         return not_exercised("no fault sends frames again" if recorded.plan else NO_FAULTS)
     once = ~received_twice(recorded) & (recorded.attempt < 2)  # what is transmitted again is the MAC's
-    first = recorded.first_rows(once & ~_near_a_change(recorded) & ~_sent_by_rule(recorded))
+    first = recorded.first_rows(once & ~_near_a_change(recorded) & ~recorded.may_reach_of(CustomSender))
     originals, copies = first[recorded.copy[first] == 0], first[recorded.copy[first] > 0]
     frame_ns = dict(_of(recorded, originals))
     at_once = np.array([frame_ns.get(f) == t for f, t in _of(recorded, copies)], dtype=bool)
@@ -107,15 +107,6 @@ def _near_a_change(recorded: RecordedRun) -> Mask:
         for edge_ns in (planned.start_ns, planned.end_ns):
             near |= np.abs(recorded.sent_ns - edge_ns) < recorded.guard_ns
     return near
-
-
-def _sent_by_rule(recorded: RecordedRun) -> Mask:
-    """Rows of frames in whose place a rule of the user's own may have sent others, as often as it liked."""
-    ruled = np.zeros(len(recorded.trace), dtype=bool)
-    for planned in recorded.plan:
-        if isinstance(planned.fault, CustomSender):
-            ruled |= recorded.may_reach(planned)
-    return ruled
 
 
 def _due(recorded: RecordedRun, rows: Rows) -> IntArray:

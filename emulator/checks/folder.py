@@ -299,11 +299,10 @@ def _decided_again(recorded: RecordedRun) -> Engine:
     sender, seq, period_ms = (each[rows].tolist() for each in (recorded.sender, recorded.seq, recorded.period_ms))
     changes_ns = _changes_ns(recorded)
     endings = {event.time_ns for event in recorded.event(*kinds_with(ENDS_PROGRAM))}
-    everybody = np.arange(len(recorded.node_ids))
-    up = np.ones(len(everybody), dtype=bool)
+    up = np.ones(len(recorded.node_ids), dtype=bool)
 
     def set_up(time_ns: int) -> None:
-        now_up = ~recorded.is_down(everybody, np.full(len(everybody), time_ns))
+        now_up = ~recorded.down_at(time_ns)
         for node in np.flatnonzero(up != now_up).tolist():
             engine.set_up(node, bool(now_up[node]))
         up[:] = now_up

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.records.distributions import lowest_share
-from emulator.records.events import Event, EventKind, in_words, kinds_of
+from emulator.records.events import KINDS, Event, EventKind, in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
 from emulator.records.tables import STATES, VALUES_AS_LIST
@@ -405,11 +405,6 @@ def steady_growth_kib_per_s(time_s: Sequence[float], size_kb: Sequence[float]) -
     return grown_kb / (to_s - from_s) if is_steady else 0.0
 
 
-KINDS = {str(kind): kind for kind in EventKind}
-KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
-"""Columns by which the rows of the trace are sorted."""
-
-
 def check_row_order(recorded: RecordedRun) -> Finding:
     """Check that the rows of trace, states and metrics are in order, and that each event can be of the run."""
     count, period_ns = len(recorded.node_ids), recorded.scenario.period_ns
@@ -419,7 +414,7 @@ def check_row_order(recorded: RecordedRun) -> Finding:
     columns = {
         "period of the states": np.asarray(states["period"].to_numpy()) != period,
         "time_ns of the states": np.asarray(states["time_ns"].to_numpy()) != period * period_ns,
-        "node of the states": _nodes(recorded) != place - period * count,
+        "node of the states": recorded.place[1] != place - period * count,
         "period of the metrics": np.asarray(metrics["period"].to_numpy()) != np.arange(len(metrics)),
         "time_ns of the metrics": np.asarray(metrics["time_ns"].to_numpy()) != np.arange(len(metrics)) * period_ns,
         "trace": _disordered(recorded),
@@ -447,12 +442,6 @@ def _is_nobodys(event: Event, recorded: RecordedRun) -> bool:
     if event.node is not None and of_vehicle and event.node not in recorded.number:
         return bool(recorded.number)
     return recorded.scenario.run.pacing == "lockstep" and event.time_ns > recorded.scenario.duration_ns
-
-
-def _nodes(recorded: RecordedRun) -> Any:
-    column = recorded.states["node"].combine_chunks().dictionary_encode()
-    code = np.array([recorded.number_of(node) for node in column.dictionary.to_pylist()], dtype=np.intp)
-    return code[column.indices.to_numpy()]
 
 
 def _disordered(recorded: RecordedRun) -> Mask:

@@ -56,7 +56,15 @@ from emulator.records.tables import (
     open_table,
 )
 from emulator.records.verdicts import MOST_ROWS, Record, read_record
-from emulator.scenario.faults import EmulatorRestart, Infrastructure, ProcessFault, Range, SenderFault, Swizzle
+from emulator.scenario.faults import (
+    EmulatorRestart,
+    Fault,
+    Infrastructure,
+    ProcessFault,
+    Range,
+    SenderFault,
+    Swizzle,
+)
 from emulator.scenario.loading import LARGEST_BYTES, load_scenario, parse_recorded_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import Links
@@ -94,10 +102,6 @@ class Span:
     start_ns: int
     end_ns: int
     planned: bool
-
-    def holds(self, time_ns: IntArray) -> Mask:
-        """Mask of the instants within the span."""
-        return np.asarray((self.start_ns <= time_ns) & (time_ns < self.end_ns))
 
 
 class Emissions(NamedTuple):
@@ -589,6 +593,12 @@ class RecordedRun:
             down[mine] = begun > ended
         return down
 
+    def down_at(self, time_ns: int) -> Mask:
+        """Mask (N,) of the nodes that are down at an instant."""
+        down = np.zeros(len(self.node_ids), dtype=bool)
+        down[[span.node for span in self.down if span.start_ns <= time_ns < span.end_ns]] = True
+        return down
+
     def is_unsure(self, time_ns: IntArray) -> Mask:
         """Instants of which nobody can say who was up: those of a death, in real time those near a change."""
         unsure = np.isin(time_ns, list(self.deaths_ns.values()))
@@ -651,6 +661,14 @@ class RecordedRun:
         """Mask of the rows that may have been sent on a link while a fault acted there."""
         later_ns = [0, self.guard_ns, -self.guard_ns] if self.guard_ns else [0]
         return np.asarray(np.logical_or.reduce([self._reached(planned, each_ns, True) for each_ns in later_ns]))
+
+    def may_reach_of(self, *kinds: type[Fault]) -> Mask:
+        """Mask of the rows that may have been sent on a link while a fault of one of these classes acted there."""
+        reached = np.zeros(len(self.trace), dtype=bool)
+        for planned in self.plan:
+            if isinstance(planned.fault, kinds):
+                reached |= self.may_reach(planned)
+        return reached
 
     def surely_reaches(self, planned: PlannedFault) -> Mask:
         """Mask of the rows that were certainly sent on a link while a fault acted there."""

@@ -233,9 +233,7 @@ class Run:
 
     def up(self, time_s: float) -> Mask:
         """Return the vehicles (N,) that are up at `time_s`: in the network, not ended, and not ended by a fault."""
-        count = len(self.nodes)
-        times_ns: IntArray = np.full(count, round(time_s * NS_PER_S), dtype=np.int64)
-        return np.asarray(~self._recorded.is_down(np.arange(count), times_ns))
+        return ~self._recorded.down_at(round(time_s * NS_PER_S))
 
     @property
     def up_throughout(self) -> Mask:
