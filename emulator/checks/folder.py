@@ -165,8 +165,12 @@ def check_truth(recorded: OpenedRun) -> Finding:
     if periods_of(scenario) * vehicles > len(recorded.states) + SPARE_ROWS:
         return not_exercised("the run was cut short")
     world = build_world(scenario)
-    ours, theirs = recorded.world, RecordedWorld.of(world)
-    wrong = [{"file": WORLD_FILE, "column": each} for each in ARRAYS if not _same_array(ours, theirs, each)]
+    ours, theirs = recorded.world.arrays(), RecordedWorld.of(world).arrays()
+    wrong = [
+        {"file": WORLD_FILE, "column": name}
+        for name in ARRAYS
+        if not _same_array(name, ours.get(name), theirs.get(name))
+    ]
     if recorded.node_ids and list(world.node_ids) != recorded.node_ids:
         wrong.append({"file": STATES.file, "column": "node"})
     else:
@@ -177,13 +181,12 @@ def check_truth(recorded: OpenedRun) -> Finding:
     return result(len(wrong), text, broken_text, wrong)
 
 
-def _same_array(ours: RecordedWorld, theirs: RecordedWorld, name: str) -> bool:
-    mine, other = getattr(ours, name), getattr(theirs, name)
-    if mine is None or other is None or np.shape(mine) != np.shape(other):
+def _same_array(name: str, mine: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
+    if mine is None or other is None or mine.shape != other.shape:
         return mine is other
     if name == "area_m":  # of a test that ended the run early it is that of the whole
         return bool((mine[0] <= other[0] + TOLERANCE_M).all() and (mine[1] >= other[1] - TOLERANCE_M).all())
-    if np.asarray(mine).dtype.kind != "f":
+    if mine.dtype.kind != "f":
         return bool(np.array_equal(mine, other))
     return bool(same_numbers(mine, other, TOLERANCE_M).all())
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -59,9 +59,8 @@ class RecordedWorld:
 
     `position_m` (n, 2) are positions at time 0, NaN of a vehicle that is not there yet; `area_m` (2, 2) the corners
     of the box in which vehicles are during the run; lanes (l) have a point, a heading and a length from there,
-    infinite for a line that goes both ways. `links` (n, n) is who (row) hears whom (column), or None; `link_…` are
-    the arrays of `LinkTable`, and `building_…` those of `Buildings`, or None; `receiver_m` (k, r, 2) is what each
-    receiver of a recorded common error has beyond the common one in each period, or None.
+    infinite for a line that goes both ways. `radio_inputs` are links and buildings. `receiver_m` (k, r, 2) is what
+    each receiver of a recorded common error has beyond the common one in each period, or None.
     """
 
     node_ids: tuple[str, ...]
@@ -70,22 +69,13 @@ class RecordedWorld:
     lane_point_m: Array
     lane_heading_rad: Array
     lane_length_m: Array
-    links: Mask | None = None
-    link_time_ns: IntArray | None = None
-    link_sender: NDArray[np.intp] | None = None
-    link_receiver: NDArray[np.intp] | None = None
-    link_loss: Array | None = None
-    building_corner_m: Array | None = None
-    building_first: NDArray[np.intp] | None = None
-    building_number: NDArray[np.intp] | None = None
+    radio_inputs: RadioInputs
     receiver_m: Array | None = None
 
     @classmethod
     def of(cls, world: World) -> RecordedWorld:
         """Take from a world what is to be recorded."""
-        lanes, buildings = world.lane_map, world.radio_inputs.buildings
-        links = world.radio_inputs.links
-        table = links if isinstance(links, LinkTable) else None
+        lanes = world.lane_map
         return cls(
             node_ids=world.node_ids,
             position_m=world.position_m(0),
@@ -93,45 +83,32 @@ class RecordedWorld:
             lane_point_m=lanes.point_m,
             lane_heading_rad=lanes.heading_rad,
             lane_length_m=lanes.length_m,
-            links=None if isinstance(links, LinkTable) else links,
-            link_time_ns=None if table is None else table.time_ns,
-            link_sender=None if table is None else table.sender,
-            link_receiver=None if table is None else table.receiver,
-            link_loss=None if table is None else table.loss,
-            building_corner_m=None if buildings is None else buildings.corner_m,
-            building_first=None if buildings is None else buildings.first,
-            building_number=None if buildings is None else buildings.building,
+            radio_inputs=replace(world.radio_inputs, units=()),
             receiver_m=world.receiver_m,
         )
 
-    @cached_property
-    def link_table(self) -> LinkTable | None:
-        """Links over time, where the radio has measured ones."""
-        if self.link_time_ns is None or self.link_sender is None:
-            return None
-        if self.link_receiver is None or self.link_loss is None:
-            return None
-        return LinkTable(self.link_time_ns, self.link_sender, self.link_receiver, self.link_loss)
-
-    @cached_property
+    @property
     def buildings(self) -> Buildings | None:
         """The buildings between vehicles, where the radio has any."""
-        if self.building_corner_m is None or self.building_first is None or self.building_number is None:
-            return None
-        return Buildings(self.building_corner_m, self.building_first, self.building_number)
+        return self.radio_inputs.buildings
 
-    @property
-    def radio_inputs(self) -> RadioInputs:
-        """Inputs of the radio from files."""
-        return RadioInputs(self.links if self.link_table is None else self.link_table, self.buildings)
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of the file, of `ARRAYS` those that this world has."""
+        links, buildings = self.radio_inputs.links, self.radio_inputs.buildings
+        arrays: dict[str, Any] = {name: getattr(self, name, None) for name in ARRAYS}
+        arrays["node_ids"] = np.array(self.node_ids, dtype=np.str_)
+        if isinstance(links, LinkTable):
+            arrays |= zip(LINKS, (links.time_ns, links.sender, links.receiver, links.loss), strict=True)
+        else:
+            arrays["links"] = links
+        if buildings is not None:
+            arrays |= zip(BUILDINGS, (buildings.corner_m, buildings.first, buildings.building), strict=True)
+        return {name: array for name, array in arrays.items() if array is not None}
 
     def write(self, path: Path) -> None:
         """Write the file. Raises OSError."""
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
-        arrays["node_ids"] = np.array(self.node_ids, dtype=np.str_)
-        present = {name: array for name, array in arrays.items() if array is not None}
         with path.open("wb") as file:  # by its name, numpy would append to it
-            np.savez_compressed(file, allow_pickle=False, **present)
+            np.savez_compressed(file, allow_pickle=False, **self.arrays())
 
     @classmethod
     def read(cls, path: Path) -> RecordedWorld:
@@ -144,8 +121,14 @@ class RecordedWorld:
         except ValueError as error:
             raise VnetError(f"{path}: {error}") from None
         _check(path, arrays)
-        node_ids = tuple(arrays.pop("node_ids").tolist())
-        return cls(node_ids=node_ids, **arrays)
+        node_ids, links = tuple(arrays.pop("node_ids").tolist()), arrays.pop("links", None)
+        over_time = [arrays.pop(name) for name in LINKS if name in arrays]
+        outlines = [arrays.pop(name) for name in BUILDINGS if name in arrays]
+        radio_inputs = RadioInputs(
+            links=LinkTable(*over_time) if over_time else links,
+            buildings=Buildings(*outlines) if outlines else None,
+        )
+        return cls(node_ids=node_ids, radio_inputs=radio_inputs, **arrays)
 
 
 def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
