@@ -77,27 +77,6 @@ class ZygoteGoneError(Exception):
     """The zygote has ended before it answered."""
 
 
-class Process(Protocol):
-    """A child process, as `subprocess.Popen` has it."""
-
-    pid: int
-
-    def poll(self) -> int | None:
-        """Return the exit status (minus the signal's number), or None while it runs."""
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end. Raises subprocess.TimeoutExpired."""
-
-    def send_signal(self, sig: int) -> None:
-        """Send it a signal, unless it has ended."""
-
-    def terminate(self) -> None:
-        """Send it SIGTERM."""
-
-    def kill(self) -> None:
-        """Send it SIGKILL."""
-
-
 class ForkedProcess:
     """A process that was forked from the zygote, and whose parent is this process; its group ends with it."""
 
@@ -423,7 +402,7 @@ class Launcher:
         self._folders = folders
         self._zygote = zygote
         self._patience_s = patience_s
-        self._processes: dict[str, Process] = {}
+        self._processes: dict[str, ForkedProcess | GroupProcess] = {}
         self._services: set[str] = set()
 
     def prepare(self) -> None:
