@@ -14,7 +14,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -49,29 +49,19 @@ class Relay:
     def __init__(self) -> None:
         self._items: list[Call] = []
         self._size_bytes = 0
-        self._is_urgent = False
-        self._awaited: set[str] = set()
-
-    def granted(self, process_id: str) -> None:
-        """Note that a process owes a yield."""
-        self._awaited.add(process_id)
-
-    def ended(self, process_id: str) -> None:
-        """Note that a process owes nothing any more."""
-        self._awaited.discard(process_id)
-
-    def hurry(self) -> None:
-        """Let what there is go at once: the emulator waits for more than yields."""
-        self._is_urgent = True
+        self.is_urgent = False
+        """True if what there is goes at once: the emulator waits for more than yields."""
+        self.awaited: set[str] = set()
+        """The processes that owe a yield."""
 
     def take(self, node: str, payload: bytes) -> None:
         """Take a message of an agent, which is on the `tx` of `node`; yields are on that of their process."""
         self._items.append(("message", node, payload))
         self._size_bytes += len(payload)
         if wire.is_yield(payload):
-            self._awaited.discard(node)
+            self.awaited.discard(node)
         else:
-            self._is_urgent = True
+            self.is_urgent = True
 
     def take_unit(self, unit: str, payload: bytes) -> None:
         """Take a message of a unit on its key of the backbone: it waits for the yield that refers to it."""
@@ -81,19 +71,14 @@ class Relay:
     def add(self, item: Call) -> None:
         """Take news of the host itself, which goes at once."""
         self._items.append(item)
-        self._is_urgent = True
-
-    @property
-    def awaited(self) -> Collection[str]:
-        """The processes that owe a yield."""
-        return self._awaited
+        self.is_urgent = True
 
     def take_bundle(self) -> list[Call]:
         """Return what is to go now: nothing while all that there is are yields, and one is owed."""
-        is_due = self._is_urgent or not self._awaited or self._size_bytes >= FULL_BYTES
+        is_due = self.is_urgent or not self.awaited or self._size_bytes >= FULL_BYTES
         if not is_due:
             return []
-        bundle, self._items, self._size_bytes, self._is_urgent = self._items, [], 0, False
+        bundle, self._items, self._size_bytes, self.is_urgent = self._items, [], 0, False
         return bundle
 
 
@@ -370,13 +355,13 @@ class HostProcess:
         for name, *arguments in message.calls:  # those of TO_HOST and no others
             getattr(self, f"_{name}")(*arguments)
         if not self._relay.awaited:
-            self._relay.hurry()
+            self._relay.is_urgent = True
 
     def _to_node(self, node: str, payload: bytes, awaited: bool) -> None:
         if not awaited:
-            self._relay.hurry()
+            self._relay.is_urgent = True
         elif node in self._launcher.pids:
-            self._relay.granted(node)
+            self._relay.awaited.add(node)
         self._down.agents.put(node, payload)
 
     def _to_unit(self, unit: str, payload: bytes) -> None:
@@ -401,12 +386,12 @@ class HostProcess:
     def _kill(self, process_id: str) -> None:
         self._cpu.look(self._launcher.pids)
         self._launcher.kill(process_id)
-        self._relay.ended(process_id)
+        self._relay.awaited.discard(process_id)
 
     def _detach(self, process_id: str, patience_s: float) -> None:
         self._cpu.look(self._launcher.pids)
         wait = self._launcher.detach(process_id)
-        self._relay.ended(process_id)
+        self._relay.awaited.discard(process_id)
         thread = threading.Thread(target=wait, args=[patience_s], name=f"end of {process_id}")
         thread.start()
         self._leaving[process_id] = thread
@@ -417,7 +402,7 @@ class HostProcess:
             return
         self._launcher.signal(process_id, number)
         if number is signal.SIGUSR1:  # its faulthandler writes to its log
-            self._relay.hurry()
+            self._relay.is_urgent = True
             self._tails_due.append((time.monotonic() + STACKS_WRITTEN_S, process_id))
 
     def _look(self, time_ns: int, memory_limit_mb: float | None) -> None:
@@ -426,7 +411,6 @@ class HostProcess:
         self._launcher.cut_logs()
         if over := first_over(memory_limit_mb, self._launcher.pids):
             self._relay.add(("memory", *over))
-            self._relay.hurry()
 
     def _be_patient(self, within_s: float) -> None:
         self._patience_until = time.monotonic() + within_s
@@ -454,7 +438,7 @@ class HostProcess:
 
     def _children_ended(self) -> None:
         for process_id, how in self._launcher.ended().items():
-            self._relay.ended(process_id)
+            self._relay.awaited.discard(process_id)
             serial = self._serials[process_id]
             self._relay.add(("ended", process_id, serial, how.status, how.log_tail, None))
 

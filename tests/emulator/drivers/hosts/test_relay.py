@@ -9,8 +9,7 @@ FINAL = wire.encode(wire.Final(b"nonce", wire.Traffic()))
 
 def granted(*process_ids: str) -> Relay:
     made = Relay()
-    for process_id in process_ids:
-        made.granted(process_id)
+    made.awaited.update(process_ids)
     return made
 
 
@@ -42,7 +41,7 @@ def test_what_a_unit_sends_over_the_backbone_goes_with_the_yield_that_refers_to_
 def test_who_ends_owes_nothing() -> None:
     host = granted("v01", "v02")
     host.take("v01", YIELD)
-    host.ended("v02")
+    host.awaited.discard("v02")
     assert host.take_bundle() == [("message", "v01", YIELD)]
 
 
@@ -53,13 +52,13 @@ def test_what_is_no_yield_goes_at_once_and_takes_along_what_is_there() -> None:
     assert host.take_bundle() == [("message", "v01", YIELD), ("message", "v02", FINAL)]
     host.add(("token", "v02", False))
     assert host.take_bundle() == [("token", "v02", False)]
-    assert set(host.awaited) == {"v02"}, "it still owes its yield"
+    assert host.awaited == {"v02"}, "it still owes its yield"
 
 
 def test_an_emulator_that_asks_does_not_wait_for_those_that_are_stuck() -> None:
     host = granted("v01", "v02")
     host.take("v01", YIELD)
-    host.hurry()
+    host.is_urgent = True
     assert host.take_bundle() == [("message", "v01", YIELD)]
 
 
