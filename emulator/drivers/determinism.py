@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -77,26 +77,22 @@ def repetitions(command: str, emulation: Emulation) -> Iterator[Repetition]:
 
 
 @contextmanager
-def calls_recorded(folder: Path, asked: bool) -> Iterator[None]:
+def _set(variable: str, value: str) -> Iterator[None]:
+    os.environ[variable] = value
+    try:
+        yield
+    finally:
+        del os.environ[variable]
+
+
+def calls_recorded(folder: Path, asked: bool) -> AbstractContextManager[None]:
     """Have the programs of a run write down from which lines they send and report, if asked."""
-    if not asked:
-        yield
-        return
-    os.environ[CALLS_VARIABLE] = str((folder / CALLS).absolute())
-    try:
-        yield
-    finally:
-        del os.environ[CALLS_VARIABLE]
+    return _set(CALLS_VARIABLE, str((folder / CALLS).absolute())) if asked else nullcontext()
 
 
-@contextmanager
-def scattered() -> Iterator[None]:
+def scattered() -> AbstractContextManager[None]:
     """Have objects of programs get other addresses in this process and those forked from it."""
-    os.environ[SCATTER_VARIABLE] = "1"
-    try:
-        yield
-    finally:
-        del os.environ[SCATTER_VARIABLE]
+    return _set(SCATTER_VARIABLE, "1")
 
 
 def run_again(

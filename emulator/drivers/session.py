@@ -13,9 +13,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import closing, nullcontext, redirect_stdout
 from contextvars import copy_context
 from dataclasses import dataclass
 from io import StringIO
@@ -101,7 +101,7 @@ class Session:
         forget_imports()
         is_local = isinstance(programs, Local)
         loads_programs = loads_programs and not is_local and bool(entries_of(scenario))
-        with program_check(scenario) if loads_programs else nullcontext() as check:
+        with closing(ProgramCheck(scenario)) if loads_programs else nullcontext() as check:
             world = build_world(scenario)
             self._local = programs if isinstance(programs, Local) else Local()
             self._processes = process_count(self._local.processes, len(world.node_ids))
@@ -257,7 +257,7 @@ _LONGEST_REASON = 1 << 16
 
 
 class ProgramCheck:
-    """One process that imports the programs of `scenario`; made by `program_check`."""
+    """A process that imports the programs of a scenario in the background, until `close`."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._entries = entries_of(scenario)
@@ -302,13 +302,3 @@ class ProgramCheck:
         self._process.kill()
         self._process.wait()
         os.close(self._reason)
-
-
-@contextmanager
-def program_check(scenario: Scenario) -> Iterator[ProgramCheck]:
-    """Import the programs in the background; `wait` within the block says whether they can be loaded."""
-    check = ProgramCheck(scenario)
-    try:
-        yield check
-    finally:
-        check.close()
