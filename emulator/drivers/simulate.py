@@ -23,6 +23,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.local import InLoop, LocalProcesses, Pipes
 from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
 from emulator.drivers.signals import ENDING, gets_signals, signals_handled, tell_from_handler
+from emulator.records.costs import Costs
 from emulator.records.events import EventKind
 from vnet.errors import VnetError, shown
 from vnet.runtime.debug_target import DebugTarget
@@ -58,7 +59,6 @@ def simulate(
     if apart is not None:
         others = [node for node in node_ids if node != apart]
         groups = [*([[apart]] if apart else []), *(split_evenly(others, MOST_APART) if others else [])]
-    emulation.costs.processes = len(groups)
     stop = stop or threading.Event()
     lockstep = Lockstep(emulation, groups, permanent=True)
     search_programs_in(emulation.scenario.program.folders)
@@ -105,7 +105,7 @@ def _take_endings(emulation: Emulation, processes: LocalProcesses, time_ns: int,
     for each in processes.endings:
         cpu_ns.update(each.cpu_ns)
         wake_ups.update(each.wake_ups)
-    emulation.costs.take_programs(cpu_ns, wake_ups)
+    emulation.costs = Costs("program", cpu_ns, wake_ups, processes=len(processes.pids))
     emulation.orders.steps = {node: count for each in processes.endings for node, count in each.order_steps.items()}
 
 

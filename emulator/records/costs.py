@@ -16,6 +16,7 @@ MOST_VEHICLES = 100
 """Vehicles that are listed, those that took most CPU time first: verdict.json stays small."""
 
 
+@dataclass
 class Costs:
     """CPU time in ns and wake-ups by node, as the driver measures them while a run goes on.
 
@@ -23,19 +24,10 @@ class Costs:
     have run the programs of a simulation; None for a live run.
     """
 
-    def __init__(self) -> None:
-        self.measured: Literal["program", "process"] = "process"
-        self.processes: int | None = None
-        self.cpu_ns: Mapping[str, int] = {}
-        self.wake_ups: Counter[str] = Counter()
-
-    def take_programs(self, cpu_ns: Mapping[str, int], wake_ups: Counter[str]) -> None:
-        """Take what was measured on a loop that hosts all nodes."""
-        self.measured, self.cpu_ns, self.wake_ups = "program", cpu_ns, wake_ups
-
-    def take_processes(self, cpu_ns: Mapping[str, int]) -> None:
-        """Take the CPU time of processes, by their first nodes."""
-        self.cpu_ns = cpu_ns
+    measured: Literal["program", "process"] = "process"
+    cpu_ns: Mapping[str, int] = field(default_factory=dict)
+    wake_ups: Counter[str] = field(default_factory=Counter)
+    processes: int | None = None
 
 
 @dataclass(frozen=True)

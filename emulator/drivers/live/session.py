@@ -196,7 +196,7 @@ class LiveSession:
             self._measure_cpu()
             interrupted |= await _to_its_end(self._shut_down(completed))
             in_all_ns = self._cpu.cpu_ns if self._fleet is None else self._cpu.cpu_ns + self._fleet.cpu_ns
-            self._emulation.costs.take_processes(in_all_ns)
+            self._emulation.costs.cpu_ns = in_all_ns
             self._memory.write(folder, self._time_ns())
             self._processes.write_refused()
         return wall_s, interrupted

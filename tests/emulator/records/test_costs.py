@@ -11,8 +11,7 @@ NODES = ["v01", "v02", "v03"]
 
 
 def test_the_slowest_vehicle_comes_first() -> None:
-    costs = Costs()
-    costs.take_programs({"v01": 10**9, "v02": 3 * 10**9}, Counter(v01=4, v02=5, v03=6))
+    costs = Costs("program", {"v01": 10**9, "v02": 3 * 10**9}, Counter(v01=4, v02=5, v03=6))
     cost = run_cost(costs, NODES, np.array([2, 0, 2]), np.array([10, 300, 30]))
     assert [vehicle.node for vehicle in cost.vehicles] == ["v02", "v01", "v03"]
     assert (cost.measured, cost.cpu_s, cost.wake_ups) == ("program", 4.0, 15)
@@ -33,8 +32,7 @@ def test_what_was_not_measured_is_not_told() -> None:
 
 
 def test_only_the_slowest_are_listed() -> None:
-    costs = Costs()
-    costs.take_processes({"v03": 1})
+    costs = Costs("process", {"v03": 1})
     none = np.array([], dtype=np.int32)
     cost = run_cost(costs, NODES, none, none, most=1)
     assert [vehicle.node for vehicle in cost.vehicles] == ["v03"]
