@@ -147,7 +147,7 @@ def page() -> str:
     parts += [docstring(Figures), columns(_of_program(METRICS), Figures)]
     parts += ["## Outcomes", "Each reception has exactly one."]
     public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
-    parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
+    parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.meaning] for outcome in public)))
     parts += ["## `scenario.toml`", SCENARIO, "## `world.npz`", WORLD_ABOUT, table(WORLD_COLUMNS, world_rows())]
     parts += [
         "## `events.jsonl`",

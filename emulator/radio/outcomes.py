@@ -7,7 +7,6 @@ condition. The trace, checks, reports, the terminal, Rerun and the reference pag
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,173 +38,80 @@ def _has_grid(scenario: Scenario, vehicles: int) -> bool:
     return scenario.radio.sidelink is not None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Facts:
-    """All that vnet states about an outcome.
-
-    `meaning` completes "the outcome of a frame at a receiver if …" for the reference pages. `colour` is a name of
-    `emulator.pages.palette`, and `sign` a block for terminals without colours; an outcome without a colour is not
-    drawn. `is_possible(scenario, vehicles)` says whether a run can have it, whatever faults are injected.
-    """
-
-    meaning: str
-    stage: Stage | None = None
-    colour: str = ""
-    sign: str = ""
-    is_possible: Callable[[Scenario, int], bool] = _always
-
-
-IN_FLIGHT = Facts(meaning="it is in flight; no finished trace has it")
+RECEPTION, CHANNEL, SENDER, ARRIVAL = Stage
 
 
 class Outcome(IntEnum):
     """The outcome of one reception. Its number is that of the trace's internal columns, its name the public one.
 
     `pending` is the state of a reception in flight; no finished trace contains it. Numbers count up from 0.
+
+    `colour` is a name of `emulator.pages.palette`, and `sign` a block for terminals without colours; an outcome
+    without a colour is not drawn. `meaning` completes "the outcome of a frame at a receiver if …" for the reference
+    pages. `is_possible(scenario, vehicles)` says whether a run can have it, whatever faults are injected.
     """
 
     _value_: int
-    facts: Facts
+    stage: Stage | None
+    colour: str
+    sign: str
+    meaning: str
+    is_possible: Callable[[Scenario, int], bool]
 
-    def __new__(cls, number: int, facts: Facts = IN_FLIGHT) -> Self:
+    def __new__(
+        cls,
+        number: int,
+        stage: Stage | None = None,
+        colour: str = "",
+        sign: str = "",
+        meaning: str = "",
+        is_possible: Callable[[Scenario, int], bool] = _always,
+    ) -> Self:
         """Make a member that is its number, and carries its facts."""
         outcome = int.__new__(cls, number)
         outcome._value_ = number
-        outcome.facts = facts
+        outcome.stage, outcome.colour, outcome.sign = stage, colour, sign
+        outcome.meaning, outcome.is_possible = meaning, is_possible
         return outcome
 
-    pending = 0
-    delivered = (
-        1,
-        Facts(meaning="it arrived, at `arrival_ns`", stage=Stage.ARRIVAL, colour="green", sign="█"),
-    )
+    # fmt: off
+    pending = 0, None, "", "", "it is in flight; no finished trace has it"
+    delivered = 1, ARRIVAL, "green", "█", "it arrived, at `arrival_ns`"
     out_of_range = (
-        2,
-        Facts(meaning="counted in `verdict.json`, and has no row, but for a frame to this vehicle alone"),
-    )
+        2, None, "", "", "counted in `verdict.json`, and has no row, but for a frame to this vehicle alone")
     peer_cap = (
-        3,
-        Facts(
-            meaning="the receiver hears `radio.max_peers` nearer senders",
-            stage=Stage.CHANNEL,
-            colour="orange",
-            sign="░",
-            is_possible=lambda scenario, vehicles: scenario.radio.max_peers < vehicles - 1,
-        ),
-    )
+        3, CHANNEL, "orange", "░", "the receiver hears `radio.max_peers` nearer senders",
+        lambda scenario, vehicles: scenario.radio.max_peers < vehicles - 1)
     lost = (
-        4,
-        Facts(
-            meaning="by `radio.loss`, or the loss of its link in `radio.links`",
-            stage=Stage.RECEPTION,
-            colour="red",
-            sign="▒",
-            is_possible=lambda scenario, vehicles: (
-                scenario.radio.loss > 0 or isinstance(scenario.radio.links, Path)
-            ),
-        ),
-    )
-    queue_full = (
-        5,
-        Facts(meaning="the sender's queue was full", stage=Stage.SENDER, colour="blue", sign="▚"),
-    )
-    oversize = (
-        6,
-        Facts(meaning="longer than `radio.max_payload_bytes`", stage=Stage.SENDER, colour="ink", sign="▞"),
-    )
-    fault = (
-        7,
-        Facts(meaning="cut or lost by the fault in `cause`", stage=Stage.CHANNEL, colour="purple", sign="▓"),
-    )
-    receiver_down = (
-        8,
-        Facts(
-            meaning="it arrived at a vehicle that was down, at `arrival_ns`",
-            stage=Stage.ARRIVAL,
-            colour="grey",
-            sign="▤",
-        ),
-    )
+        4, RECEPTION, "red", "▒", "by `radio.loss`, or the loss of its link in `radio.links`",
+        lambda scenario, vehicles: scenario.radio.loss > 0 or isinstance(scenario.radio.links, Path))
+    queue_full = 5, SENDER, "blue", "▚", "the sender's queue was full"
+    oversize = 6, SENDER, "ink", "▞", "longer than `radio.max_payload_bytes`"
+    fault = 7, CHANNEL, "purple", "▓", "cut or lost by the fault in `cause`"
+    receiver_down = 8, ARRIVAL, "grey", "▤", "it arrived at a vehicle that was down, at `arrival_ns`"
     transport = (
-        9,
-        Facts(
-            meaning="lost between emulator and agent; in real time only, and the run is then unknown",
-            stage=Stage.ARRIVAL,
-            colour="sky",
-            sign="▥",
-            is_possible=lambda scenario, vehicles: scenario.run.pacing == "realtime",
-        ),
-    )
+        9, ARRIVAL, "sky", "▥", "lost between emulator and agent; in real time only, and the run is then unknown",
+        lambda scenario, vehicles: scenario.run.pacing == "realtime")
     faded = (
-        10,
-        Facts(
-            meaning="too weak to be detected, or to be read, with nobody else on the air",
-            stage=Stage.RECEPTION,
-            colour="sand",
-            sign="▧",
-            is_possible=lambda scenario, vehicles: scenario.radio.path_loss is not None,
-        ),
-    )
+        10, RECEPTION, "sand", "▧", "too weak to be detected, or to be read, with nobody else on the air",
+        lambda scenario, vehicles: scenario.radio.path_loss is not None)
     collided = (
-        11,
-        Facts(
-            meaning="it would have been received had nobody else been on the air",
-            stage=Stage.RECEPTION,
-            colour="rust",
-            sign="▨",
-            is_possible=lambda scenario, vehicles: scenario.radio.mac is not None,
-        ),
-    )
+        11, RECEPTION, "rust", "▨", "it would have been received had nobody else been on the air",
+        lambda scenario, vehicles: scenario.radio.mac is not None)
     held_back = (
-        12,
-        Facts(
-            meaning="congestion control gave a newer frame its place",
-            stage=Stage.SENDER,
-            colour="navy",
-            sign="▦",
-            is_possible=lambda scenario, vehicles: scenario.radio.congestion is not None,
-        ),
-    )
+        12, SENDER, "navy", "▦", "congestion control gave a newer frame its place",
+        lambda scenario, vehicles: scenario.radio.congestion is not None)
     duplicate = (
-        13,
-        Facts(
-            meaning="it was received before: its sender has missed the acknowledgement, and sent it again",
-            stage=Stage.RECEPTION,
-            colour="yellow",
-            sign="▩",
-            is_possible=lambda scenario, vehicles: bool(scenario.radio.mac and not scenario.radio.sidelink),
-        ),
-    )
+        13, RECEPTION, "yellow", "▩",
+        "it was received before: its sender has missed the acknowledgement, and sent it again",
+        lambda scenario, vehicles: bool(scenario.radio.mac and not scenario.radio.sidelink))
     half_duplex = (
-        14,
-        Facts(
-            meaning="the receiver transmitted in the same slot (sidelink)",
-            stage=Stage.RECEPTION,
-            colour="plum",
-            sign="▘",
-            is_possible=_has_grid,
-        ),
-    )
-    below_sensing = (
-        15,
-        Facts(
-            meaning="weaker than `radio.mac.sensing_dbm` (sidelink)",
-            stage=Stage.RECEPTION,
-            colour="teal",
-            sign="▝",
-            is_possible=_has_grid,
-        ),
-    )
+        14, RECEPTION, "plum", "▘", "the receiver transmitted in the same slot (sidelink)", _has_grid)
+    below_sensing = 15, RECEPTION, "teal", "▝", "weaker than `radio.mac.sensing_dbm` (sidelink)", _has_grid
     no_grant = (
-        16,
-        Facts(
-            meaning="its sender may use no more of the channel, or its own frames have the slots (sidelink)",
-            stage=Stage.SENDER,
-            colour="slate",
-            sign="▖",
-            is_possible=_has_grid,
-        ),
-    )
+        16, SENDER, "slate", "▖",
+        "its sender may use no more of the channel, or its own frames have the slots (sidelink)", _has_grid)
+    # fmt: on
 
     @property
     def title(self) -> str:
@@ -215,11 +121,11 @@ class Outcome(IntEnum):
 
 def decided_at(*stages: Stage) -> tuple[str, ...]:
     """Names of the outcomes that are decided at these stages."""
-    return tuple(outcome.name for outcome in Outcome if outcome.facts.stage in stages)
+    return tuple(outcome.name for outcome in Outcome if outcome.stage in stages)
 
 
-_LOST = [outcome for outcome in Outcome if outcome.facts.colour and outcome is not Outcome.delivered]
-DRAWN = (Outcome.delivered, *sorted(_LOST, key=lambda outcome: (outcome.facts.stage or 0, outcome)))
+_LOST = [outcome for outcome in Outcome if outcome.colour and outcome is not Outcome.delivered]
+DRAWN = (Outcome.delivered, *sorted(_LOST, key=lambda outcome: (outcome.stage or 0, outcome)))
 """Outcomes of receptions in range in the order in which they are stacked: delivered first, then by stage."""
 PENDING, OUT_OF_RANGE = Outcome.pending.value, Outcome.out_of_range.value
 """The same as plain numbers, with which numpy compares ten times as fast."""

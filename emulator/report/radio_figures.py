@@ -35,7 +35,7 @@ from vnet.errors import VnetError, printable
 from vnet.types import Array, IntArray
 from vnet.units import NS_PER_S
 
-OUTCOME_COLOURS = {outcome.name: PALETTE[outcome.facts.colour].light for outcome in DRAWN}
+OUTCOME_COLOURS = {outcome.name: PALETTE[outcome.colour].light for outcome in DRAWN}
 MOST_BINS = 80
 MOST_BARS = 10
 

@@ -285,7 +285,7 @@ def _outcome(name: str) -> tuple[str, str, bool]:
     if name not in Outcome.__members__:
         return printable(name), "ink", False
     outcome = Outcome[name]
-    return outcome.title, outcome.facts.colour or "ink", outcome.facts.stage is Stage.SENDER
+    return outcome.title, outcome.colour or "ink", outcome.stage is Stage.SENDER
 
 
 # Which lanes and which time come first.

@@ -38,9 +38,7 @@ Words = tuple[str, Style]
 GREEN, RED, ORANGE, SKY = (Style(color=PALETTE[name].either) for name in ("green", "red", "orange", "sky"))
 PLAIN, BOLD, DIM = Style(), Style(bold=True), Style(dim=True)
 BAD = RED + BOLD
-OUTCOMES = {
-    outcome.name: (Style(color=PALETTE[outcome.facts.colour].either), outcome.facts.sign) for outcome in DRAWN
-}
+OUTCOMES = {outcome.name: (Style(color=PALETTE[outcome.colour].either), outcome.sign) for outcome in DRAWN}
 """Style and sign of each outcome; signs tell them apart where there are no colours."""
 HEIGHTS = "▁▂▃▄▅▆▇"  # and not the full block, which would run into the row above
 SMALLEST_FACTOR = 4.0

@@ -29,7 +29,7 @@ TIMELINE = "emulated time"
 BLUE, SKY, GREEN, ORANGE, RED, PURPLE, GREY, DARK = (
     PALETTE[name].rgb for name in ("blue", "sky", "green", "orange", "red", "purple", "grey", "ink")
 )
-OUTCOME_COLOURS: dict[Outcome, Colour] = {outcome: PALETTE[outcome.facts.colour].rgb for outcome in DRAWN}
+OUTCOME_COLOURS: dict[Outcome, Colour] = {outcome: PALETTE[outcome.colour].rgb for outcome in DRAWN}
 """In the order in which they are stacked."""
 
 POSITION = Estimate(

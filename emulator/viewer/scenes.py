@@ -728,7 +728,7 @@ def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
     """The outcomes that no reception of this run can have, whatever faults are injected."""
     scenario = parse_recorded_scenario(scene["scenario"], Path(SCENARIO_FILE))
     vehicles = len(scene["node_ids"])
-    return {outcome for outcome in Outcome if not outcome.facts.is_possible(scenario, vehicles)}
+    return {outcome for outcome in Outcome if not outcome.is_possible(scenario, vehicles)}
 
 
 def in_reach(radio: Mapping[str, Any]) -> str:

@@ -16,18 +16,9 @@ from tests.support.paths import ROOT
 
 OUTCOME = """
     jammed = (
-        17,
-        Facts(
-            meaning="an interferer was on the air",
-            stage=Stage.RECEPTION,
-            colour="quiet",
-            sign="▣",
-            is_possible=lambda scenario, vehicles: vehicles > 5,
-        ),
-    )
-
+        17, RECEPTION, "quiet", "▣", "an interferer was on the air", lambda scenario, vehicles: vehicles > 5)
 """
-BEFORE_OUTCOME = "    @property\n    def title"
+BEFORE_OUTCOME = "    # fmt: on"
 KIND = """    jammed = "jammed", "vehicle", "channel", "its radio is jammed", FAILURE, GROUPED | ENDS_PROGRAM
 """
 BEFORE_KIND = "    # fmt: on"

@@ -9,14 +9,14 @@ def test_numbers_names_and_stages() -> None:
     assert Outcome(7) is Outcome.fault and Outcome.fault.title == "fault" and Outcome.peer_cap.title == "peer cap"
     assert set(Outcome) - set(DRAWN) == {Outcome.pending, Outcome.out_of_range}
     assert DRAWN[0] is Outcome.delivered
-    staged = {outcome for outcome in Outcome if outcome.facts.stage is not None}
+    staged = {outcome for outcome in Outcome if outcome.stage is not None}
     assert staged == {*DRAWN}
     assert decided_at(Stage.SENDER) == ("queue_full", "oversize", "held_back", "no_grant")
     assert decided_at(Stage.ARRIVAL) == ("delivered", "receiver_down", "transport")
 
 
 def test_outcomes_are_told_apart_by_colour_and_by_sign() -> None:
-    colours = [PALETTE[outcome.facts.colour] for outcome in DRAWN]
+    colours = [PALETTE[outcome.colour] for outcome in DRAWN]
     for shade in ("light", "dark", "either"):
         assert len({getattr(colour, shade) for colour in colours}) == len(DRAWN)
-    assert len({outcome.facts.sign for outcome in DRAWN}) == len(DRAWN)
+    assert len({outcome.sign for outcome in DRAWN}) == len(DRAWN)
