@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,30 +17,40 @@ MOST_IN_MATRICES = 64
 """Largest number of vehicles whose links are kept as matrices of all pairs, the fastest way for few vehicles."""
 
 
-class Connectivity(Protocol):
+class Connectivity:
     """A model of the nodes in range of each other; rows are senders, and no node is in range of itself.
 
-    `position_m` (N, 2) are positions, `distance_m` (N, N) the distances between them.
+    It depends on positions alone, and all signals in range are equally strong, so that overlapping frames are lost:
+    models override what is otherwise with them. `position_m` (N, 2) are positions, `distance_m` (N, N) the
+    distances between them.
     """
 
     @property
     def changes_ns(self) -> IntArray:
         """Times at which the model changes, sorted, each once; none if it depends on positions alone."""
+        return np.zeros(0, np.int64)
 
     def at(self, time_ns: int) -> Connectivity:
         """Return the model as it is at a time."""
+        return self
 
     def losses(self, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Array | None:
         """Return the loss probabilities (n,) of pairs in range; None if they are `radio.loss`."""
+        return None
 
     def links(self, position_m: Array) -> Links:
         """Return the pairs of a sender and a receiver in its range."""
+        raise NotImplementedError
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """Return the mask (N, N) of receivers (columns) in range of each sender (rows)."""
+        raise NotImplementedError
 
     def power_mw(self, position_m: Array, distance_m: Array) -> Array:
         """Return the mean received power (N, N) in mW, 0 out of range; the diagonal is the transmit power."""
+        power_mw = self.in_range(position_m, distance_m).astype(float)
+        np.fill_diagonal(power_mw, 1.0)
+        return power_mw
 
 
 def connectivity_of(radio: Radio, seed: int, inputs: RadioInputs | None = None) -> Connectivity:
@@ -75,42 +84,7 @@ def distances_m(position_m: Array) -> Array:
     return np.asarray(np.hypot(offset_m[..., 0], offset_m[..., 1]))
 
 
-class _Timeless:
-    """A model that depends on positions alone, and leaves losses to `radio.loss`."""
-
-    @property
-    def changes_ns(self) -> IntArray:
-        """See `Connectivity`."""
-        return np.zeros(0, np.int64)
-
-    def at(self, time_ns: int) -> Self | Measured:
-        """See `Connectivity`."""
-        return self
-
-    def losses(self, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Array | None:
-        """See `Connectivity`."""
-        return None
-
-
-class _EqualPower(_Timeless):
-    """Connectivity without a path loss: all signals in range are equally strong, so overlapping frames are lost."""
-
-    def links(self, position_m: Array) -> Links:
-        """See `Connectivity`."""
-        raise NotImplementedError
-
-    def in_range(self, position_m: Array, distance_m: Array) -> Mask:
-        """See `Connectivity`."""
-        raise NotImplementedError
-
-    def power_mw(self, position_m: Array, distance_m: Array) -> Array:
-        """See `Connectivity`."""
-        power_mw = self.in_range(position_m, distance_m).astype(float)
-        np.fill_diagonal(power_mw, 1.0)
-        return power_mw
-
-
-class Disc(_EqualPower):
+class Disc(Connectivity):
     """Unit disc: all nodes within `range_m`, and no others."""
 
     def __init__(self, range_m: float) -> None:
@@ -125,7 +99,7 @@ class Disc(_EqualPower):
         return _without_itself(distance_m <= self._range_m)
 
 
-class Matrix(_EqualPower):
+class Matrix(Connectivity):
     """Links given by a matrix, independent of positions."""
 
     def __init__(self, links: Mask) -> None:
@@ -140,7 +114,7 @@ class Matrix(_EqualPower):
         return _without_itself(self._links.T & np.isfinite(distance_m))
 
 
-class Measured(_EqualPower):
+class Measured(Connectivity):
     """Links given by a table over time, independent of positions, as they are at `time_ns`."""
 
     def __init__(self, table: LinkTable, time_ns: int = 0, loss: Array | None = None) -> None:
@@ -174,7 +148,7 @@ class Measured(_EqualPower):
         return self.links(position_m).matrix()
 
 
-class AboveFloor(_Timeless):
+class AboveFloor(Connectivity):
     """All nodes whose mean received power is at least `floor_dbm`, behind buildings too."""
 
     def __init__(self, mean: MeanPower, floor_dbm: float, obstacles: Obstacles | None = None) -> None:
