@@ -36,7 +36,6 @@ from emulator.radio.frames import (
     Transmission,
     UnicastResult,
     allowed_choices,
-    allowed_period_ms,
     flipped,
 )
 from emulator.radio.mac import Mac, TransmitQueue
@@ -471,7 +470,7 @@ class Engine:
             ticket, self._trace.acknowledges = self._unicasts.register(node, asked.number), True
         if (gain_db, bitrate_mbps) != (0.0, self._radio.bitrate_mbps):
             self._trace.begin_choices(self._radio.bitrate_mbps)
-        period_ms = allowed_period_ms(self._periods_ms, asked)
+        period_ms = int(asked.period_ms) if asked.period_ms in self._periods_ms else 0
         self._trace.tells_periods |= period_ms > 0
         return {
             "gain_db": gain_db,

@@ -72,11 +72,6 @@ def allowed_choices(radio: Radio, asked: SentFrame, largest_dbm: float | None) -
     return gain_db, bitrate_mbps
 
 
-def allowed_period_ms(periods_ms: tuple[int, ...], asked: SentFrame) -> int:
-    """Return the reservation interval that a program has asked for; 0 for none, or one that is not among these."""
-    return int(asked.period_ms) if asked.period_ms in periods_ms else 0
-
-
 class InSlot(NamedTuple):
     """A sidelink's transmission in a slot, on `length` subchannels: (N,) each over the receivers.
 

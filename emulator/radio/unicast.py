@@ -124,8 +124,6 @@ class Unicasts:
         self._results: list[UnicastResult] = []
         self._duplicates: list[tuple[int, int, int, Transmission]] = []
         """Heap of attempts received once more: arrival time, row, addressee, and the attempt received first."""
-        self.counts = {"sent": 0, "delivered": 0, "attempts": 0}
-        """Frames to single vehicles whose results are known, those acknowledged, and transmissions."""
 
     @property
     def are_open(self) -> bool:
@@ -153,9 +151,6 @@ class Unicasts:
     def _conclude(self, ticket: int, delivered: bool, attempts: int, time_ns: int) -> None:
         if asked := self._open.pop(ticket, None):
             heappush(self._results, UnicastResult(time_ns + self._delay_ns, *asked, delivered, attempts))
-            self.counts["sent"] += 1
-            self.counts["delivered"] += delivered
-            self.counts["attempts"] += attempts
 
     def note_duplicates(
         self,
