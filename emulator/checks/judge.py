@@ -478,7 +478,7 @@ def _own_findings(recorded: OpenedRun, folder: Path, own_checks: bool, checks: S
     if not own_checks:  # the folder has no say in where modules come from
         program = program.model_copy(update={"checks": (), "folders": ()})
         found = {finding.name: finding for finding in recorded_findings(recorded.record)}
-    program = with_modules(program, None, checks)
+    program, _ = with_modules(program, (), None, checks)
     load_checks(program)
     return list(
         (found | {finding.name: finding for finding in own_findings(program, Run(recorded, folder))}).values()

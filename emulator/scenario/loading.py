@@ -30,8 +30,8 @@ from pydantic import ValidationError
 from emulator.scenario.faults import DEFAULT_RULE, RENAMED_SELECTORS, Fault, OwnRule
 from emulator.scenario.network import LIBSUMO, input_files, libsumo_build
 from emulator.scenario.program import Program, from_here, split_file, with_programs
-from emulator.scenario.scenario import Scenario, WorldSection
-from emulator.scenario.sections import first_problem
+from emulator.scenario.scenario import Scenario
+from emulator.scenario.sections import Section, first_problem
 from vnet.bounded import read_bounded
 from vnet.errors import OverrideError, ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.runtime.own_packages import OWN
@@ -57,6 +57,7 @@ DEFAULT_FUNCTIONS = {
 """Functions of a file that is named without one, by key."""
 P = ParamSpec("P")
 T = TypeVar("T")
+AnySection = TypeVar("AnySection", bound=Section)
 Source = str | Path | Mapping[str, Any] | Scenario
 DATA = Path("scenario")
 """The name of plain data in messages. Relative paths in it are taken from the current folder."""
@@ -203,20 +204,15 @@ def _value(text: str) -> Any:
         return text.strip()
 
 
-def with_modules(program: Program, base: Path | None, checks: Sequence[str] = (), source: str = "") -> Program:
-    """Return `[program]` with every file as a module, with `checks` after its own, and with absolute `folders`.
+def with_modules(
+    program: Program, faults: Sequence[Fault], base: Path | None, checks: Sequence[str] = (), source: str = ""
+) -> tuple[Program, tuple[Fault, ...]]:
+    """Return `[program]` and faults with every file as a module, `checks` after its own, and absolute `folders`.
 
     Modules are looked for in `program.folders`, in `base`, the folder of the scenario, and in the current one.
     `source` is what messages call the scenario. Raises ScenarioError for a file or folder that is not there.
     """
-    return with_rules(program, (), base, checks, source)[0]
-
-
-def with_rules(
-    program: Program, faults: Sequence[Fault], base: Path | None, checks: Sequence[str] = (), source: str = ""
-) -> tuple[Program, tuple[Fault, ...]]:
-    """Return the same, and the faults with the rules of the user's own as modules in `program.folders`."""
-    found = _Modules(program.folders, base, f"{source}: " if source else "")
+    found = _Modules(program.folders, base, source)
     exceptions = [
         each.model_copy(update={"entry": found.entry("program.entry", each.entry)}) for each in program.exceptions
     ]
@@ -231,36 +227,11 @@ def with_rules(
     return program.model_copy(update={**data, "folders": found.folders}), ruled
 
 
-def with_network(program: Program, function: str, base: Path | None, source: str) -> tuple[Program, str]:
-    """Return `[program]` with the folder of the function of `[network]`, and that as `module:function`.
-
-    Raises ScenarioError for a file that is not there.
-    """
-    found = _Modules(program.folders, base, f"{source}: " if source else "")
-    entry = found.entry("network.function", function)
-    return program.model_copy(update={"folders": found.folders}), entry
-
-
-def with_sensors(
-    program: Program, world: WorldSection, base: Path | None, source: str
-) -> tuple[Program, WorldSection]:
-    """Return `[program]` with the folders of the models of `[world.sensor]`, and `[world]` with them as modules.
-
-    Raises ScenarioError for a file that is not there.
-    """
-    found = _Modules(program.folders, base, f"{source}: " if source else "")
-    sensors = {
-        name: sensor.model_copy(update={"model": found.entry("world.sensor.model", sensor.model)})
-        for name, sensor in world.sensor.items()
-    }
-    return program.model_copy(update={"folders": found.folders}), world.model_copy(update={"sensor": sensors})
-
-
 class _Modules:
     """The folders of a scenario's modules, as they are found."""
 
     def __init__(self, given: Iterable[Path], base: Path | None, source: str) -> None:
-        self._source = source
+        self._source = f"{source}: " if source else ""
         self._given = [self._folder(path, base) for path in given]
         self._searched = list(dict.fromkeys([*self._given, *filter(None, [base]), Path.cwd()]))
         self._of_files: dict[str, Path] = {}
@@ -399,13 +370,20 @@ def with_own_modules(
     The arguments and exceptions are those of `with_modules`.
     """
     program = with_programs(scenario.program, scenario.roadside)
-    program, faults = with_rules(program, scenario.fault, base, checks, source)
+    program, faults = with_modules(program, scenario.fault, base, checks, source)
     network, world = scenario.network, scenario.world
     if network.function is not None:
-        program, function = with_network(program, network.function, base, source)
-        network = network.model_copy(update={"function": function})
+        found = _Modules(program.folders, base, source)
+        network = network.model_copy(update={"function": found.entry("network.function", network.function)})
+        program = program.model_copy(update={"folders": found.folders})
     if world.sensor:
-        program, world = with_sensors(program, world, base, source)
+        found = _Modules(program.folders, base, source)
+        sensors = {
+            name: sensor.model_copy(update={"model": found.entry("world.sensor.model", sensor.model)})
+            for name, sensor in world.sensor.items()
+        }
+        world = world.model_copy(update={"sensor": sensors})
+        program = program.model_copy(update={"folders": found.folders})
     parts = {"program": program, "fault": faults, "network": network, "world": world}
     return scenario.model_copy(update=parts)
 
@@ -459,39 +437,15 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
-    network, radio = scenario.network, scenario.radio
-    if network.path is not None:
-        path = _absolute(network.path, "network.path", scenario_path)
-        network = network.model_copy(update={"path": path})
-    if isinstance(radio.links, Path):
-        path = _absolute(radio.links, "radio.links", scenario_path)
-        radio = radio.model_copy(update={"links": path})
-    if radio.buildings is not None and radio.buildings.path is not None:
-        path = _absolute(radio.buildings.path, "radio.buildings.path", scenario_path)
-        radio = radio.model_copy(update={"buildings": radio.buildings.model_copy(update={"path": path})})
-    roads = scenario.map
-    if roads is not None:
-        roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})
-    run = scenario.run
-    if isinstance(run.tape, Path):
-        run = run.model_copy(update={"tape": _absolute(run.tape, "run.tape", scenario_path)})
-    world = _world_of(scenario, scenario_path)
-    parts: dict[str, Any] = {"run": run, "network": network, "radio": radio, "map": roads, "world": world}
-    if (sessions := scenario.program.zenoh) is not None:
-        files = {name: path for name, path in sessions if isinstance(path, Path)}
-        files = {name: _absolute(path, f"program.zenoh.{name}", scenario_path) for name, path in files.items()}
-        program = scenario.program.model_copy(update={"zenoh": sessions.model_copy(update=files)})
-        parts["program"] = program
-    return scenario.model_copy(update=parts)
-
-
-def _world_of(scenario: Scenario, scenario_path: Path) -> WorldSection:
-    common = scenario.world.common_error
-    if common.path is None:
-        return scenario.world
-    path = _absolute(common.path, "world.common_error.path", scenario_path)
-    return scenario.world.model_copy(update={"common_error": common.model_copy(update={"path": path})})
+def _with_absolute_paths(section: AnySection, scenario_path: Path, key: str = "") -> AnySection:
+    """Return a section in which the paths of files are absolute, those of the sections within it, too."""
+    absolute: dict[str, Any] = {}
+    for name, value in section:
+        if isinstance(value, Path):
+            absolute[name] = _absolute(value, f"{key}{name}", scenario_path)
+        elif isinstance(value, Section):
+            absolute[name] = _with_absolute_paths(value, scenario_path, f"{key}{name}.")
+    return section.model_copy(update=absolute)
 
 
 def _absolute(given: Path, key: str, scenario_path: Path) -> Path:

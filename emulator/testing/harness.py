@@ -32,7 +32,7 @@ from emulator.records.events import Event
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.scenario.faults import LONGEST_S, Fault, OwnRule, parse_fault, refuse_router_restart
-from emulator.scenario.loading import with_rules
+from emulator.scenario.loading import with_modules
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError, VnetError
 from vnet.units import NS_PER_S
@@ -221,7 +221,7 @@ class RunHarness:
             return self._emulation.inject(fault, self._now_ns - 1)
         program = self.scenario.program
         program = program.model_copy(update={"folders": (*program.folders, *self._folders)})
-        program, (ruled,) = with_rules(program, [fault], None)
+        program, (ruled,) = with_modules(program, [fault], None)
         assert isinstance(ruled, OwnRule)
         return self._emulation.inject_rule(ruled, program, self._now_ns - 1)
 
