@@ -29,7 +29,6 @@ from xml.parsers import expat
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
@@ -353,7 +352,7 @@ def write_trips(motion: Motion, path: Path, rate_hz: float) -> int:
     )
     try:
         if path.suffix.lower() == ".csv":
-            pyarrow.csv.write_csv(table, path)
+            pacsv.write_csv(table, path)
         else:
             pq.write_table(table, path.absolute())  # a colon would make it an address
     except OSError as error:

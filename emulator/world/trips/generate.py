@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.world.maps.roads import NAMES, VEHICLE_WIDTH_M, Ints, Roads
+from emulator.world.maps.roads import MIN_HALF_WIDTH_M, NAMES, VEHICLE_WIDTH_M, Ints, Roads
 from emulator.world.trips.motion import MOST_STATES, SHORTEST_STAY_S, Motion, lateral_offsets_m
 from vnet.errors import ScenarioError
 from vnet.extras import require
@@ -57,8 +57,6 @@ PARKED_OFFSET_M, PARKED_S = (7.0, 18.0), (5.0, 40.0)
 """Ranges of a parking lot's distance from the lane, and of the time that a vehicle stays there."""
 LATERAL_SIGMA_M, LATERAL_TAU_S = 0.3, 20.0
 """Standard deviation and time constant of the lateral offset in a lane."""
-MIN_HALF_WIDTH_M = 0.3
-"""Least bound of the lateral offset, in a lane hardly wider than the vehicle."""
 SLOWEST_SHARE, FASTEST_SHARE = 0.85, 1.05
 """Range of a vehicle's speed relative to the streets' free-flow speeds."""
 STEP_M, SMOOTH_STEPS = 1.0, 5
@@ -245,11 +243,10 @@ class _Trip:
         self._leaves_s = max(enters_s + stays_s, enters_s + SHORTEST_STAY_S) if early else math.inf
         route = network.route(rng, FASTEST_SHARE * stays_s)
         edge = network.edge(route[:-1], route[1:])
-        lane = _Lane(network, edge, int(rng.integers(16)), side)
-        line_m, speed_m_s, crossing = lane.line(route)
+        offset_m, self._half_width_m = _lane(network.streets, edge, int(rng.integers(16)), side)
+        line_m, speed_m_s, crossing = _centre_line(network, route, offset_m, network.streets.speed_m_s[edge])
         if parked:
             line_m, speed_m_s, crossing = _from_parking_lot(rng, line_m, speed_m_s, crossing, side.sign)
-        self._half_width_m = lane.half_width_m
         self._follow(line_m, speed_m_s * rng.uniform(SLOWEST_SHARE, FASTEST_SHARE), crossing, parked, enters_s)
 
     def _follow(self, line_m: Array, speed_m_s: Array, crossing: Array, parked: bool, enters_s: float) -> None:
@@ -300,47 +297,48 @@ class _Trip:
         return np.asarray(offset[moves])
 
 
-class _Lane:
-    """The lane of a route: on each street lane `number` from the right, modulo the lanes in this direction."""
+def _lane(streets: Streets, edge: Ints, number: int, side: Side) -> tuple[Array, float]:
+    """Return the offsets (n,) of a lane to the right of the edges (n,) of a route, and half its least width.
 
-    def __init__(self, network: StreetNetwork, edge: Ints, number: int, side: Side) -> None:
-        streets = network.streets
-        roads = streets.roads
-        self._network, self._node_m = network, roads.node_m
-        road, against = streets.road[edge], streets.against[edge] > 0
-        count = np.where(against, roads.backward[road], roads.forward[road])
-        both = roads.forward[road] + roads.backward[road]
-        width_m = roads.lane_width_m[road]
-        # Lanes are counted from the road's edge, half its width from its centre line.
-        from_right = np.minimum(number % np.maximum(count, 1), count - 1) + 0.5
-        self._offset_m = side.sign * (both / 2 - from_right) * width_m + side.aside_m
-        self._speed_m_s = streets.speed_m_s[edge]
-        self.half_width_m = max(float(((width_m - VEHICLE_WIDTH_M) / 2).min()), MIN_HALF_WIDTH_M)
+    On each street it is lane `number` from the right, modulo the lanes in this direction.
+    """
+    roads = streets.roads
+    road, against = streets.road[edge], streets.against[edge] > 0
+    count = np.where(against, roads.backward[road], roads.forward[road])
+    both = roads.forward[road] + roads.backward[road]
+    width_m = roads.lane_width_m[road]
+    # Lanes are counted from the road's edge, half its width from its centre line.
+    from_right = np.minimum(number % np.maximum(count, 1), count - 1) + 0.5
+    half_width_m = max(float(((width_m - VEHICLE_WIDTH_M) / 2).min()), MIN_HALF_WIDTH_M)
+    return side.sign * (both / 2 - from_right) * width_m + side.aside_m, half_width_m
 
-    def line(self, route: Ints) -> tuple[Array, Array, Array]:
-        """Return the lane's centre line (n, 2), the speed from each point on, and a mask of points at crossings."""
-        node_m = self._node_m[route]
-        step = np.diff(node_m, axis=0)
-        length_m = np.maximum(np.hypot(*step.T), 1e-6)
-        ahead = step / length_m[:, None]
-        right = np.column_stack([ahead[:, 1], -ahead[:, 0]])
-        start = node_m[:-1] + self._offset_m[:, None] * right
-        end = node_m[1:] + self._offset_m[:, None] * right
-        heading = np.arctan2(ahead[:, 1], ahead[:, 0])
-        turn = np.abs(np.mod(np.diff(heading) + np.pi, 2 * np.pi) - np.pi)
-        points, speed, crossing = [start[:1]], [self._speed_m_s[0]], [False]
-        is_crossing = self._network.is_crossing[route[1:-1]]
-        for k in range(len(turn)):
-            if turn[k] > CORNER_RAD:
-                cut = min(CORNER_M, 0.45 * length_m[k], 0.45 * length_m[k + 1])
-                arc = _arc(end[k] - cut * ahead[k], ahead[k], start[k + 1] + cut * ahead[k + 1], ahead[k + 1])
-            else:
-                arc = (end[k : k + 1] + start[k + 1 : k + 2]) / 2
-            points.append(arc)
-            speed += [self._speed_m_s[k + 1]] * len(arc)
-            crossing += [bool(is_crossing[k])] + [False] * (len(arc) - 1)
-        points.append(end[-1:])
-        return np.concatenate(points), np.array(speed), np.array([*crossing, False])
+
+def _centre_line(
+    network: StreetNetwork, route: Ints, offset_m: Array, edge_speed_m_s: Array
+) -> tuple[Array, Array, Array]:
+    """Return a lane's centre line (n, 2), the speed from each point on, and a mask of points at crossings."""
+    node_m = network.streets.roads.node_m[route]
+    step = np.diff(node_m, axis=0)
+    length_m = np.maximum(np.hypot(*step.T), 1e-6)
+    ahead = step / length_m[:, None]
+    right = np.column_stack([ahead[:, 1], -ahead[:, 0]])
+    start = node_m[:-1] + offset_m[:, None] * right
+    end = node_m[1:] + offset_m[:, None] * right
+    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    turn = np.abs(np.mod(np.diff(heading) + np.pi, 2 * np.pi) - np.pi)
+    points, speed, crossing = [start[:1]], [edge_speed_m_s[0]], [False]
+    is_crossing = network.is_crossing[route[1:-1]]
+    for k in range(len(turn)):
+        if turn[k] > CORNER_RAD:
+            cut = min(CORNER_M, 0.45 * length_m[k], 0.45 * length_m[k + 1])
+            arc = _arc(end[k] - cut * ahead[k], ahead[k], start[k + 1] + cut * ahead[k + 1], ahead[k + 1])
+        else:
+            arc = (end[k : k + 1] + start[k + 1 : k + 2]) / 2
+        points.append(arc)
+        speed += [edge_speed_m_s[k + 1]] * len(arc)
+        crossing += [bool(is_crossing[k])] + [False] * (len(arc) - 1)
+    points.append(end[-1:])
+    return np.concatenate(points), np.array(speed), np.array([*crossing, False])
 
 
 def _arc(start: Array, ahead: Array, end: Array, then: Array) -> Array:

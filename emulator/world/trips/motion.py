@@ -177,10 +177,8 @@ class Samples:
         wrong = ours[same & ((step_s < 0) | ((step_s == 0) & moved))]
         if len(wrong):
             raise self._out_of_order(int(wrong.min()), len(before["code"]), both, order, line)
-        self._last = {
-            name: values[np.append(~same, True) if len(order) else []]
-            for name, values in _sorted_columns(both, order)
-        }
+        last = order[np.append(~same, True)] if len(order) else order
+        self._last = {name: values[last] for name, values in both.items()}
         new = np.ones(len(order), dtype=bool)
         new[ours[same & (step_s == 0)]] = False
         return new[len(before["code"]) :]
@@ -255,10 +253,6 @@ class Samples:
         latitude_deg, longitude_deg = columns["lat_deg"], columns["lon_deg"]
         self.origin_deg = origin_deg or middle_deg(latitude_deg, longitude_deg)
         return project(self._path, latitude_deg, longitude_deg, self.origin_deg)[1]
-
-
-def _sorted_columns(columns: dict[str, Array], order: NDArray[np.intp]) -> list[tuple[str, Array]]:
-    return [(name, values[order]) for name, values in columns.items()]
 
 
 def lateral_offsets_m(normal: Array, sigma_m: float, correlation: float, half_width_m: float) -> Array:
