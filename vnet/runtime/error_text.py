@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import Any
 
 NOT_THE_PROGRAM = (
@@ -49,6 +49,14 @@ def own_line(error: BaseException) -> str:
     leaf = leaves(error)[0]
     traces = [each.__traceback__ for each in ([error, leaf] if leaf is not error else [leaf])]
     return line_of(frame for trace in traces for frame in traceback.walk_tb(trace))
+
+
+def of_program(trace: TracebackType | None) -> TracebackType | None:
+    """Return a traceback without the frames of vnet that lead to the program; all of it if it has no others."""
+    inner = trace
+    while inner is not None and inner.tb_frame.f_code.co_filename.startswith(NOT_THE_PROGRAM[0]):
+        inner = inner.tb_next
+    return inner or trace
 
 
 def line_of_caller() -> str:

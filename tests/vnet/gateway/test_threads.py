@@ -314,8 +314,7 @@ def test_crash_of_main_is_a_crash_of_its_vehicle_with_its_line(drive: Drive) -> 
     assert (crash["node"], crash["place"]) == ("v01", "program0.py:3")
     assert "ZeroDivisionError" in crash["error"]
     files = [line.split('"')[1] for line in log(run) if line.startswith("  File")]
-    assert files[-1].endswith("program0.py")
-    assert sum("gateway/emulated" in file for file in files) == 1, "frames of vnet's own tell nothing"
+    assert [Path(file).name for file in files] == ["program0.py"], "frames of vnet's own tell nothing"
 
 
 def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None:

@@ -220,6 +220,8 @@ def test_a_program_that_raises_ends_its_node_and_no_other() -> None:
         ("v1", "crashed", "ValueError: no idea"),
         ("v2", "finished", ""),
     ]
+    first = world.endings[0].details.splitlines()[1]
+    assert __file__ in first, "a traceback begins in the program"
     assert "raise ValueError" in world.endings[0].details
     frames = [frame for traffic in world.traffic for frame in traffic.frames]
     assert [(frame.node, frame.payload) for frame in frames] == [("v2", b"still here")]

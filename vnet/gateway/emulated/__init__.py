@@ -30,6 +30,7 @@ from vnet.gateway.emulated.values import NO_STACK, Intake, Outlet, refused
 from vnet.gateway.emulated.vehicle import Vehicle
 from vnet.gateway.ros2 import Ros2
 from vnet.node import Node
+from vnet.runtime.error_text import of_program
 from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
 
@@ -129,7 +130,7 @@ async def main(node: Node) -> None:
                     tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT), environment))
     except ExceptionGroup as errors:
         error = errors.exceptions[0]
-        raise error.with_traceback(_of_program(error.__traceback__)) from None
+        raise error.with_traceback(_without_imports(error.__traceback__)) from None
     except KeyboardInterrupt:  # of the whole process, which has heard of it by the command's task
         raise asyncio.CancelledError from None
     finally:
@@ -137,17 +138,14 @@ async def main(node: Node) -> None:
             task.cancel()
 
 
-def _of_program(trace: TracebackType | None) -> TracebackType | None:
-    """Return what of a traceback is the program's, without the import system's; all of it if nothing is."""
-    inner = trace
-    while inner is not None and inner.tb_frame.f_globals.get("__name__", "").startswith("vnet."):
-        inner = inner.tb_next
-    last = inner
+def _without_imports(trace: TracebackType | None) -> TracebackType | None:
+    """Return what of a traceback is the program's, without the import system's."""
+    last = inner = of_program(trace)
     while last is not None:
         while last.tb_next is not None and _is_import(last.tb_next.tb_frame):
             last.tb_next = last.tb_next.tb_next
         last = last.tb_next
-    return inner or trace
+    return inner
 
 
 def _is_import(frame: FrameType) -> bool:
