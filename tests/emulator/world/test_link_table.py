@@ -1,6 +1,7 @@
 """Tables of links over time: what they say, on the radio and in whole runs, and what is wrong with them."""
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +217,7 @@ def test_what_is_lost_on_a_link_that_loses_nothing_is_found(measured: RecordedRu
     assert outcome.count("lost") > 20 and outcome.count("delivered") > 20
     changed = LinkTable(*(np.array(each) for each in ([0, 0], [0, 1], [1, 0], [1.0, 0.0])))
     assert sound.world is not None
-    world = type(sound.world)(**{**vars(sound.world), "link_loss": changed.loss})
+    world = replace(sound.world, radio_inputs=RadioInputs(links=changed))
     claimed = RecordedRun(sound.scenario, sound.trace, sound.states, sound.metrics, sound.events, world=world)
     for recorded, verdict in ((sound, "valid"), (claimed, "invalid")):
         assert {c.name: c.verdict.value for c in judge(recorded).checks}["loss_rate"] == verdict
