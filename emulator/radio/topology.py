@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ MOST_IN_MATRICES = 64
 """Largest number of vehicles whose links are kept as matrices of all pairs, the fastest way for few vehicles."""
 
 
-class Connectivity:
+class Connectivity(ABC):
     """A model of the nodes in range of each other; rows are senders, and no node is in range of itself.
 
     It depends on positions alone, and all signals in range are equally strong, so that overlapping frames are lost:
@@ -38,13 +39,13 @@ class Connectivity:
         """Return the loss probabilities (n,) of pairs in range; None if they are `radio.loss`."""
         return None
 
+    @abstractmethod
     def links(self, position_m: Array) -> Links:
         """Return the pairs of a sender and a receiver in its range."""
-        raise NotImplementedError
 
+    @abstractmethod
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """Return the mask (N, N) of receivers (columns) in range of each sender (rows)."""
-        raise NotImplementedError
 
     def power_mw(self, position_m: Array, distance_m: Array) -> Array:
         """Return the mean received power (N, N) in mW, 0 out of range; the diagonal is the transmit power."""
