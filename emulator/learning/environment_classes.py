@@ -56,6 +56,7 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         self._episodes = 0
         self._seed = scenario.run.seed
         self._observed: dict[str, Any] = {}
+        self._asked: set[str] = set()  # who has observed at the beginning of this step
         self.possible_agents = Episode.agents_of(scenario, build_world(scenario).node_ids)
         self.agents: list[str] = []
 
@@ -95,8 +96,8 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         self._scenes = Scenes(self._episode.emulation)
         with self._ended_by_an_error():
             turn = self._episode.next_turn()
-        self._scenes.moment(turn.time_ns, {})
-        self._observed = dict(turn.observed)
+        self._scenes.moment(turn, {})
+        self._observed, self._asked = dict(turn.observed), {*turn.observed}
         self.agents = [agent for agent in self.possible_agents if agent in turn.observed]
         return dict(turn.observed), {agent: {} for agent in self.agents}
 
@@ -106,22 +107,25 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         """Let agents act, and one period pass; return observations, rewards, terminated, truncated and infos.
 
         An agent without an action does nothing. One that gets no fix, as in an outage of its receiver, has its last
-        observation again. Raises VnetError before the first `reset`, and for an action of no living agent.
+        observation again, and does not act. Raises VnetError before the first `reset`, and for an action of no
+        living agent.
         """
         if self._episode is None:
             raise VnetError("step: the episode is over, or has not begun: reset()")
         if unknown := sorted(set(actions) - set(self.agents)):
             raise VnetError(f"step: {unknown[0]} is no living agent; there are: {', '.join(self.agents)}")
         self._episode.answer(actions)
+        done = {agent: action for agent, action in actions.items() if agent in self._asked}
         with self._ended_by_an_error():
             turn = self._episode.next_turn()
-            return self._step(self._episode, turn, self._scenes.moment(turn.time_ns, actions))
+            return self._step(self._episode, turn, self._scenes.moment(turn, done))
 
     def _step(
         self, episode: Episode, turn: Turn, moment: Moment
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Return what a step returns, that ends with this turn and this moment."""
         self._observed |= turn.observed
+        self._asked = {*turn.observed}
         entered = [agent for agent in turn.observed if agent not in {*self.agents, *episode.finished}]
         at_end = [*self.agents, *entered]
         rewards = {agent: float(self._behaviour.reward(agent, moment)) for agent in at_end}

@@ -1,7 +1,7 @@
 """Episodes: runs whose vehicles await what agents outside of the run have them do.
 
-The run is simulated on a thread of its own. A microsecond after the fixes of a period it stops, in the midst of
-emulated time, with what all agents have observed, and goes on when it is told what each is to do.
+The run is simulated on a thread of its own. A microsecond after the fixes of each period it stops, in the midst of
+emulated time, with what agents have observed, and goes on when it is told what each is to do.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from vnet.node import Fix, Node
 from vnet.radio import Packet
+from vnet.runtime.own_asyncio import current_node
 from vnet.runtime.programs import given_programs
 from vnet.types import Array
 from vnet.units import NS_PER_S
@@ -51,7 +52,7 @@ class Moment:
     position_m: (2,) in m east-north, by node, read-only; NaN for a vehicle that is not there.
     speed_m_s: speed by node, from the way since the step before (0 in the first); NaN as above.
     events: what has happened since the step before, such as `collision`.
-    actions: what each agent did in this step.
+    actions: what each agent did in this step; one that had observed nothing at its beginning did nothing.
     """
 
     time_s: float
@@ -73,10 +74,14 @@ class Behaviour:
 
 @dataclass(frozen=True)
 class Turn:
-    """Observations of agents at one instant, by node; or that the run is over, and by which error."""
+    """Observations of agents at one instant, by node; or that the run is over, and by which error.
+
+    events: all of the run until then.
+    """
 
     time_ns: int
     observed: Mapping[str, Any]
+    events: Sequence[Event]
     over: bool = False
     error: BaseException | None = None
 
@@ -94,7 +99,8 @@ class Episode:
         self._keeps = out is not None
         if self._keeps:
             self._session.folder.open(self.emulation.scenario)
-        self._asking: dict[str, tuple[Any, asyncio.Future[Any]]] = {}
+        self._asking: dict[str, tuple[int, Any, asyncio.Future[Any]]] = {}
+        self._known: set[str] = set()  # agents that have ever observed
         self._turns: SimpleQueue[Turn] = SimpleQueue()
         self._answers: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
         self._stop = threading.Event()
@@ -136,47 +142,68 @@ class Episode:
         try:
             with given_programs({ENTRY: self._vehicle}):
                 self._session.run(stop=self._stop)
+            last = Turn(self.emulation.emulated_ns, {}, self._events(), over=True)
             if self._keeps:
                 self._session.close(NO_REPLAY)
         except BaseException as error:
-            self._turns.put(Turn(0, {}, over=True, error=error))
-        else:
-            self._turns.put(Turn(self.emulation.emulated_ns, {}, over=True))
+            last = Turn(0, {}, (), over=True, error=error)
+        self._turns.put(last)
+
+    def _events(self) -> Sequence[Event]:
+        return [*self.emulation.folder.events]
 
     async def _vehicle(self, node: Node) -> None:
-        """The program of an agent."""
+        """The program of an agent; started again after a kill, it is none any more."""
+        if node.id in self._known:
+            return
         async for fix in node.gnss:
             if node.id in self.finished:
                 return
+            *_, newest = fix, *node.gnss.drain()  # after a pause there are several
             try:
-                observation = self._behaviour.observe(node, fix, node.radio.drain())
-                answered, action = await self._await_action(node.id, fix.time_ns, observation)
+                observation = self._behaviour.observe(node, newest, node.radio.drain())
+                answered, action = await self._await_action(node.id, newest.time_ns, observation)
                 if answered and (doing := self._behaviour.act(node, action)) is not None:
                     await doing
             except Exception as error:  # whoever learns is to know, and not only the run's verdict
-                self._turns.put(Turn(fix.time_ns, {}, over=True, error=error))
+                self._turns.put(Turn(newest.time_ns, {}, (), over=True, error=error))
                 raise
+            node.gnss.drain()  # the turns of these are over
 
     async def _await_action(self, node: str, fix_time_ns: int, observation: Any) -> tuple[bool, Any]:
         """Return whether the agent does anything, and what."""
         loop = asyncio.get_running_loop()
-        if not self._asking:  # a timer of nobody's: no fault stops it
-            loop.call_later(THINKING_S, self._take_turn, fix_time_ns, context=Context())
+        if not self._known:
+            nobodys = Context()  # no fault stops its timers, or sets its clock
+            nobodys.run(current_node.set, None)
+            loop.call_soon(self._schedule, loop, context=nobodys)
+        self._known.add(node)
         future: asyncio.Future[tuple[bool, Any]] = loop.create_future()
-        self._asking[node] = observation, future
+        self._asking[node] = fix_time_ns, observation, future
         answer = await future
         if self._stop.is_set():  # the run ends with this window, and its programs as if they still acted
             await asyncio.sleep(FOR_EVER_S)
         return answer
 
-    def _take_turn(self, time_ns: int) -> None:
-        """Stop emulated time until the caller has answered."""
-        asking, self._asking = self._asking, {}
-        asking = {node: each for node, each in asking.items() if not each[1].done()}  # not of killed programs
-        observed = {node: observation for node, (observation, _) in asking.items()}
-        self._turns.put(Turn(time_ns, observed))
+    def _schedule(self, loop: asyncio.AbstractEventLoop, due_s: float | None = None) -> None:
+        """Take a turn at `due_s`, or when agents that see the present fixes have observed."""
+        due_s = loop.time() + THINKING_S if due_s is None else due_s
+        loop.call_at(due_s, self._take_turn, loop, due_s)
+
+    def _take_turn(self, loop: asyncio.AbstractEventLoop, due_s: float) -> None:
+        """Stop emulated time until the caller has answered; once a period, whoever has observed.
+
+        While all vehicles are paused no timer fires; those turns are then made up for.
+        """
+        self._schedule(loop, due_s + self.emulation.world.period_ns / NS_PER_S)
+        time_ns = round((due_s - THINKING_S) * NS_PER_S)
+        waiting = {node: each for node, each in self._asking.items() if not each[2].done()}  # not killed programs
+        now = {node: each for node, each in waiting.items() if each[0] <= time_ns}
+        self._asking = {node: each for node, each in waiting.items() if node not in now}
+        observed = {node: observation for node, (_, observation, _) in now.items()}
+        self._turns.put(Turn(time_ns, observed, self._events()))
         answers = self._answers.get() or {}
-        for node, (_, future) in asking.items():
+        for node, (_, _, future) in now.items():
             future.set_result((node in answers, answers.get(node)))
 
 
@@ -189,15 +216,15 @@ class Scenes:
         self._period = 0
         self._speed = np.zeros(len(emulation.world.node_ids))
 
-    def moment(self, time_ns: int, actions: Mapping[str, Any]) -> Moment:
-        """Return the moment of a step that ends at `time_ns`."""
-        world, events = self._emulation.world, list(self._emulation.folder.events)
-        period = min(time_ns // world.period_ns, world.last_known_period)
+    def moment(self, turn: Turn, actions: Mapping[str, Any]) -> Moment:
+        """Return the moment of a step that ends with `turn`."""
+        world = self._emulation.world
+        period = min(turn.time_ns // world.period_ns, world.last_known_period)
         if period > self._period:
             way_m = world.position_m(period) - world.position_m(self._period)
             passed_s = (period - self._period) * world.period_ns / NS_PER_S
             self._speed, self._period = np.hypot(way_m[:, 0], way_m[:, 1]) / passed_s, period
-        new, self._events = events[self._events :], len(events)
+        new, self._events = turn.events[self._events :], len(turn.events)
         position_m = world.position_m(period).copy()
         position_m.flags.writeable = False  # one for the functions of all agents
         return Moment(

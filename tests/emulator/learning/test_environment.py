@@ -17,6 +17,7 @@ import emulator
 from emulator import Moment
 from vnet import Fix, Node, Packet
 from vnet.errors import VnetError
+from vnet.units import NS_PER_S
 
 ROAD = {"road": "ring", "length_m": 1000.0, "gap_m": 40.0, "speed_mps": 10.0}
 
@@ -143,11 +144,65 @@ def test_what_the_user_imports_between_steps_stays(tmp_path: Path, monkeypatch: 
     assert isinstance(pickle.loads(pickle.dumps(policy)), importlib.import_module("own_policy").Policy)
 
 
-def test_a_paused_vehicle_s_agent_has_its_last_observation() -> None:
+FAULTS: dict[str, dict[str, Any]] = {
+    "pause of one": {"kind": "pause", "nodes": ["v02"], "duration_s": 0.5},
+    "pause of all": {"kind": "pause", "duration_s": 0.5},
+    "outage of all": {"kind": "gnss_outage", "duration_s": 0.5},
+    "a clock set forward": {"kind": "skew", "nodes": ["v01"], "duration_s": 0.5, "offset_ms": 3000.0},
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("at_s", [0.0, 0.5])
+def test_a_step_is_a_period_whatever_fails(name: str, at_s: float) -> None:
+    moments: list[Moment] = []
+
+    def see_time(node: Node, fix: Fix, packets: Sequence[Packet]) -> Any:
+        return np.array([fix.time_ns / NS_PER_S, len(packets)], np.float32)
+
+    def reward(agent: str, moment: Moment) -> float:
+        moments.extend([moment] if agent == "v01" else [])
+        return 1.0
+
+    steps = play(make(observe=see_time, reward=reward, sections={"fault": [FAULTS[name] | {"at_s": at_s}]}))
+    begun = 2.0 - (at_s + 0.5 if at_s == 0.0 and name in ("pause of all", "outage of all") else 0.0)
+    assert len(steps) == 1 + round(10 * begun)
+    times = [moment.time_s for moment in moments]
+    assert times[:-1] == pytest.approx([2.0 - begun + 0.1 * (1 + step) for step in range(len(times) - 1)])
+    for step, time_s in zip(steps[1:], times[:-1], strict=False):
+        fix_s = {agent: float(seen[0]) for agent, seen in step[0].items()}
+        assert max(fix_s.values()) <= time_s + 1e-6
+        failing = at_s <= time_s < at_s + 0.5 - 1e-6
+        if not failing or name == "a clock set forward":
+            assert fix_s == pytest.approx(dict.fromkeys(fix_s, time_s), abs=1e-6)
+
+
+def test_an_agent_that_gets_no_fix_has_its_last_observation_and_does_not_act() -> None:
+    moments: list[Moment] = []
+
+    def reward(agent: str, moment: Moment) -> float:
+        moments.extend([moment] if agent == "v01" else [])
+        return 0.0
+
     fault = {"kind": "pause", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}
-    steps = play(make(sections={"fault": [fault]}))
+    steps = play(make(reward=reward, sections={"fault": [fault]}))
     assert all("v02" in step[0] for step in steps)
     assert steps[5][0]["v02"].tolist() == steps[6][0]["v02"].tolist() != steps[9][0]["v02"].tolist()
+    assert ["v02" not in moment.actions for moment in moments] == [False] * 5 + [True] * 3 + [False] * 12
+
+
+@pytest.mark.parametrize("nodes", [["v01"], ["v01", "v02", "v03", "v04"]], ids=len)
+@pytest.mark.parametrize(("at_s", "duration_s", "step"), [(0.5, 0.3, 5), (0.55, 0.01, 6)])
+def test_whoever_is_killed_is_terminated_in_that_step(
+    nodes: list[str], at_s: float, duration_s: float, step: int
+) -> None:
+    fault = {"kind": "kill", "nodes": nodes, "at_s": at_s, "duration_s": duration_s}
+    steps = play(make(sections={"fault": [fault]}))
+    for node in nodes:
+        assert [taken[2].get(node, True) for taken in steps[1:]] == [False] * (step - 1) + [True] * (
+            len(steps) - step
+        )
+    assert len(steps) == (1 + step if len(nodes) == 4 else 21)
 
 
 def test_a_function_may_end_an_agent_s_episode() -> None:
