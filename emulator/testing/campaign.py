@@ -563,7 +563,8 @@ class Campaign:
         folder = self._folder / "failures" / outcome.label
         again = self._workshop.run(shrunk, folder, apart)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
+        if not (folder / SCENARIO_FILE).exists():  # its process has died before
+            (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
         (folder / "drawn.toml").write_text(schedule_toml(outcome.scenario.fault) + "\n")
         test = regression_test(folder.name, sorted(outcome.trial.failed), self._plan.limit_s)
         (folder / TEST_FILE).write_text(test)

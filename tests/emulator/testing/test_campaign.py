@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import signal
 from collections import Counter
 from collections.abc import Iterator
@@ -74,6 +75,9 @@ def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) 
         again = json.loads((Path(row["folder"]) / "verdict.json").read_text())
         assert again["verdict"] == "invalid"
         assert row["folder"] in again["reproduce"]
+        checked = forked_commands.run([*VNET, "check", row["folder"]], capture_output=True, text=True).stdout
+        assert re.search(r"files +│ valid", checked), checked
+        assert "[code]" in (Path(row["folder"]) / "scenario.toml").read_text()
         assert 'kind = "pause"' in said
         assert row["parting"]["passing"] == "the same run without faults"
     (spared,) = [row for row in results if "failed" not in row]
