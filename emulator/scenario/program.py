@@ -66,11 +66,15 @@ PLACEHOLDER = re.compile(r"\{[a-z_]+\}", re.IGNORECASE)
 """A word that is meant to be filled in. Within a word braces may be a program's own."""
 
 
-_Variable = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+"""Names of variables that any shell takes."""
 
 
-def _check_filled_in(words: Iterable[str]) -> None:
-    """Raise ValueError for a word that is meant to be filled in, and is none of those that are."""
+def _check_words(words: Iterable[str]) -> None:
+    """Raise ValueError for what no command can be given, or is meant to be filled in and is not."""
+    words = list(words)
+    if broken := [word for word in words if "\0" in word]:
+        raise ValueError(f"{shown(broken[0])}: a NUL ends a word")
     if unknown := [word for word in words if PLACEHOLDER.fullmatch(word) and word not in FILLED_IN]:
         raise ValueError(f"{unknown[0]} is none of {', '.join(FILLED_IN)}, which are filled in")
 
@@ -81,8 +85,9 @@ class OneProgram(Section):
     command: tuple[tuple[str, ...], ...] | None = None
     """`kind = "zenoh"`: the words of the command that starts a program that speaks Zenoh, or a list of such lists.
     `{id}`, `{endpoint}` and `{port}` are filled in; `python` is vnet's own. If left out, others start them."""
-    environment: dict[_Variable, str] = Field(default_factory=dict)
-    """Variables that its commands find in their environment. The same is filled in."""
+    environment: dict[str, str] = Field(default_factory=dict)
+    """Variables that its commands have besides vnet's own. The same is filled in. The run's folder has them: no
+    place for passwords."""
     entry: Entry = _ENTRY
     """An async function of one argument, the `Node`: `package.module:function` or `file.py:function`; a file's is
     `main` if left out."""
@@ -97,14 +102,21 @@ class OneProgram(Section):
         for words in commands or ():
             if not isinstance(words, list | tuple) or not words or not all(isinstance(word, str) for word in words):
                 raise ValueError('write its words, as ["python", "talker.py", "{id}"], or a list of such lists')
-            _check_filled_in(words)
+            _check_words(words)
         return commands
+
+    @field_validator("environment")
+    @classmethod
+    def _are_variables(cls, given: dict[str, str]) -> dict[str, str]:
+        if wrong := [name for name in given if not VARIABLE.fullmatch(name)]:
+            raise ValueError(f"{shown(wrong[0])} is no variable: letters, digits and _ are allowed, a letter first")
+        _check_words(given.values())
+        return given
 
     @model_validator(mode="after")
     def _variables_are_of_commands(self) -> Self:
         if self.environment and self.command is None:
             raise ValueError("environment goes with a command")
-        _check_filled_in(self.environment.values())
         return self
 
     @property

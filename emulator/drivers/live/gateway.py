@@ -300,7 +300,7 @@ def session_environment(
     path = folder / f"{node}.json5"
     path.write_text(json.dumps(client))
     path.chmod(0o600)
-    searched = [str(STARTUP), *map(str, program.folders), inherited.get("PYTHONPATH")]
+    searched = [str(STARTUP), inherited.get("PYTHONPATH"), *map(str, program.folders)]  # as in a simulation
     python_path = os.pathsep.join(filter(None, searched))
     return {**inherited, **session_variables(node, endpoint, client, path), "PYTHONPATH": python_path}
 

@@ -139,8 +139,9 @@ class Gateways:
 
     def _check(self, node_ids: Sequence[str]) -> None:
         """Raise ProgramError for what is no command, and for vehicles without a port, before anything starts."""
-        for words in self._program.all_commands if self._starts else ():
-            _located(words)
+        for program in (self._program, *self._program.exceptions) if self._starts else ():
+            for words in program.commands if "PATH" not in program.environment else ():
+                _located(words)
         if self._starts:
             check_trust(self._settings)
         if self._settings.users is not None:
@@ -381,7 +382,8 @@ class Gateways:
         try:
             for name, words in self._commands_of(node).items():
                 environment[FAILURE] = str(self._failure_path(vehicle, name))
-                self._launcher.start_command(name, _located(words), environment, vehicle.nice)
+                found = _located(words, environment.get("PATH"))
+                self._launcher.start_command(name, found, environment, vehicle.nice)
                 vehicle.commands[name] = " ".join(words)
         except VnetError as error:
             self._say_hello(vehicle, failure=str(error))
@@ -611,9 +613,9 @@ def _groups_connected_to(port: str) -> set[int]:
     return groups
 
 
-def _located(words: Sequence[str]) -> list[str]:
-    """Return the words of a command with the path of its first. Raises ProgramError if there is no such command."""
-    found = sys.executable if words[0] in PYTHON else shutil.which(words[0])
+def _located(words: Sequence[str], path: str | None = None) -> list[str]:
+    """Return the words of a command, the first as found on `path`. Raises ProgramError if there is no such one."""
+    found = sys.executable if words[0] in PYTHON else shutil.which(words[0], path=path)
     if found is None:
         raise ProgramError(f"program.command: {shown(words[0])} is no command")
     return [found, *words[1:]]

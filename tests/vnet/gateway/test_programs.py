@@ -155,9 +155,42 @@ def test_variables_of_the_scenario_are_in_the_environment_of_each_vehicles_comma
         assert "another 3" in log(run, node)
 
 
+def test_modules_that_vehicles_share_find_the_variables_of_each(drive: Drive) -> None:
+    before = dict(os.environ)
+    run = drive(
+        """
+        import getpass, os, shutil, threading
+        from pathlib import Path
+        print(Path.home(), os.path.expandvars("$HOME"), shutil.get_terminal_size()[0], os.get_exec_path()[0])
+        thread = threading.Thread(target=lambda: print(os.path.expanduser("~"), getpass.getuser()))
+        thread.start()
+        thread.join()
+        os.environ["HOME"] = "/elsewhere"
+        print(Path.home(), os.environb[b"HOME"], os.getenvb(b"HOME"), "HOME" in os.environ)
+        del os.environ["HOME"]
+        print(os.path.expandvars("$HOME"), os.environb.get(b"HOME"))
+        """,
+        vehicles=2,
+        program={"environment": {"HOME": "/home/{id}", "COLUMNS": "33", "PATH": "/x-{id}:/bin", "LOGNAME": "{id}"}},
+    )
+    for node in ("v01", "v02"):
+        assert log(run, node)[:4] == [
+            f"/home/{node} /home/{node} 33 /x-{node}",
+            f"/home/{node} {node}",
+            "/elsewhere b'/elsewhere' b'/elsewhere' True",
+            "$HOME None",
+        ]
+    assert dict(os.environ) == before
+
+
 @pytest.mark.parametrize(
     ("environment", "text"),
-    [({"A": "{name}"}, "{name} is none of {id}"), ({"A=B": "c"}, "A=B"), ({"": "c"}, "environment")],
+    [
+        ({"A": "{name}"}, "{name} is none of {id}"),
+        ({"A=B": "c"}, "A=B"),
+        ({"": "c"}, "environment"),
+        ({"A": "\0"}, "NUL"),
+    ],
 )
 def test_variables_that_cannot_be_are_refused_when_the_scenario_is_read(
     environment: dict[str, str], text: str

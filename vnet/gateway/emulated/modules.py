@@ -23,7 +23,7 @@ import sys
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextvars import ContextVar
 from copy import copy
 from functools import cache, partial
@@ -150,6 +150,44 @@ class Variables(dict[str, str]):
     """The environment of a program: a dict that, as Python's own, has attributes."""
 
 
+class _PresentData(MutableMapping[bytes, bytes]):
+    """The variables in `os.environ` for modules that programs share: of the program whose strand runs, else vnet's."""
+
+    def __init__(self, own: MutableMapping[bytes, bytes]) -> None:
+        self._own = own
+
+    def __getitem__(self, key: bytes) -> bytes:
+        program = _present.get()
+        return self._own[key] if program is None else os.fsencode(program.environ[os.fsdecode(key)])
+
+    def __setitem__(self, key: bytes, value: bytes) -> None:
+        program = _present.get()
+        if program is None:
+            self._own[key] = value
+        else:
+            program.environ[os.fsdecode(key)] = os.fsdecode(value)
+
+    def __delitem__(self, key: bytes) -> None:
+        program = _present.get()
+        if program is None:
+            del self._own[key]
+        else:
+            del program.environ[os.fsdecode(key)]
+
+    def __iter__(self) -> Iterator[bytes]:
+        program = _present.get()
+        return iter(self._own) if program is None else map(os.fsencode, program.environ)
+
+    def __len__(self) -> int:
+        program = _present.get()
+        return len(self._own if program is None else program.environ)
+
+
+_data = _PresentData(vars(os.environ)["_data"])
+for _environ in os.environ, os.environb:
+    vars(_environ)["_data"] = _data  # as `Path.home` and `shutil.which` read it
+
+
 class ProgramModules:
     """The modules of one program of a vehicle, as `sys.modules` has them."""
 
@@ -166,7 +204,7 @@ class ProgramModules:
         self.path: list[str] = []
         self.argv: list[str] = []
         own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)
-        self.environ = Variables(os.environ | environment | own)
+        self.environ = Variables({**os.environ, **environment, **own})
         searched = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
         self._searched = [*searched, *sys.path]
         if "ros2" in node.options:

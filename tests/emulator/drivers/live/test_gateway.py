@@ -535,6 +535,6 @@ def test_commands_find_modules_in_the_folders_of_the_program(tmp_path: Path) -> 
     (tmp_path / "app" / "solo.py").write_text("print('found')")
     program = Program.model_validate({"kind": "zenoh", "command": ["python"], "folders": [str(tmp_path / "app")]})
     environment = session_environment("v01", "tcp/127.0.0.1:7447", program, tmp_path, {"PYTHONPATH": "own"})
-    assert environment["PYTHONPATH"].endswith("own")
+    assert environment["PYTHONPATH"].endswith(f"own:{tmp_path / 'app'}")  # folders come last
     ran = subprocess.run([sys.executable, "-m", "solo"], env=environment, cwd=tmp_path, capture_output=True)
     assert ran.stdout == b"found\n"
