@@ -61,6 +61,8 @@ def environment(
             name, space, callable(space) or isinstance(space, spaces.Space), "a space of gymnasium, or a function"
         )
     loaded = scenario_of(scenario, {**(set or {}), "program.entry": ENTRY, "run.pacing": "lockstep"})
+    if loaded.run.order == "pct" and loaded.run.order_steps is None:
+        raise VnetError('environment: run.order = "pct" needs run.order_steps: a run without actions counts none')
     say = Behaviour(observe, act, reward, terminated or (lambda agent, moment: False))
     return VehicleEnvironment(loaded, say, observation_space, action_space, None if out is None else Path(out))
 

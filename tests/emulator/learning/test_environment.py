@@ -124,12 +124,21 @@ def test_an_episode_with_a_kill_that_ends_is_valid_and_one_that_is_left_early_is
     fault = {"kind": "kill", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}
     env = make(sections={"fault": [fault]}, out=tmp_path)
     play(env)
-    env.reset(seed=2)
-    env.step({})
+    for steps in (1, 5, 8):  # as a fault begins, and as it ends
+        env.reset(seed=2)
+        for _ in range(steps):
+            env.step({})
     env.close()
     folders = sorted(path for path in tmp_path.iterdir() if path.is_dir())
     verdicts = [emulator.Run.open(folder).verdict for folder in folders]
-    assert [verdict.value for verdict in verdicts] == ["valid", "unknown"]
+    assert [verdict.value for verdict in verdicts] == ["valid", "unknown", "unknown", "unknown"]
+
+
+def test_an_order_whose_decisions_nobody_can_count_is_refused() -> None:
+    with pytest.raises(VnetError, match="order_steps"):
+        make(set={"run.order": "pct"})
+    env = make(set={"run.order": "pct", "run.order_steps": 50})
+    assert len(play(env)) == 21
 
 
 def test_what_the_user_imports_between_steps_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
