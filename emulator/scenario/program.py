@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from emulator.scenario.sections import DAY_S, FAR_M, Section
 from vnet.errors import ScenarioError, shown
-from vnet.gateway import FILLED_IN
+from vnet.gateway import FILLED_IN, SESSION_VARIABLES
 
 _MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
@@ -86,8 +86,8 @@ class OneProgram(Section):
     """`kind = "zenoh"`: the words of the command that starts a program that speaks Zenoh, or a list of such lists.
     `{id}`, `{endpoint}` and `{port}` are filled in; `python` is vnet's own. If left out, others start them."""
     environment: dict[str, str] = Field(default_factory=dict)
-    """Variables that its commands have besides vnet's own. The same is filled in. The run's folder has them: no
-    place for passwords."""
+    """`kind = "zenoh"`: variables that the commands have besides vnet's own, filled in as their words. Exceptions
+    have their own. The run's folder has them: no place for passwords."""
     entry: Entry = _ENTRY
     """An async function of one argument, the `Node`: `package.module:function` or `file.py:function`; a file's is
     `main` if left out."""
@@ -110,6 +110,8 @@ class OneProgram(Section):
     def _are_variables(cls, given: dict[str, str]) -> dict[str, str]:
         if wrong := [name for name in given if not VARIABLE.fullmatch(name)]:
             raise ValueError(f"{shown(wrong[0])} is no variable: letters, digits and _ are allowed, a letter first")
+        if told := [name for name in given if name in SESSION_VARIABLES]:
+            raise ValueError(f"{told[0]} is vnet's to set")
         _check_words(given.values())
         return given
 

@@ -190,6 +190,7 @@ def test_modules_that_vehicles_share_find_the_variables_of_each(drive: Drive) ->
         ({"A=B": "c"}, "A=B"),
         ({"": "c"}, "environment"),
         ({"A": "\0"}, "NUL"),
+        ({"VNET_NODE": "v07"}, "VNET_NODE is vnet's"),
     ],
 )
 def test_variables_that_cannot_be_are_refused_when_the_scenario_is_read(
@@ -200,6 +201,14 @@ def test_variables_that_cannot_be_are_refused_when_the_scenario_is_read(
         Scenario.model_validate({"program": {"kind": "zenoh", "command": command, "environment": environment}})
     with pytest.raises(ValueError, match="environment goes with a command"):
         Scenario.model_validate({"program": {"environment": {"A": "b"}}})
+
+
+def test_an_exception_has_variables_of_its_own() -> None:
+    command = ["python", "talker.py"]
+    exception = {"nodes": ["v02"], "command": command, "environment": {"B": "2"}}
+    program = {"kind": "zenoh", "command": command, "environment": {"A": "1"}, "exceptions": [exception]}
+    scenario = Scenario.model_validate({"network": {"vehicles": 2}, "program": program})
+    assert [scenario.options_of(node)["environment"] for node in ("v01", "v02")] == [{"A": "1"}, {"B": "2"}]
 
 
 def test_chance_of_numpy_is_the_vehicles_own(drive: Drive) -> None:

@@ -151,7 +151,7 @@ class Variables(dict[str, str]):
 
 
 class _PresentData(MutableMapping[bytes, bytes]):
-    """The variables in `os.environ` for modules that programs share: of the program whose strand runs, else vnet's."""
+    """The variables of `os.environ` for modules that programs share: of whose strand runs, else vnet's own."""
 
     def __init__(self, own: MutableMapping[bytes, bytes]) -> None:
         self._own = own
