@@ -138,6 +138,11 @@ class PlannedFault:
         """Its name in trace, events and commands, for example `partition-0`."""
         return f"{self.fault.title}-{self.number}"
 
+    @property
+    def draws_of(self) -> int:
+        """The number by which its random draws are keyed."""
+        return self.number if self.fault.draws_of is None else self.fault.draws_of
+
     def acts_at(self, time_ns: int) -> bool:
         """Return whether the fault acts at this instant."""
         return self.start_ns <= time_ns < self.end_ns
@@ -168,12 +173,16 @@ class FaultPlan:
         self._nodes_at = nodes_at
         self._groups = scenario.run.nodes_per_process
         self.faults: list[PlannedFault] = []
+        self._draws: dict[int, str] = {}  # whose they are
         for fault in scenario.fault:
             self.add(fault)
 
     def add(self, fault: Fault) -> PlannedFault:
         """Plan one more fault; it ends by the time the network must be at rest. Raises ScenarioError."""
         number = len(self.faults)
+        drawn = number if fault.draws_of is None else fault.draws_of
+        if drawn in self._draws:
+            raise ScenarioError(f"{fault.title}-{number}: draws_of = {drawn}: {self._draws[drawn]} has these draws")
         start_ns = round(fault.at_s * NS_PER_S)
         if start_ns >= self._healed_ns:
             limit_s = self._healed_ns / NS_PER_S
@@ -182,9 +191,9 @@ class FaultPlan:
         moving = None
         try:
             if self._nodes_at is None or not _selects_by_position(fault):
-                nodes, links = _selection(fault, self._nodes, fault_stream(self._seed, number, "select"))
+                nodes, links = _selection(fault, self._nodes, fault_stream(self._seed, drawn, "select"))
             else:
-                moving = _MovingSelection(fault, self._nodes_at, self._period_ns, self._seed, number)
+                moving = _MovingSelection(fault, self._nodes_at, self._period_ns, self._seed, drawn)
                 nodes, links = moving(start_ns)
         except ScenarioError as error:
             raise ScenarioError(f"{fault.title}-{number}: {error}") from None
@@ -193,6 +202,7 @@ class FaultPlan:
         planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links, moving)
         self._refuse_parts_of_processes(planned)
         self.faults.append(planned)
+        self._draws[drawn] = planned.label
         return planned
 
     def _refuse_parts_of_processes(self, planned: PlannedFault) -> None:
@@ -260,19 +270,19 @@ class _MovingSelection:
     """The nodes and links of a fault at each instant; the last answer is kept, as it holds for a whole period."""
 
     def __init__(
-        self, fault: Fault, nodes_at: Callable[[int], Nodes], period_ns: int, seed: int, number: int
+        self, fault: Fault, nodes_at: Callable[[int], Nodes], period_ns: int, seed: int, draws_of: int
     ) -> None:
         self._fault = fault
         self._nodes_at = nodes_at
         self._period_ns = period_ns
         self._seed = seed
-        self._number = number
+        self._draws_of = draws_of
         self._last: tuple[int, Selection] | None = None
 
     def __call__(self, time_ns: int) -> Selection:
         period = time_ns // self._period_ns
         if self._last is None or self._last[0] != period:
-            rng = fault_stream(self._seed, self._number, "select")
+            rng = fault_stream(self._seed, self._draws_of, "select")
             self._last = period, _selection(self._fault, self._nodes_at(period), rng)
         return self._last[1]
 
@@ -294,16 +304,16 @@ def _ends(links: Mask) -> Mask:
     return np.asarray(links.any(axis=0) | links.any(axis=1))
 
 
-def fault_stream(seed: int, number: int, what: str) -> np.random.Generator:
+def fault_stream(seed: int, draws_of: int, what: str) -> np.random.Generator:
     """Return the random stream of one fault of the plan, named by what it decides."""
-    return random_streams.stream(seed, f"fault {number} {what}")
+    return random_streams.stream(seed, f"fault {draws_of} {what}")
 
 
 def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, int]]:
     """Return (node, cut off at, back at) of each node of a swizzle: off in the first half, back in the second."""
     assert isinstance(planned.fault, Swizzle)
     chosen = np.flatnonzero(planned.nodes)
-    rng = fault_stream(seed, planned.number, "swizzle")
+    rng = fault_stream(seed, planned.draws_of, "swizzle")
     half_ns = round((planned.fault.over_s or planned.fault.duration_s) * NS_PER_S) // 2
     step_ns = half_ns // max(1, len(chosen))
     back = dict(zip(rng.permutation(chosen).tolist(), range(len(chosen)), strict=True))

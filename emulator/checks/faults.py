@@ -57,7 +57,7 @@ from emulator.scenario.faults import (
 )
 from emulator.scenario.radio import Edca
 from emulator.world.truth import further_error_m
-from vnet.errors import counted
+from vnet.errors import VnetError, counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS, NS_PER_S
 
@@ -183,6 +183,8 @@ def receiver_noise_m(recorded: RecordedRun) -> Array:
     world = recorded.world
     middle_m = np.zeros(2) if world is None else world.area_m.mean(axis=0)
     receiver_m = None if world is None else world.receiver_m
+    if receiver_m is not None and not (len(receiver_m) >= len(position_m) and receiver_m.size):
+        raise VnetError(f"world.npz: receiver_m has the shape {receiver_m.shape} in {len(position_m)} periods")
     further_m = further_error_m(recorded.scenario, position_m, middle_m, receiver_m) if position_m.size else None
     return np.asarray(error_m if further_m is None else error_m - further_m)
 

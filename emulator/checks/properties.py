@@ -240,7 +240,7 @@ def _held(run: Run, name: str, predicate: Predicate, at: str, wanted: bool) -> R
     asked = [(moment, held) for moment, held in answers if held is not None]
     failed = [moment for moment, held in asked if held is not wanted]
     if failed:
-        return _failed(run, name, failed, "does not hold" if wanted else "holds", of=len(asked))
+        return _failed(run, name, failed, "is false" if wanted else "is true", of=len(asked))
     if not asked:
         values = "".join(f": none has a value {value!r}" for value in sorted(missing)[:1])
         return Result(name, "unknown", f"the predicate had nothing to say at any moment{values}")

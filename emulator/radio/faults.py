@@ -162,10 +162,10 @@ class LinkFaults:
 
     def _started(self, planned: PlannedFault) -> _RandomFault:
         bad = np.zeros((self._count, self._count) if isinstance(planned.fault, LossFault) else (0, 0), dtype=bool)
-        return _RandomFault(planned, Draws(self._seed, f"fault {planned.number}"), bad)
+        return _RandomFault(planned, Draws(self._seed, f"fault {planned.draws_of}"), bad)
 
     def _ruled(self, planned: PlannedFault) -> RuledLinks:
-        return RuledLinks(planned, Draws(self._seed, f"fault {planned.number} bytes"), self._rules)
+        return RuledLinks(planned, Draws(self._seed, f"fault {planned.draws_of} bytes"), self._rules)
 
     def _cut_by(self, planned: PlannedFault, time_ns: int) -> Mask | None:
         """Return the mask (N, N) of the links that a fault cuts at `time_ns`; None if it cuts none."""
@@ -298,7 +298,7 @@ class SenderFaults:
         return replace(
             frame,
             copy=self._copies.next(frame.sender, frame.seq),
-            draw=(planned.number + 1 << 32) + index,
+            draw=(planned.draws_of + 1 << 32) + index,
             cause=planned.number,
             name=self._node_ids[frame.sender] + suffix,
             dropped=False,

@@ -277,7 +277,7 @@ class OwnRules:
             rate_mbps=frame.bitrate_mbps,
             options=self._options[number],
             _position_of=lambda vehicle: self._where(topology, vehicle),
-            _stream=(self._seed, f"fault {number} rule", frame.sender, frame.seq, frame.draw),
+            _stream=(self._seed, f"fault {planned.draws_of} rule", frame.sender, frame.seq, frame.draw),
         )
 
     def largest_dbm(self, node: int) -> float | None:

@@ -66,15 +66,17 @@ class Mean:
 def mean_of(values: Sequence[float], size: float = 0.0) -> Mean:
     """Return the mean of one number or more, with the interval of Student's t distribution.
 
-    `size` is the largest number of which values are differences: what its rounding alone explains is no spread.
+    `size` is the largest number of which values are differences: what its rounding alone explains is 0.
     """
-    count = len(values)
+    count, mean = len(values), float(np.mean(values))
+    if abs(mean) <= ROUNDING * size:
+        mean = 0.0
     if count == 1:
-        return Mean(float(values[0]), None, 1)
+        return Mean(mean, None, 1)
     half = float(student_quantile((1 + CONFIDENCE) / 2, count - 1) * np.std(values, ddof=1) / np.sqrt(count))
     if half <= ROUNDING * max(size, *map(abs, values)):
         half = 0.0
-    return Mean(float(np.mean(values)), half, count)
+    return Mean(mean, half, count)
 
 
 def too_few(seeds: int) -> str:

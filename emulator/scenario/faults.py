@@ -181,6 +181,9 @@ class Fault(Section):
     """Start of the fault, in emulated time."""
     duration_s: float = Field(gt=0, le=LONGEST_S)
     """Length of the fault, in emulated time."""
+    draws_of: int | None = Field(None, ge=0, lt=2**16)
+    """Place in the file, from 0 on, whose random draws the fault has: those that it had before others were taken
+    out. If left out, its own."""
 
     @property
     def title(self) -> str:

@@ -304,11 +304,19 @@ def shrink(
 def _smaller(schedule: Schedule) -> Iterator[Schedule]:
     """Schedules a little smaller than this one; what makes it smallest comes first."""
     for number in range(len(schedule)):
-        yield schedule[:number] + schedule[number + 1 :]
+        yield schedule[:number] + tuple(
+            map(_with_its_draws, schedule[number + 1 :], range(number + 1, len(schedule)))
+        )
+    yield tuple(fault.model_copy(update={"draws_of": None}) for fault in schedule)
     for simpler in (_fewer, _shorter):
         for number, fault in enumerate(schedule):
             for changed in simpler(fault):
                 yield (*schedule[:number], changed, *schedule[number + 1 :])
+
+
+def _with_its_draws(fault: Fault, number: int) -> Fault:
+    """Return a fault that keeps its random draws when its number changes."""
+    return fault if fault.draws_of is not None else fault.model_copy(update={"draws_of": number})
 
 
 def _halves(items: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:

@@ -520,7 +520,7 @@ class FaultyGnss:
         assert isinstance(fault, GnssFault)
         if isinstance(fault, RandomPos):
             # Drawn for each vehicle and period, independent of other draws.
-            draws = fault_stream(self._seed, planned.number, f"position {number} {period}").random(2)
+            draws = fault_stream(self._seed, planned.draws_of, f"position {number} {period}").random(2)
             angle, away_m = 2 * math.pi * draws[0], fault.radius_m * math.sqrt(draws[1])
             return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
         displacement_m = fault.displacement_m(time_ns - planned.start_ns)

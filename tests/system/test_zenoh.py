@@ -308,7 +308,7 @@ def test_users_and_several_commands_of_one_vehicle(vnet: Vnet, tmp_path: Path, p
     (tmp_path / "users.txt").write_text("car:secret\n")
     secured = ('kind = "zenoh"', 'kind = "zenoh"\nzenoh = { users = "users.txt" }')
     again = '["sh", "-c", "exec $TALKER $NAME"]'
-    variables = f'environment = {{ TALKER = "{sys.executable} {tmp_path}/talker.py", NAME = "{{id}}" }}'
+    variables = f'environment = {{ TALKER = "{sys.executable} {tmp_path}/talker.py", NAME = "{{id}}b" }}'
     both = f'[["python", "talker.py", "{{id}}"], {again}]\n{variables}'
     alone = '["sh", "-c", "unset ZENOH_CONFIG; exec sleep 100"]'
     words = both if program == "talker.py" else alone
@@ -318,3 +318,4 @@ def test_users_and_several_commands_of_one_vehicle(vnet: Vnet, tmp_path: Path, p
     if words == both:
         assert heard(done, "v01")["v01"] > 0
         assert "heard car/v01/pose" in (done.folder / "logs/v01~2.log").read_text()
+        assert "heard car/v01b/pose" in (done.folder / "logs/v01.log").read_text()

@@ -56,10 +56,10 @@ def test_always_and_never_ask_at_each_period_of_each_vehicle(run: Run) -> None:
     assert never(run, "far", lambda m: np.abs(m["position_m"]).max() > 1e7).text == "false at 80 moments"
     failed = always(run, "early", lambda m: m["count"] < 1.0)
     assert failed.verdict == "invalid"
-    assert failed.text == "does not hold: first of v01 at 1 s (40 of 80 in all)"
+    assert failed.text == "is false: first of v01 at 1 s (40 of 80 in all)"
     assert failed.figures["rows"][0] == {"node": "v01", "time_s": 1.0}
     assert any("sent frame 0" in line for line in failed.figures["before"])
-    assert never(run, "early", lambda m: m["count"] >= 1.0).text.startswith("holds: first of v01 at 1 s")
+    assert never(run, "early", lambda m: m["count"] >= 1.0).text.startswith("is true: first of v01 at 1 s")
 
 
 def test_a_predicate_that_has_nothing_to_say_is_unknown(run: Run) -> None:
@@ -199,7 +199,7 @@ def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty:
     assert never(faulty, "some", lambda m: m["dead"] > 1).verdict == "valid"
     assert always(faulty, "none", lambda m: m["dead"] == 0).verdict == "invalid"
     assert always(faulty, "reports", lambda m: m.get("dead") is not None).text == (
-        "does not hold: first of v02 at 0.5 s (10 of 60 in all)"
+        "is false: first of v02 at 0.5 s (10 of 60 in all)"
     )
     assert always(faulty, "reports", lambda m: "dead" in m).verdict == "invalid"
     assert always(faulty, "typing error", lambda m: m["no_such"] <= 1).verdict == "unknown"
@@ -247,7 +247,7 @@ def test_the_result_is_one_of_a_check_of_ones_own(tmp_path: Path, monkeypatch: p
         out=tmp_path / "run",
     )
     (check,) = [check for check in judged.checks if check.name == "own:small"]
-    assert judged.verdict == "invalid" and check.text.startswith("does not hold: first of v01 at 0.5 s")
+    assert judged.verdict == "invalid" and check.text.startswith("is false: first of v01 at 0.5 s")
 
 
 @pytest.mark.slow
@@ -272,7 +272,7 @@ def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
                 emu.always(lambda moment: True)
             await emu.run_until(1.0)
             emu.check("own:counts", "own:soon", "own:warns")
-            with pytest.raises(AssertionError, match=r"own:long is invalid: holds: first of v01 at 0.6 s"):
+            with pytest.raises(AssertionError, match=r"own:long is invalid: is true: first of v01 at 0.6 s"):
                 emu.check("own:long")
 
     asyncio.run(story())
@@ -299,7 +299,7 @@ def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: 
         with pytest.raises(VnetError, match="own:same: there is a promise of this name"):
             emu.never(lambda moment: False, name="same")
 
-    with pytest.raises(AssertionError, match="own:same is invalid: does not hold: first of v01 at 0 s"):
+    with pytest.raises(AssertionError, match="own:same is invalid: is false: first of v01 at 0 s"):
         asyncio.run(story("broken", twice))
     asyncio.run(story("kept", lambda emu: emu.always(lambda moment: True, name="kept")))
     with pytest.raises(AssertionError, match=r"own:typo is unknown: .*: none has a value 'no_such'"):

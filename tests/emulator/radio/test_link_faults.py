@@ -23,6 +23,30 @@ def test_a_partition_cuts_between_groups_for_as_long_as_it_lasts_and_by_name() -
         assert (row["outcome"], row["cause"]) == (("fault", "partition-0") if expected else ("delivered", ""))
 
 
+RANDOM: dict[str, dict[str, Any]] = {
+    "loss": {"probability": 0.4},
+    "burst_loss": {"loss_bad": 0.9},
+    "corrupt": {"probability": 0.5},
+    "duplicate": {"probability": 0.5},
+    "block": {"senders": {"fraction": 0.4}},
+    "swizzle": {},
+}
+
+
+@pytest.mark.parametrize("kind", RANDOM)
+def test_a_fault_has_the_draws_that_it_had_behind_another(kind: str) -> None:
+    """And others without `draws_of`, so that this can fail."""
+
+    def played(*faults: dict[str, Any]) -> list[dict[str, Any]]:
+        air = FaultyEngine([*faults], loss=0.2)
+        air.chat(40)
+        return [{**row, "cause": row["cause"].partition("-")[0]} for row in air.rows()]
+
+    first, random = fault("range", 3.0, 0.5, nodes={"ids": ["v1"]}, range_m=1e5), fault(kind, **RANDOM[kind])
+    behind = played(first, random)
+    assert played(random | {"draws_of": 1}) == behind != played(random)
+
+
 def test_a_block_goes_one_way_only() -> None:
     air = FaultyEngine([fault("block", senders={"ids": ["v1"]}, receivers={"ids": ["v2", "v3"]})])
     air.chat(3)

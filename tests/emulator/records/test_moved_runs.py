@@ -154,6 +154,12 @@ def test_an_input_that_changes_during_a_run_is_recorded_as_it_was_read(inputs: P
 # Damage, and folders of other versions.
 
 
+def with_short_receivers(path: Path) -> None:
+    """Give a world receivers of one period."""
+    arrays = dict(np.load(path)) | {"receiver_m": np.zeros((1, 1, 2))}
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "says"),
@@ -161,6 +167,7 @@ def test_an_input_that_changes_during_a_run_is_recorded_as_it_was_read(inputs: P
         (lambda path: path.unlink(), r"no world\.npz in it"),
         (lambda path: path.write_bytes(path.read_bytes()[:200]), r"world\.npz: not an NPZ file"),
         (lambda path: path.write_bytes(b""), r"world\.npz: not an NPZ file"),
+        (with_short_receivers, r"world\.npz: receiver_m has the shape \(1, 1, 2\) in \d+ periods"),
     ],
 )
 def test_a_world_that_cannot_be_read_is_told_in_one_line(

@@ -15,3 +15,4 @@ def test_rounding_of_a_constant_difference_is_no_spread() -> None:
 
 def test_small_spread_of_small_numbers_is_kept() -> None:
     assert str(mean_of([1e-13, 2e-13, 3e-13])).endswith("e-13")
+    assert str(mean_of([1e-16, -3e-16, 2e-16], size=1.0)) == str(mean_of([0.0, 0.0, 0.0]))

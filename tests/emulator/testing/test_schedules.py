@@ -120,6 +120,16 @@ def test_shrinking_drops_halves_and_shortens() -> None:
     assert steps <= 12
 
 
+def test_a_fault_that_is_left_keeps_its_random_draws_if_they_matter() -> None:
+    def falls(schedule: Schedule) -> bool:
+        return any(isinstance(each.fault, Loss) and each.draws_of == 1 for each in planned(schedule).faults)
+
+    smallest, _ = shrink(CROWD, falls)
+    assert [(fault.kind, fault.draws_of) for fault in smallest] == [("loss", 1)]
+    with pytest.raises(ScenarioError, match="draws_of = 1: loss-0 has these draws"):
+        planned((smallest[0], CROWD[0]))
+
+
 def test_shrinking_stops_after_so_many_steps() -> None:
     asked: list[Schedule] = []
 
