@@ -76,7 +76,7 @@ class Behaviour:
 class Turn:
     """Observations of agents at one instant, by node; or that the run is over, and by which error.
 
-    events: all of the run until then.
+    events: what has happened since the turn before.
     """
 
     time_ns: int
@@ -100,6 +100,7 @@ class Episode:
         if self._keeps:
             self._session.folder.open(self.emulation.scenario)
         self._asking: dict[str, tuple[int, Any, asyncio.Future[Any]]] = {}
+        self._told = 0  # events
         self._known: set[str] = set()  # agents that have ever observed
         self._turns: SimpleQueue[Turn] = SimpleQueue()
         self._answers: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
@@ -150,7 +151,10 @@ class Episode:
         self._turns.put(last)
 
     def _events(self) -> Sequence[Event]:
-        return [*self.emulation.folder.events]
+        """Return the events since the last call."""
+        new = self.emulation.folder.events[self._told :]
+        self._told += len(new)
+        return new
 
     async def _vehicle(self, node: Node) -> None:
         """The program of an agent; started again after a kill, it is none any more."""
@@ -212,7 +216,6 @@ class Scenes:
 
     def __init__(self, emulation: Emulation) -> None:
         self._emulation = emulation
-        self._events = 0
         self._period = 0
         self._speed = np.zeros(len(emulation.world.node_ids))
 
@@ -224,13 +227,12 @@ class Scenes:
             way_m = world.position_m(period) - world.position_m(self._period)
             passed_s = (period - self._period) * world.period_ns / NS_PER_S
             self._speed, self._period = np.hypot(way_m[:, 0], way_m[:, 1]) / passed_s, period
-        new, self._events = turn.events[self._events :], len(turn.events)
         position_m = world.position_m(period).copy()
         position_m.flags.writeable = False  # one for the functions of all agents
         return Moment(
             period * world.period_ns / NS_PER_S,
             dict(zip(world.node_ids, position_m, strict=True)),
             dict(zip(world.node_ids, self._speed.tolist(), strict=True)),
-            new,
+            turn.events,
             actions,
         )
