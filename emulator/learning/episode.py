@@ -101,6 +101,7 @@ class Episode:
             self._session.folder.open(self.emulation.scenario)
         self._asking: dict[str, tuple[int, Any, asyncio.Future[Any]]] = {}
         self._told = 0  # events
+        self._turn_ns = -1  # the latest turn is of the fixes of this instant
         self._known: set[str] = set()  # agents that have ever observed
         self._turns: SimpleQueue[Turn] = SimpleQueue()
         self._answers: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
@@ -164,6 +165,8 @@ class Episode:
             if node.id in self.finished:
                 return
             *_, newest = fix, *node.gnss.drain()  # after a pause there are several
+            if newest.time_ns <= self._turn_ns:
+                continue  # what is heard until the next one is observed with that
             try:
                 observation = self._behaviour.observe(node, newest, node.radio.drain())
                 answered, action = await self._await_action(node.id, newest.time_ns, observation)
@@ -172,7 +175,6 @@ class Episode:
             except Exception as error:  # whoever learns is to know, and not only the run's verdict
                 self._turns.put(Turn(newest.time_ns, {}, (), over=True, error=error))
                 raise
-            node.gnss.drain()  # the turns of these are over
 
     async def _await_action(self, node: str, fix_time_ns: int, observation: Any) -> tuple[bool, Any]:
         """Return whether the agent does anything, and what."""
@@ -180,7 +182,7 @@ class Episode:
         if not self._known:
             nobodys = Context()  # no fault stops its timers, or sets its clock
             nobodys.run(current_node.set, None)
-            loop.call_soon(self._schedule, loop, context=nobodys)
+            loop.call_soon(self._schedule, loop, fix_time_ns, context=nobodys)
         self._known.add(node)
         future: asyncio.Future[tuple[bool, Any]] = loop.create_future()
         self._asking[node] = fix_time_ns, observation, future
@@ -189,18 +191,19 @@ class Episode:
             await asyncio.sleep(FOR_EVER_S)
         return answer
 
-    def _schedule(self, loop: asyncio.AbstractEventLoop, due_s: float | None = None) -> None:
-        """Take a turn at `due_s`, or when agents that see the present fixes have observed."""
-        due_s = loop.time() + THINKING_S if due_s is None else due_s
-        loop.call_at(due_s, self._take_turn, loop, due_s)
+    def _schedule(self, loop: asyncio.AbstractEventLoop, time_ns: int) -> None:
+        """Take the turn of the fixes of an instant."""
+        loop.call_at(time_ns / NS_PER_S + THINKING_S, self._take_turn, loop, time_ns)
 
-    def _take_turn(self, loop: asyncio.AbstractEventLoop, due_s: float) -> None:
+    def _take_turn(self, loop: asyncio.AbstractEventLoop, time_ns: int) -> None:
         """Stop emulated time until the caller has answered; once a period, whoever has observed.
 
         While all vehicles are paused no timer fires; those turns are then made up for.
         """
-        self._schedule(loop, due_s + self.emulation.world.period_ns / NS_PER_S)
-        time_ns = round((due_s - THINKING_S) * NS_PER_S)
+        if self._stop.is_set():
+            return
+        self._turn_ns = time_ns
+        self._schedule(loop, time_ns + self.emulation.world.period_ns)
         waiting = {node: each for node, each in self._asking.items() if not each[2].done()}  # not killed programs
         now = {node: each for node, each in waiting.items() if each[0] <= time_ns}
         self._asking = {node: each for node, each in waiting.items() if node not in now}

@@ -4,6 +4,7 @@ import importlib
 import pickle
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -162,7 +163,7 @@ FAULTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-@pytest.mark.parametrize("at_s", [0.0, 0.5])
+@pytest.mark.parametrize("at_s", [0.0, 0.5, 0.55])
 def test_a_step_is_a_period_whatever_fails(name: str, at_s: float) -> None:
     moments: list[Moment] = []
 
@@ -184,6 +185,23 @@ def test_a_step_is_a_period_whatever_fails(name: str, at_s: float) -> None:
         failing = at_s <= time_s < at_s + 0.5 - 1e-6
         if not failing or name == "a clock set forward":
             assert fix_s == pytest.approx(dict.fromkeys(fix_s, time_s), abs=1e-6)
+
+
+@pytest.mark.parametrize("left", ["close", "terminated", "error"])
+def test_an_episode_may_be_left_while_all_vehicles_are_paused(left: str) -> None:
+    def reward(agent: str, moment: Moment) -> float:
+        if left == "error" and moment.time_s > 0.65:
+            raise ValueError("left")
+        return 0.0
+
+    ends = {"terminated": lambda agent, moment: moment.time_s > 0.65} if left == "terminated" else {}
+    env = make(reward=reward, sections={"fault": [{"kind": "pause", "at_s": 0.5, "duration_s": 0.5}]}, **ends)
+    env.reset(seed=1)
+    with suppress(ValueError):
+        for _ in range(7):
+            env.step({})
+    env.close()
+    assert threads() == 0
 
 
 def test_an_agent_that_gets_no_fix_has_its_last_observation_and_does_not_act() -> None:
