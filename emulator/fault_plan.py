@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,11 +122,14 @@ def _outside_majority(order: NDArray[np.int64]) -> Mask:
 class PlannedFault:
     """A fault with its number in the plan, the time [start, end) in which it acts, and its nodes and links.
 
+    `draws_of` is the number by which its random draws are keyed.
+
     `nodes` (N,) are those selected; `links` (N, N), rows are senders, those it acts on; None for faults of nodes.
     `moving` selects both again at each instant, where vehicles drive into a region and out of it.
     """
 
     number: int
+    draws_of: int
     fault: Fault
     start_ns: int
     end_ns: int
@@ -137,11 +141,6 @@ class PlannedFault:
     def label(self) -> str:
         """Its name in trace, events and commands, for example `partition-0`."""
         return f"{self.fault.title}-{self.number}"
-
-    @property
-    def draws_of(self) -> int:
-        """The number by which its random draws are keyed."""
-        return self.number if self.fault.draws_of is None else self.fault.draws_of
 
     def acts_at(self, time_ns: int) -> bool:
         """Return whether the fault acts at this instant."""
@@ -180,8 +179,10 @@ class FaultPlan:
     def add(self, fault: Fault) -> PlannedFault:
         """Plan one more fault; it ends by the time the network must be at rest. Raises ScenarioError."""
         number = len(self.faults)
-        drawn = number if fault.draws_of is None else fault.draws_of
-        if drawn in self._draws:
+        drawn = fault.draws_of
+        if drawn is None:
+            drawn = next(free for free in count(number) if free not in self._draws)
+        elif drawn in self._draws:
             raise ScenarioError(f"{fault.title}-{number}: draws_of = {drawn}: {self._draws[drawn]} has these draws")
         start_ns = round(fault.at_s * NS_PER_S)
         if start_ns >= self._healed_ns:
@@ -199,7 +200,7 @@ class FaultPlan:
             raise ScenarioError(f"{fault.title}-{number}: {error}") from None
         if not fault.follows_vehicles:
             moving = None
-        planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links, moving)
+        planned = PlannedFault(number, drawn, fault, start_ns, end_ns, nodes, links, moving)
         self._refuse_parts_of_processes(planned)
         self.faults.append(planned)
         self._draws[drawn] = planned.label

@@ -183,7 +183,7 @@ class Fault(Section):
     """Length of the fault, in emulated time."""
     draws_of: int | None = Field(None, ge=0, lt=2**16)
     """Place in the file, from 0 on, whose random draws the fault has: those that it had before others were taken
-    out. If left out, its own."""
+    out. If left out, its own, or the next that no fault has."""
 
     @property
     def title(self) -> str:

@@ -194,7 +194,9 @@ def test_an_episode_may_be_left_while_all_vehicles_are_paused(left: str) -> None
             raise ValueError("left")
         return 0.0
 
-    ends = {"terminated": lambda agent, moment: moment.time_s > 0.65} if left == "terminated" else {}
+    ends: dict[str, Any] = (
+        {"terminated": lambda agent, moment: moment.time_s > 0.65} if left == "terminated" else {}
+    )
     env = make(reward=reward, sections={"fault": [{"kind": "pause", "at_s": 0.5, "duration_s": 0.5}]}, **ends)
     env.reset(seed=1)
     with suppress(ValueError):

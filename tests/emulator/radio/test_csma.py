@@ -122,7 +122,7 @@ def test_however_time_is_cut_the_same_happens(
 def planned(number: int, fault: Fault, span: Span, count: int, *nodes: int) -> PlannedFault:
     """A fault of these nodes, or of all links if there are none."""
     of, links = np.isin(np.arange(count), nodes), None if nodes else np.ones((count, count), dtype=bool)
-    return PlannedFault(number, fault, span[0], span[1], of, links)
+    return PlannedFault(number, number, fault, span[0], span[1], of, links)
 
 
 ACT: dict[str, Any] = {"at_s": 0.0, "duration_s": 1.0}

@@ -126,8 +126,9 @@ def test_a_fault_that_is_left_keeps_its_random_draws_if_they_matter() -> None:
 
     smallest, _ = shrink(CROWD, falls)
     assert [(fault.kind, fault.draws_of) for fault in smallest] == [("loss", 1)]
-    with pytest.raises(ScenarioError, match="draws_of = 1: loss-0 has these draws"):
-        planned((smallest[0], CROWD[0]))
+    assert [each.draws_of for each in planned((smallest[0], CROWD[0])).faults] == [1, 2]
+    with pytest.raises(ScenarioError, match="loss-1: draws_of = 1: loss-0 has these draws"):
+        planned((smallest[0], smallest[0]))
 
 
 def test_shrinking_stops_after_so_many_steps() -> None:

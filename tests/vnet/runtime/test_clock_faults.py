@@ -27,7 +27,7 @@ LAST_NS = 20 * S
 def planned(kind: str, at_s: float, until_s: float, number: int = 0, **more: float) -> PlannedFault:
     data = {"kind": kind, "at_s": at_s, "duration_s": until_s - at_s, **more}
     mask = np.array([True])
-    return PlannedFault(number, parse_fault(data), round(at_s * S), round(until_s * S), mask, None)
+    return PlannedFault(number, number, parse_fault(data), round(at_s * S), round(until_s * S), mask, None)
 
 
 class Clocks:
