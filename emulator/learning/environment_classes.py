@@ -99,6 +99,8 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         self._scenes.moment(turn, {})
         self._observed, self._asked = dict(turn.observed), {*turn.observed}
         self.agents = [agent for agent in self.possible_agents if agent in turn.observed]
+        if turn.over:
+            self.close()
         return dict(turn.observed), {agent: {} for agent in self.agents}
 
     def step(
@@ -106,19 +108,29 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Let agents act, and one period pass; return observations, rewards, terminated, truncated and infos.
 
-        An agent without an action does nothing. One that gets no fix, as in an outage of its receiver, has its last
-        observation again, and does not act. Raises VnetError before the first `reset`, and for an action of no
-        living agent.
+        If nobody is left it lasts until somebody enters. An agent without an action does nothing. One that gets no
+        fix, as in an outage of its receiver, has its last observation again, and does not act. Raises VnetError
+        before the first `reset`, and for an action of no living agent.
         """
         if self._episode is None:
             raise VnetError("step: the episode is over, or has not begun: reset()")
         if unknown := sorted(set(actions) - set(self.agents)):
             raise VnetError(f"step: {unknown[0]} is no living agent; there are: {', '.join(self.agents)}")
         self._episode.answer(actions)
-        done = {agent: action for agent, action in actions.items() if agent in self._asked}
+        episode, done = self._episode, {each: action for each, action in actions.items() if each in self._asked}
         with self._ended_by_an_error():
-            turn = self._episode.next_turn()
-            return self._step(self._episode, turn, self._scenes.moment(turn, done))
+            turn = episode.next_turn()
+            result = self._step(episode, turn, self._scenes.moment(turn, done))
+            while not (self.agents or turn.over or episode.finished.issuperset(self.possible_agents)):
+                episode.answer({})  # nobody is there: on to who enters next
+                turn = episode.next_turn()
+                for known, more in zip(
+                    result, self._step(episode, turn, self._scenes.moment(turn, {})), strict=True
+                ):
+                    known.update(more)
+        if not self.agents:
+            self.close()
+        return result
 
     def _step(
         self, episode: Episode, turn: Turn, moment: Moment
@@ -137,8 +149,6 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         episode.finished |= {agent for agent in at_end if ended[agent] or turn.over}
         self.agents = [agent for agent in at_end if agent not in episode.finished]
         observations = {agent: self._observed[agent] for agent in at_end}
-        if not self.agents:
-            self.close()
         return observations, rewards, ended, truncated, {agent: {} for agent in at_end}
 
     @contextmanager

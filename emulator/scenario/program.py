@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from emulator.scenario.sections import DAY_S, FAR_M, Section
 from vnet.errors import ScenarioError, shown
-from vnet.gateway import FILLED_IN, SESSION_VARIABLES
+from vnet.gateway import FILLED_IN
 
 _MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
@@ -109,8 +109,8 @@ class OneProgram(Section):
     @classmethod
     def _are_variables(cls, given: dict[str, str]) -> dict[str, str]:
         if wrong := [name for name in given if not VARIABLE.fullmatch(name)]:
-            raise ValueError(f"{shown(wrong[0])} is no variable: letters, digits and _ are allowed, a letter first")
-        if told := [name for name in given if name in SESSION_VARIABLES]:
+            raise ValueError(f"{shown(wrong[0])} is no variable: letters, digits and _ are allowed, no digit first")
+        if told := [name for name in given if name.startswith(("VNET_", "ZENOH_CONFIG"))]:
             raise ValueError(f"{told[0]} is vnet's to set")
         _check_words(given.values())
         return given

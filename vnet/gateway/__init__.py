@@ -44,18 +44,18 @@ def client_config(endpoint: str) -> dict[str, Any]:
     }
 
 
-SESSION_VARIABLES = ("ZENOH_CONFIG", "ZENOH_CONFIG_OVERRIDE", "VNET_ENDPOINT", "VNET_NODE")
-"""Variables by which a program finds its endpoint and its vehicle."""
-
-
 def session_variables(node: str, endpoint: str, config: Mapping[str, Any], path: Path) -> dict[str, str]:
-    """Return `SESSION_VARIABLES` for a program; `path` is a file that has `config`.
+    """Return the variables by which a program finds its endpoint; `path` is a file that has `config`.
 
     `ZENOH_CONFIG` is read by `Config.from_env`, and `ZENOH_CONFIG_OVERRIDE` by rmw_zenoh and, with `STARTUP` on
     `PYTHONPATH`, by `zenoh.open`.
     """
-    override = ";".join(f"{key}={_json(value)}" for key, value in _leaves(config))
-    return dict(zip(SESSION_VARIABLES, (str(path), override, endpoint, node), strict=True))
+    return {
+        "ZENOH_CONFIG": str(path),
+        "ZENOH_CONFIG_OVERRIDE": ";".join(f"{key}={_json(value)}" for key, value in _leaves(config)),
+        "VNET_ENDPOINT": endpoint,
+        "VNET_NODE": node,
+    }
 
 
 def _json(value: object) -> str:

@@ -112,6 +112,22 @@ def test_a_vehicle_that_leaves_is_terminated() -> None:
     assert all(steps[-1][3][agent] for agent in ("v02", "v03", "v04"))
 
 
+def test_an_episode_goes_on_while_nobody_is_there_and_others_will_enter(tmp_path: Path) -> None:
+    rows = [
+        f"{name},{time_s},{10 * time_s},0"
+        for name, from_s in (("a", 0), ("b", 2))
+        for time_s in range(from_s, from_s + 2)
+    ]
+    (tmp_path / "trips.csv").write_text("\n".join(["id,time_s,x_m,y_m", *rows]))
+    network = {"kind": "trips", "path": str(tmp_path / "trips.csv")}
+    env = make(duration_s=4.0, act=lambda node, action: None, sections={"network": network})
+    steps = play(env)
+    alone = next(step for step in steps[1:] if step[2].get("a"))
+    assert "b" in alone[0] and not alone[2]["b"]
+    assert next(step for step in steps if "b" in step[0]) is alone
+    assert steps[-1][2]["b"] and threads() == 0
+
+
 @pytest.mark.slow
 def test_a_killed_program_s_agent_is_terminated_and_not_revived() -> None:
     fault = {"kind": "kill", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}

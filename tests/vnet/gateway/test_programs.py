@@ -191,6 +191,7 @@ def test_modules_that_vehicles_share_find_the_variables_of_each(drive: Drive) ->
         ({"": "c"}, "environment"),
         ({"A": "\0"}, "NUL"),
         ({"VNET_NODE": "v07"}, "VNET_NODE is vnet's"),
+        ({"1A": "b"}, "1A"),
     ],
 )
 def test_variables_that_cannot_be_are_refused_when_the_scenario_is_read(
