@@ -90,8 +90,8 @@ def check_name(name: str) -> None:
     if name in RESERVED_NAMES:
         taken = ", ".join(sorted(RESERVED_NAMES))
         raise ValueError(f"report({name}=…): this name is taken by vnet; so are {taken}")
-    if not name.partition(".")[0].isidentifier():
-        allowed = "a Python identifier is expected, with a dot and any text behind it if need be"
+    if not (name.partition(".")[0].isidentifier() and name.isprintable()):
+        allowed = "a Python identifier is expected, with a dot and any printable text behind it if need be"
         raise ValueError(f"report(**{{{name!r}: …}}): not a name of a value; {allowed}")
 
 

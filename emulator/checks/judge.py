@@ -391,8 +391,8 @@ CHECKS: list[Check] = [
         check_reports,
         RUN,
         "Reports hold what `node.report` allows: covariance matrices that are symmetric and positive semidefinite, "
-        f"names that are identifiers, with a dot and any text behind it, and texts of at most {LONGEST_TEXT} "
-        "characters.",
+        "names that are identifiers, with a dot and any printable text behind it, and texts of at most "
+        f"{LONGEST_TEXT} characters.",
         invalid="one holds something else",
         not_applicable="no program reports",
     ),

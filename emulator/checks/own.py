@@ -11,6 +11,7 @@ import json
 import re
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import chdir
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -90,10 +91,11 @@ def own_findings(program: Program, run: Run) -> list[Finding]:
         try:
             if interrupted:
                 raise KeyboardInterrupt
-            for finding in _findings_of(entry, program, run):
-                if finding.name in findings:
-                    raise _NonsenseError(f"yields {finding.name.removeprefix(PREFIX)!r} twice")
-                findings[finding.name] = finding
+            with chdir("."):  # afterwards here again, wherever it has gone
+                for finding in _findings_of(entry, program, run):
+                    if finding.name in findings:
+                        raise _NonsenseError(f"yields {finding.name.removeprefix(PREFIX)!r} twice")
+                    findings[finding.name] = finding
         except KeyboardInterrupt:
             interrupted = True
             findings[_broken(entry)] = named(_broken(entry), unknown("interrupted"))

@@ -38,6 +38,7 @@ from emulator.records.tables import BACKBONE, BACKGROUND, BUSY, DRIVEN, PAYLOADS
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised
 from emulator.scenario.own_functions import declared_checks
+from vnet.errors import sendable
 from vnet.runtime.environment import arithmetic
 
 
@@ -182,7 +183,7 @@ def _own_findings(
     with redirect_stdout(StringIO()) as printed, signals_handled(signal.default_int_handler, signal.SIGINT):
         findings = own_findings(program, Run(recorded, folder.path, write=write))
     if printed.getvalue():
-        folder.keep("logs/checks.txt", lambda path: write_text(path, printed.getvalue()))
+        folder.keep("logs/checks.txt", lambda path: write_text(path, sendable(printed.getvalue())))
     return findings
 
 

@@ -124,9 +124,8 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
             while not (self.agents or turn.over or episode.finished.issuperset(self.possible_agents)):
                 episode.answer({})  # nobody is there: on to who enters next
                 turn = episode.next_turn()
-                for known, more in zip(
-                    result, self._step(episode, turn, self._scenes.moment(turn, {})), strict=True
-                ):
+                later = self._step(episode, turn, self._scenes.moment(turn, {}))
+                for known, more in zip(_dicts(result), _dicts(later), strict=True):
                     known.update(more)
         if not self.agents:
             self.close()
@@ -170,6 +169,10 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
     def __del__(self) -> None:
         with suppress(AttributeError):  # it was never made
             self.close()
+
+
+def _dicts(result: tuple[Any, ...]) -> tuple[dict[str, Any], ...]:
+    return result
 
 
 def whole_seed(seed: Any) -> int:

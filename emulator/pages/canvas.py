@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -231,11 +232,17 @@ def thin(time_s: Array, value: Array) -> tuple[Array, Array]:
     return time_s[kept], value[kept]
 
 
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML 1.0 has not: a program may report them in texts."""
+
+
 def to_svg(figure: Figure, key: str, label: str) -> Markup:
     """Return the figure as an `<svg>` element; `key` makes its ids unique on a page, `label` describes it."""
     file = io.BytesIO()
-    figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    root = ElementTree.fromstring(file.getvalue())
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph ")  # the page's fonts show the text, not matplotlib's
+        figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    root = ElementTree.fromstring(_NOT_XML.sub("\ufffd", file.getvalue().decode()))
     numbers = count()
     names = {name: f"{key}-{next(numbers)}" for element in root.iter() for name in _references(element)}
     for parent in root.iter():

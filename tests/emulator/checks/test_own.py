@@ -67,6 +67,12 @@ async def waiting(run):
     pass
 
 number = 5
+
+def elsewhere(run):
+    import os
+    os.chdir("/")
+    print("road\\udce9")
+    yield "away", "valid", os.getcwd()
 """
 SCENARIO = (
     '[run]\nname = "own"\nduration_s = 0.5\nsettle_s = 0.0\n[network]\nvehicles = 3\n[radio]\nrange_m = 1e5\n'
@@ -134,6 +140,13 @@ def test_results_stand_in_the_verdict_of_a_run(here: Path) -> None:
     assert written["not_exercised"][-1] == {"name": "own:crowded", "reason": "there are only three vehicles"}
     assert (here / "run" / "logs" / "checks.txt").read_text() == "looked at 30\n"
     assert "looked at" not in text
+
+
+def test_a_check_may_go_elsewhere_and_print_what_is_no_text(here: Path) -> None:
+    status, text = simulate("elsewhere")
+    assert (status, Path.cwd()) == (0, here)
+    assert "own:away" in text
+    assert (here / "run" / "logs" / "checks.txt").read_text() == "road\\udce9\n"
 
 
 def test_a_failed_check_makes_the_run_invalid_and_shows_its_rows(here: Path) -> None:

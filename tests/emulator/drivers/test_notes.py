@@ -188,7 +188,9 @@ def node() -> Node:
     return Node("v01", Transport(), lane_map=None, seed=1, options={}, period_ns=1, max_payload=1)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["", "x/y", "a b <c>", ".x", "node", "time_ns", "position_m", "values"])
+@pytest.mark.parametrize(
+    "name", ["", "x/y", "a b <c>", ".x", "node", "time_ns", "position_m", "values", "x.\udce9", "x.\x1b"]
+)
 def test_a_figure_that_would_vanish_is_refused(node: Node, name: str) -> None:
     with pytest.raises(ValueError, match=r"^report\(.*: (this name is taken by vnet|not a name of a value)"):
         node.report(**{name: 1.0})

@@ -62,6 +62,12 @@ def drawing(label: str) -> Markup:
     return to_svg(canvas("x", "y").figure, "key", label)
 
 
+def test_a_text_that_is_no_xml_is_drawn() -> None:
+    made = canvas("lane\x00 \x1b[31m \ufffe", "y")
+    with styled():
+        assert "lane\ufffd \ufffd[31m \ufffd" in to_svg(made.figure, "key", "label")
+
+
 def comparison(text: str) -> str:
     """A comparison with a text wherever others may have written it."""
     run = {"letter": "A", "name": text, "folder": Path(text), "verdict": Verdict.VALID}
