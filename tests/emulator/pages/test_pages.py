@@ -63,9 +63,9 @@ def drawing(label: str) -> Markup:
 
 
 def test_a_text_that_is_no_xml_is_drawn() -> None:
-    made = canvas("lane\x00 \x1b[31m \ufffe", "y")
     with styled():
-        assert "lane\ufffd \ufffd[31m \ufffd" in to_svg(made.figure, "key", "label")
+        drawn = to_svg(canvas("lane\x00 \x1b[31m \ufffe", "y").figure, "key", "label")
+    assert "lane\ufffd \ufffd[31m \ufffd" in drawn
 
 
 def comparison(text: str) -> str:
