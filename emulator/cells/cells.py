@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -33,6 +33,7 @@ from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.drivers.signals import terminated_as_interrupted
+from emulator.drivers.simulate import MOST_APART
 from emulator.records.code_digest import digests_of
 from emulator.records.disk import atomically, disk_errors, write_atomically
 from emulator.records.events import Level
@@ -122,11 +123,15 @@ class WorkerPool(Executor):
 
 
 def each_done(
-    jobs: Sequence[J], function: Callable[[J], R], executor: Executor | None = None, most: int | None = None
+    jobs: Sequence[J],
+    function: Callable[[J], R],
+    executor: Executor | None = None,
+    most: int | None = None,
+    last: Callable[[J], J] = lambda job: job,
 ) -> Iterator[tuple[J, R]]:
     """Yield each job with its result as they are done, on `executor` or in `most` processes of this machine.
 
-    A job whose worker dies is run again. Raises VnetError that names the first job that cannot be done; what has
+    A job whose worker dies is run again, at last as `last` changes it. Raises VnetError that names the first job that cannot be done; what has
     not begun is then cancelled.
     """
     if not jobs:
@@ -163,7 +168,7 @@ def each_done(
                         raise
                     if tries == MOST_TRIES:
                         raise VnetError(f"cell {dict(job.labels)}: {error}, {tries} times") from None
-                    waiting[submit(job)] = job, tries + 1
+                    waiting[submit(job if tries + 1 < MOST_TRIES else last(job))] = job, tries + 1
     finally:
         for future in waiting:
             future.cancel()
@@ -216,6 +221,8 @@ class Cell:
     """True if every vehicle's state in every period is kept too."""
     measure: Measure | None = None
     """Gives an experiment's figures, which a crash ends; without one they are those of the run's verdict."""
+    apart: bool = False
+    """True for a process a vehicle: one that ends its process has died, and nothing else has ended."""
 
     @property
     def digest(self) -> str:
@@ -262,10 +269,14 @@ def run_cells(
                 keep(cell, compute(cell, live=True), store)
                 advance()
         else:
-            for cell, result in each_done(list(missing.values()), compute, executor, jobs):
+            for cell, result in each_done(list(missing.values()), compute, executor, jobs, _apart):
                 keep(cell, result, store)
                 advance()
     return [read_result(cell, folder, live) for cell in cells]
+
+
+def _apart(cell: Cell) -> Cell:
+    return replace(cell, apart=True)
 
 
 def compute(cell: Cell, live: bool = False) -> CellResult:
@@ -278,7 +289,7 @@ def compute(cell: Cell, live: bool = False) -> CellResult:
 
 
 def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
-    session = Session(cell.scenario, path, over_zenoh if live else Local()).open()
+    session = Session(cell.scenario, path, over_zenoh if live else Local(MOST_APART if cell.apart else 1)).open()
     session.run()
     if session.interrupted:
         raise KeyboardInterrupt

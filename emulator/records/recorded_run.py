@@ -158,6 +158,8 @@ class RecordedRun:
 
     def number_of(self, node: str | None) -> int:
         """The number of a node that trace or events name. Raises VnetError if the states do not know it."""
+        if not self.number:
+            raise VnetError("no period was completed")
         if node not in self.number:
             raise VnetError(f"node {node!r} in trace or events: the states know only {len(self.number)} others")
         return self.number[node]

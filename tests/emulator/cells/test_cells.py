@@ -65,6 +65,17 @@ def test_a_live_cell_whose_program_cannot_be_imported_is_refused_before_it_start
         compute(cell, live=True)
 
 
+def test_a_program_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
+    data = {
+        "run": {"name": "cell", "duration_s": 2.0, "settle_s": 0.5},
+        "network": TINY,
+        "program": {"entry": "tests.emulator.testing.programs:faulty"},
+    }
+    (row,) = run_cells([Cell({"seed": 1}, Scenario.model_validate(data))], tmp_path)
+    assert (row["verdict"], row["failed"]) == ("invalid", "agents_alive")
+    assert "SIGSEGV" in row["failure"]
+
+
 def test_a_program_that_raises_ends_the_experiment_and_names_the_cell(tmp_path: Path) -> None:
     with pytest.raises(VnetError, match=r"cell \{'seed': 1\}.*program.options.fusion = 'magic'"):
         run_cells([tiny_cell(1, fusion="magic")], tmp_path)
