@@ -131,8 +131,8 @@ def each_done(
 ) -> Iterator[tuple[J, R]]:
     """Yield each job with its result as they are done, on `executor` or in `most` processes of this machine.
 
-    A job whose worker dies is run again, at last as `last` changes it. Raises VnetError that names the first job that cannot be done; what has
-    not begun is then cancelled.
+    A job whose worker dies is run again, at last as `last` changes it. Raises VnetError that names the first job
+    that cannot be done; what has not begun is then cancelled.
     """
     if not jobs:
         return
