@@ -172,18 +172,17 @@ class FaultPlan:
         self._nodes_at = nodes_at
         self._groups = scenario.run.nodes_per_process
         self.faults: list[PlannedFault] = []
-        self._draws: dict[int, str] = {}  # whose they are
         for fault in scenario.fault:
             self.add(fault)
 
     def add(self, fault: Fault) -> PlannedFault:
         """Plan one more fault; it ends by the time the network must be at rest. Raises ScenarioError."""
         number = len(self.faults)
-        drawn = fault.draws_of
+        drawn, taken = fault.draws_of, {each.draws_of: each for each in self.faults}
         if drawn is None:
-            drawn = next(free for free in count(number) if free not in self._draws)
-        elif drawn in self._draws:
-            raise ScenarioError(f"{fault.title}-{number}: draws_of = {drawn}: {self._draws[drawn]} has these draws")
+            drawn = next(free for free in count(number) if free not in taken)
+        elif drawn in taken:
+            raise ScenarioError(f"{fault.title}-{number}: draws_of = {drawn}: {taken[drawn].label} has these draws")
         start_ns = round(fault.at_s * NS_PER_S)
         if start_ns >= self._healed_ns:
             limit_s = self._healed_ns / NS_PER_S
@@ -203,7 +202,6 @@ class FaultPlan:
         planned = PlannedFault(number, drawn, fault, start_ns, end_ns, nodes, links, moving)
         self._refuse_parts_of_processes(planned)
         self.faults.append(planned)
-        self._draws[drawn] = planned.label
         return planned
 
     def _refuse_parts_of_processes(self, planned: PlannedFault) -> None:

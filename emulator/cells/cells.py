@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -269,14 +269,11 @@ def run_cells(
                 keep(cell, compute(cell, live=True), store)
                 advance()
         else:
-            for cell, result in each_done(list(missing.values()), compute, executor, jobs, _apart):
+            left = list(missing.values())
+            for cell, result in each_done(left, compute, executor, jobs, partial(replace, apart=True)):
                 keep(cell, result, store)
                 advance()
     return [read_result(cell, folder, live) for cell in cells]
-
-
-def _apart(cell: Cell) -> Cell:
-    return replace(cell, apart=True)
 
 
 def compute(cell: Cell, live: bool = False) -> CellResult:

@@ -30,6 +30,9 @@ from vnet.errors import PayloadTooLargeError, VnetError, shown
 from vnet.radio import Packet
 from vnet.types import Array
 
+Of = dict[str, Any]
+Stepped = tuple[Of, Of, Of, Of, Of]
+"""By agent: observations, rewards, terminated, truncated, infos."""
 Spaces = Space[Any] | Callable[[str], Space[Any]]
 SEEDS = 2**63
 """Number of seeds, from 0 on, that a scenario can have."""
@@ -103,9 +106,7 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
             self.close()
         return dict(turn.observed), {agent: {} for agent in self.agents}
 
-    def step(
-        self, actions: dict[str, Any]
-    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def step(self, actions: dict[str, Any]) -> Stepped:
         """Let agents act, and one period pass; return observations, rewards, terminated, truncated and infos.
 
         If nobody is left it lasts until somebody enters. An agent without an action does nothing. One that gets no
@@ -125,15 +126,13 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
                 episode.answer({})  # nobody is there: on to who enters next
                 turn = episode.next_turn()
                 later = self._step(episode, turn, self._scenes.moment(turn, {}))
-                for known, more in zip(_dicts(result), _dicts(later), strict=True):
+                for known, more in zip(result, later, strict=True):
                     known.update(more)
         if not self.agents:
             self.close()
         return result
 
-    def _step(
-        self, episode: Episode, turn: Turn, moment: Moment
-    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def _step(self, episode: Episode, turn: Turn, moment: Moment) -> Stepped:
         """Return what a step returns, that ends with this turn and this moment."""
         self._observed |= turn.observed
         self._asked = {*turn.observed}
@@ -169,10 +168,6 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
     def __del__(self) -> None:
         with suppress(AttributeError):  # it was never made
             self.close()
-
-
-def _dicts(result: tuple[Any, ...]) -> tuple[dict[str, Any], ...]:
-    return result
 
 
 def whole_seed(seed: Any) -> int:
@@ -241,9 +236,7 @@ class RadioEnvironment(BaseParallelWrapper):
         self._observed = {agent: self._receive(agent, seen, ()) for agent, seen in observations.items()}
         return dict(self._observed), infos
 
-    def step(
-        self, actions: dict[str, Any]
-    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def step(self, actions: dict[str, Any]) -> Stepped:
         """Send what goes with these actions, step the environment, and let agents receive what has arrived."""
         if self._engine is None:
             raise VnetError("step: no episode has begun: reset()")

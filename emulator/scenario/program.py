@@ -66,10 +66,6 @@ PLACEHOLDER = re.compile(r"\{[a-z_]+\}", re.IGNORECASE)
 """A word that is meant to be filled in. Within a word braces may be a program's own."""
 
 
-VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-"""Names of variables that any shell takes."""
-
-
 def _check_words(words: Iterable[str]) -> None:
     """Raise ValueError for what no command can be given, or is meant to be filled in and is not."""
     words = list(words)
@@ -108,7 +104,7 @@ class OneProgram(Section):
     @field_validator("environment")
     @classmethod
     def _are_variables(cls, given: dict[str, str]) -> dict[str, str]:
-        if wrong := [name for name in given if not VARIABLE.fullmatch(name)]:
+        if wrong := [name for name in given if not (name.isascii() and name.isidentifier())]:
             raise ValueError(f"{shown(wrong[0])} is no variable: letters, digits and _ are allowed, no digit first")
         if told := [name for name in given if name.startswith(("VNET_", "ZENOH_CONFIG"))]:
             raise ValueError(f"{told[0]} is vnet's to set")
