@@ -292,9 +292,9 @@ CHECKS: list[Check] = [
     Check(
         check_own_rules,
         FAULTS,
-        "Rules of your own (`custom`, `custom_sender`) answered each frame, and sensors of your own each period. A "
-        "rule that fails is named with its error and line, and lets everything pass from then on.",
-        invalid="a rule or a sensor raised, did not answer, or answered nonsense",
+        "Rules of your own (`custom`, `custom_sender`) answered each frame, sensors and figures of your own each "
+        "period. What fails is named with error and line: it lets everything pass, or is unknown, from then on.",
+        invalid="a rule, a sensor or a figure raised, did not answer, or answered nonsense",
         not_applicable="no rule and no sensor of your own",
         without_positions=WithoutPositions.JUDGE,
     ),

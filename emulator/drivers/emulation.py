@@ -474,6 +474,7 @@ class Emulation:
         self._acted_ns = -1
         self._next_change_ns = self._find_next_change_ns()
         self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns, scenario.program)
+        self.metrics.on_failure = self._figures_failed
         self.number = {node: number for number, node in enumerate(world.node_ids)}
         self.driving = Driving(world, folder, self.number)
         for node, up in self.up.items():
@@ -753,6 +754,11 @@ class Emulation:
     def _sensor_failed(self, failure: SensorFailure) -> None:
         details = {"fault": f"world.sensor.{failure.sensor}", "rule": failure.model, "error": failure.error}
         self.folder.foresee(failure.time_ns, EventKind.rule_failed, None, **details, where=failure.where)
+
+    def _figures_failed(self, time_ns: int, entry: str, said: str, where: str) -> None:
+        self.folder.event(
+            time_ns, EventKind.rule_failed, None, fault="FIGURES", rule=entry, error=said, where=where
+        )
 
     def heal(self, label: str, now_ns: int) -> PlannedFault:
         """End a fault right after `now_ns`, and write that down. Raises ScenarioError if there is no such fault."""

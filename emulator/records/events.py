@@ -146,8 +146,8 @@ class EventKind(StrEnum):
     lane_ended = (
         "lane_ended", "vehicle", "lane", "on a map: a driven vehicle's lane has ended, and it is in this one now")
     rule_failed = (
-        "rule_failed", "", "fault rule sender error where", "a rule of your own raised, did not answer, or "
-        "answered nonsense: it lets everything pass from then on", FAILURE)
+        "rule_failed", "", "fault rule sender error where", "a rule, a sensor or figures of your own raised, did "
+        "not answer, or answered nonsense: it lets everything pass, or they are unknown, from then on", FAILURE)
     fault_started = "fault_started", "", "fault nodes", "a fault begins to act, and on whom"
     fault_ended = "fault_ended", "", "fault", "it has healed"
     judged_by_test = (

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cached_property
 from keyword import iskeyword
@@ -23,7 +23,15 @@ from numpy.typing import NDArray
 
 from emulator.radio.topology import component_links
 from emulator.records.distributions import chi2_quantile
-from emulator.records.period_figures import NUMBER, Period, ProgramFigures, figures_of, program_figures, vectors
+from emulator.records.period_figures import (
+    NUMBER,
+    FiguresError,
+    Period,
+    ProgramFigures,
+    figures_of,
+    program_figures,
+    vectors,
+)
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import ValueColumns, figures_among
 from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, by_instant, columns_of, schema_of
@@ -59,6 +67,11 @@ class Metrics:
         """Truth of the periods whose reports are in `_states`."""
         self._states: dict[str, list[Any]] = {}
         self._values = ValueColumns()
+        self.on_failure: Callable[[int, str, str, str], None] = lambda *failure: None
+        """Called where the program's figures fail: with the time in ns, their entry, and how, in one line and long.
+
+        They are unknown from then on.
+        """
         self._packed: list[pa.Table] = []
         self._table: pa.Table | None = None
 
@@ -100,8 +113,23 @@ class Metrics:
         first = (len(self._instants) - len(self._waiting)) * len(self._node_ids)
         of = self.declared
         reported = {name: vectors(self._states[name][first:], size) for name, size in of.vectors.items()}
-        self._rows += figures_of(self._waiting, reported, of)
+        try:
+            self._rows += figures_of(self._waiting, reported, of)
+        except FiguresError:
+            self._compute_one_by_one(reported)
         self._waiting = []
+
+    def _compute_one_by_one(self, reported: Mapping[str, Array]) -> None:
+        """Find the period in which the program's figures fail, whatever the number computed together."""
+        count = len(self._node_ids)
+        for number, period in enumerate(self._waiting):
+            columns = {name: array[number * count : (number + 1) * count] for name, array in reported.items()}
+            try:
+                self._rows += figures_of([period], columns, self.declared)
+            except FiguresError as error:
+                self.on_failure(period.instant.time_ns, self.declared.entry, str(error), error.where)
+                self.declared = self.declared.absent()
+                self._rows += figures_of([period], columns, self.declared)
 
     def _store(self, instant: Instant, last: dict[str, Report]) -> None:
         states, count = self._states, len(self._node_ids)

@@ -7,8 +7,8 @@ Every figure is the same bit by bit however many periods are computed together: 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from functools import cache, partial
 from itertools import starmap
 from typing import Annotated, Any, Literal, TypeAlias
@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationError
 
-from emulator.scenario.own_functions import CONSTANT, declared, load_entry
+from emulator.scenario.own_functions import CONSTANT, NonsenseError, declared, load_entry, told
 from emulator.scenario.program import Program
 from emulator.scenario.sections import FAR_M, first_problem, validated
 from emulator.world.world import Instant
-from vnet.errors import ScenarioError, VnetError, printable
+from vnet.errors import ScenarioError, VnetError, printable, shown
 from vnet.types import Array
 from vnet.units import label_of, unit_of
 
@@ -169,6 +169,14 @@ def views_of(data: Mapping[str, Any]) -> Views:
         raise VnetError(f"views: {first_problem(error, Views)}") from None
 
 
+class FiguresError(VnetError):
+    """Figures of a program that fail: how in one line, and the traceback `where`."""
+
+    def __init__(self, said: str, where: str) -> None:
+        super().__init__(said)
+        self.where = where
+
+
 @dataclass(frozen=True)
 class ProgramFigures:
     """Figures that a run's program declares, with vnet's own: docs/how-to/results.md."""
@@ -181,6 +189,31 @@ class ProgramFigures:
     """Figures that summary, report, comparison, sweep, list of runs and terminal show, in this order."""
     views: Views = NO_VIEWS
     compute: Callable[[Periods], Mapping[str, Sequence[Any]]] = lambda periods: {}
+    entry: str = ""
+    """The program's class, as `module:class`."""
+
+    @property
+    def own(self) -> dict[str, str]:
+        """The program's figures by name, with their types."""
+        known = {each.name for each in fields(PeriodFigures)}
+        return {each.name: str(each.type) for each in fields(self.row) if each.name not in known}
+
+    def computed(self, periods: Periods, count: int) -> dict[str, Sequence[Any]]:
+        """Return the program's figures of so many periods. Raises FiguresError."""
+        try:
+            given = self.compute(periods)
+            if not isinstance(given, Mapping):
+                raise NonsenseError(f"{shown(given)}: figures by name are needed")
+            return {name: _checked(name, kind, given.get(name), count) for name, kind in self.own.items()}
+        except (Exception, SystemExit) as error:
+            raise FiguresError(*told(error, __file__)) from error
+
+    def absent(self) -> ProgramFigures:
+        """Return the same figures with the program's unknown in each period."""
+        nothing: dict[str, Any] = {name: None if kind == NUMBER else [] for name, kind in self.own.items()}
+        return replace(
+            self, compute=lambda periods: {name: [each] * len(periods["fix_m"]) for name, each in nothing.items()}
+        )
 
     @property
     def vectors(self) -> dict[str, int]:
@@ -237,6 +270,7 @@ def _of_entry(entry: str) -> ProgramFigures:
                 }
             ),
             compute=kind.compute,
+            entry=entry,
         )
     except (AttributeError, TypeError, VnetError) as error:
         raise ScenarioError(f"{CONSTANT}: {entry!r} declares no figures of periods: {error}") from None
@@ -331,7 +365,7 @@ def figures_of(periods: Sequence[Period], reported: Mapping[str, Array], of: Pro
     """Return the figures of each period, of the class `of.row`.
 
     `reported` has the columns `of.vectors`, each an array (rows, size) with a row for each vehicle and period,
-    vehicle by vehicle within a period.
+    vehicle by vehicle within a period. Raises FiguresError.
     """
     found: list[Any] = []
     vehicles = len(periods[0].component)
@@ -370,8 +404,24 @@ def _figures(periods: Sequence[Period], columns: dict[str, Array], of: ProgramFi
         "position_anees": together.anees(error, columns["covariance_m2"]),
         "not_finite": [period.not_finite for period in periods],
     }
-    found |= of.compute(together)
+    found |= of.computed(together, len(periods))
     return list(starmap(of.row, zip(*(found[each.name] for each in fields(of.row)), strict=True)))
+
+
+def _checked(name: str, kind: str, values: Any, count: int) -> list[Any]:
+    """Return a figure of so many periods as numbers, with None for what is not finite. Raises NonsenseError."""
+    if values is None or isinstance(values, str) or not isinstance(values, Collection) or len(values) != count:
+        raise NonsenseError(f"{name} = {shown(values)}: a value for each of {count} periods is needed")
+    try:
+        return [_number(each) if kind == NUMBER else list(map(_number, each)) for each in values]
+    except (TypeError, ValueError, OverflowError):
+        raise NonsenseError(f"{name} = {shown(values)}: {kind} is needed for each period") from None
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, str):
+        raise TypeError
+    return None if value is None or not math.isfinite(number := float(value)) else number
 
 
 def _means_of_known(numbers: Array, known: _Mask) -> list[float | None]:

@@ -3,9 +3,11 @@
 import io
 import json
 import shutil
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -170,6 +172,63 @@ class OfTexts:
     def compute(periods: Any) -> dict[str, str]:
         """Return nothing."""
         return {}
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A figure whose function answers as `answer` says."""
+
+    half: float | None
+    answer: ClassVar[Callable[[int], Any]]
+
+    @staticmethod
+    def compute(periods: Any) -> Any:
+        """Answer for as many periods as there are."""
+        return Broken.answer(len(periods["fix_m"]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (
+            lambda count: {"half": [1 / 0] * count},
+            "raises ZeroDivisionError: division by zero (test_key_figures.py:",
+        ),
+        (lambda count: sys.exit("out"), "raises SystemExit: out (test_key_figures.py:"),
+        (lambda count: None, "answers None: figures by name are needed"),
+        (lambda count: {}, "answers half = None: a value for each of 1 periods is needed"),
+        (lambda count: {"half": [1.0, 2.0] * count}, "answers half = [1.0, 2.0]: a value for each of 1 periods"),
+        (lambda count: {"half": ["1"] * count}, "answers half = ['1']: float | None is needed for each period"),
+    ],
+)
+def test_figures_that_fail_are_named_and_the_rest_is_kept(
+    answer: Callable[[int], Any], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:Broken")
+    monkeypatch.setattr(Broken, "answer", answer, raising=False)
+    folder = simulate_into(Scenario.model_validate(SCENARIO), tmp_path / "run")
+    verdicts = {check.name: (check.verdict.value, check.text) for check in check_run(folder).checks}
+    assert verdicts["own_rules"][0] == "invalid"
+    assert verdicts["own_rules"][1].startswith(f"FIGURES ({__name__}:Broken) {said}")
+    assert verdicts["metrics"][0] == "unknown"
+    assert verdicts["verdict_file"][0] == "valid"
+    metrics = pq.read_table(folder / "metrics.parquet")
+    assert metrics["half"].null_count == len(metrics) == 20
+    assert metrics["position_rmse_m"].null_count == 0
+
+
+@pytest.mark.slow
+def test_a_figure_that_is_not_finite_or_a_whole_number_is_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:Broken")
+    monkeypatch.setattr(
+        Broken, "answer", lambda count: {"half": np.where(np.arange(count) < 9, np.nan, 2)}, raising=False
+    )
+    folder = simulate_into(Scenario.model_validate(SCENARIO), tmp_path / "run")
+    assert {check.name: check.verdict.value for check in check_run(folder).checks}["metrics"] == "valid"
+    assert pq.read_table(folder / "metrics.parquet")["half"].to_pylist() == [None] * 9 + [2.0] * 11
 
 
 @pytest.mark.parametrize("kind", [Wrong, OfTexts])
