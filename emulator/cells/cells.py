@@ -28,7 +28,15 @@ import pyarrow.parquet as pq
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from emulator.cells.worker import Place, Worker, WorkerDiedError, WorkerTimeoutError, call_fitly, modules_of
+from emulator.cells.worker import (
+    Place,
+    Worker,
+    WorkerDiedError,
+    WorkerTimeoutError,
+    call_fitly,
+    modules_of,
+    temporary_prefix,
+)
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session, over_zenoh
@@ -131,8 +139,8 @@ def each_done(
 ) -> Iterator[tuple[J, R]]:
     """Yield each job with its result as they are done, on `executor` or in `most` processes of this machine.
 
-    A job whose worker dies is run again, at last as `last` changes it. Raises VnetError that names the first job
-    that cannot be done; what has not begun is then cancelled.
+    A job whose worker dies is run again, at last as `last` changes it; so is one that stalls. Raises VnetError that
+    names the first job that cannot be done; what has not begun is then cancelled.
     """
     if not jobs:
         return
@@ -161,14 +169,15 @@ def each_done(
                     raise VnetError(
                         f"cell {dict(job.labels)}: the executor is broken; run it again to go on"
                     ) from None
-                except WorkerTimeoutError as error:
-                    raise VnetError(f"cell {dict(job.labels)}: {error}") from None
                 except Exception as error:
-                    if not worker_died(error):
+                    stalled = isinstance(error, WorkerTimeoutError)
+                    if not stalled and not worker_died(error):
                         raise
                     if tries == MOST_TRIES:
-                        raise VnetError(f"cell {dict(job.labels)}: {error}, {tries} times") from None
-                    waiting[submit(job if tries + 1 < MOST_TRIES else last(job))] = job, tries + 1
+                        times = "" if stalled else f", {tries} times"
+                        raise VnetError(f"cell {dict(job.labels)}: {error}{times}") from None
+                    tries = MOST_TRIES if stalled else tries + 1
+                    waiting[submit(last(job) if tries == MOST_TRIES else job)] = job, tries
     finally:
         for future in waiting:
             future.cancel()
@@ -222,7 +231,7 @@ class Cell:
     measure: Measure | None = None
     """Gives an experiment's figures, which a crash ends; without one they are those of the run's verdict."""
     apart: bool = False
-    """True for a process a vehicle: one that ends its process has died, and nothing else has ended."""
+    """True for a process a vehicle: one that ends or stalls its process does so to nothing else."""
 
     @property
     def digest(self) -> str:
@@ -278,7 +287,7 @@ def run_cells(
 
 def compute(cell: Cell, live: bool = False) -> CellResult:
     """Run one cell in this process. Raises VnetError that names the cell if it cannot be run."""
-    with tempfile.TemporaryDirectory(prefix="vnet-cell-") as name:
+    with tempfile.TemporaryDirectory(prefix=temporary_prefix(os.getpid())) as name:
         try:
             return _compute(cell, Path(name) / "run", live)
         except VnetError as error:
@@ -306,17 +315,17 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
 def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a judged run as one flat row.
 
-    `failed`: the names of invalid checks; `failure`: what the first of them saw; `frames_OUTCOME`: receptions by
-    outcome; `packet_delivery_ratio`; all of vnet's figures by name; of each value that programs report the mean
-    over all reports by its name, and as `last.NAME` the mean over the vehicles of their last one; of own checks
-    each number by `own:NAME.FIGURE`. Texts and rows are left out.
+    `failed`: the names of the checks with the run's verdict, unless it is valid; `failure`: what the first of them
+    saw; `frames_OUTCOME`: receptions by outcome; `packet_delivery_ratio`; all of vnet's figures by name; of each
+    value that programs report the mean over all reports by its name, and as `last.NAME` the mean over the vehicles
+    of their last one; of own checks each number by `own:NAME.FIGURE`. Texts and rows are left out.
     """
     frames = verdict["frames_by_outcome"]
-    invalid = [check for check in verdict["checks"] if check["verdict"] == "invalid"]
+    broken = [check for check in verdict["checks"] if check["verdict"] == verdict["verdict"] != "valid"]
     row = {
         "verdict": verdict["verdict"],
-        "failed": ", ".join(check["name"] for check in invalid),
-        "failure": invalid[0]["text"] if invalid else "",
+        "failed": ", ".join(check["name"] for check in broken),
+        "failure": broken[0]["text"] if broken else "",
         "vehicles": verdict["vehicles"],
         "emulated_s": verdict["emulated_s"],
         "packet_delivery_ratio": verdict["packet_delivery_ratio"],

@@ -13,6 +13,7 @@ import inspect
 import math
 import os
 import pickle
+import shutil
 import signal
 import socket
 import subprocess
@@ -235,6 +236,13 @@ def _end(process: subprocess.Popen[bytes], connection: Connection, errors: IO[by
     process.wait()
     connection.close()  # afterwards: a thread that waits for an answer sees the end of the process
     errors.close()
+    for left in Path(tempfile.gettempdir()).glob(f"{temporary_prefix(process.pid)}*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def temporary_prefix(pid: int) -> str:
+    """Return how the names of the temporary folders of a process's jobs begin, which go when it is ended."""
+    return f"vnet-cell-{pid}-"
 
 
 def _with_vnet(environment: Mapping[str, str]) -> dict[str, str]:

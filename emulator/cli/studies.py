@@ -108,10 +108,10 @@ def sweep(
         verdicts = table["verdict"].to_pylist()
         counts = ", ".join(f"{verdicts.count(name)} {name}" for name in sorted(set(verdicts)))
         lines = [f"{len(table)} runs: {counts}"]
-        if "invalid" in verdicts:
-            (row,) = table.slice(verdicts.index("invalid"), 1).to_pylist()
+        if worst := next((each for each in ("invalid", "unknown") if each in verdicts), None):
+            (row,) = table.slice(verdicts.index(worst), 1).to_pylist()
             where = ", ".join(f"{key} {row[key]}" for key in (*plan.varied, "seed"))
-            lines.append(f"first invalid: {where}: {row['failed'].partition(', ')[0]}: {row['failure']}")
+            lines.append(f"first {worst}: {where}: {row['failed'].partition(', ')[0]}: {row['failure']}")
         SafeConsole().print("\n".join(lines), highlight=False, soft_wrap=True)
         print(folder / SWEEP_TABLE)
         print(folder / SWEEP_PAGE)

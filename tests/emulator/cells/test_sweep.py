@@ -240,10 +240,34 @@ def test_numbers_of_own_checks_are_columns() -> None:
         {"name": "conservation", "verdict": "valid", "figures": {"frames": 10}},
     ]
     names = ("verdict", "vehicles", "emulated_s", "trace_sha256", "metrics_sha256", "wall_s", "real_time_factor")
-    verdict: dict[str, Any] = dict.fromkeys([*names, "packet_delivery_ratio"])
+    verdict: dict[str, Any] = dict.fromkeys([*names, "packet_delivery_ratio"]) | {"verdict": "invalid"}
     row = judged_figures(verdict | {"checks": checks, "frames_by_outcome": {}, "figures": {}, "reported": {}})
     assert {name: value for name, value in row.items() if "." in name} == {
         "own:warned.slowest_s": 0.2,
         "own:warned.late": 3,
     }
     assert (row["failed"], row["failure"]) == ("own:warned", "3 late")
+
+
+@pytest.mark.slow
+def test_a_run_whose_program_stalls_is_a_row(tmp_path: Path) -> None:
+    (tmp_path / "spin.py").write_text(SPIN)
+    (tmp_path / "t.toml").write_text(
+        "[run]\nduration_s = 0.4\nstall_timeout_s = 0.5\n[network]\nvehicles = 2\n[program]\nentry = 'spin:main'\n"
+    )
+    rows = emulator.sweep(tmp_path / "t.toml", {"program.options.spin": [0, 1]}, out=tmp_path / "out").to_pylist()
+    assert [row["emulated_s"] for row in rows] == [0.4, 0.0]
+    assert rows[1]["verdict"] == "unknown" and "progress" in rows[1]["failed"]
+    result = CliRunner().invoke(
+        command_app(command), [f"{tmp_path}/t.toml", "--option", "spin=1", "--out", f"{tmp_path / 'again'}"]
+    )
+    assert f"first unknown: seed 1: {rows[1]['failed'].partition(', ')[0]}: {rows[1]['failure']}" in result.output
+
+
+SPIN = """
+async def main(node):
+    while node.options["spin"] and node.id == "v02":
+        pass
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"")
+"""
