@@ -164,12 +164,12 @@ class Run:
 
         `name` and `values` are those of a program's own event (`node.event`), as in properties over time.
         """
-        return self._recorded.events
+        return list(self._recorded.events)  # a check may sort it, and others read them after it
 
     @property
     def nodes(self) -> list[str]:
         """Ids of all vehicles."""
-        return self._recorded.node_ids
+        return list(self._recorded.node_ids)
 
     @property
     def period_s(self) -> float:
@@ -189,7 +189,7 @@ class Run:
     @property
     def faults(self) -> Sequence[PlannedFault]:
         """Faults with `start_ns`, `end_ns` and `label`."""
-        return self._recorded.plan
+        return list(self._recorded.plan)
 
     @property
     def rested_s(self) -> float:
@@ -204,7 +204,7 @@ class Run:
     @property
     def runs_the_program(self) -> Mask:
         """Vehicles (N,) that run the scenario's program, and none of its exceptions."""
-        return self._recorded.runs_the_program
+        return self._recorded.runs_the_program.copy()
 
     def index(self, node: str) -> int:
         """Return the index of a vehicle in arrays. Raises VnetError for an id that no vehicle has."""

@@ -73,6 +73,13 @@ def elsewhere(run):
     os.chdir("/")
     print("road\\udce9")
     yield "away", "valid", os.getcwd()
+
+def clearing(run):
+    run.events.clear()
+    run.nodes.clear()
+    run.positions(0.0)[:] = 0.0
+    run.runs_the_program[:] = False
+    yield "kept", "valid", str(len(run.events) > 0 < len(run.nodes))
 """
 SCENARIO = (
     '[run]\nname = "own"\nduration_s = 0.5\nsettle_s = 0.0\n[network]\nvehicles = 3\n[radio]\nrange_m = 1e5\n'
@@ -147,6 +154,12 @@ def test_a_check_may_go_elsewhere_and_print_what_is_no_text(here: Path) -> None:
     assert (status, Path.cwd()) == (0, here)
     assert "own:away" in text
     assert (here / "run" / "logs" / "checks.txt").read_text() == "road\\udce9\n"
+
+
+def test_a_check_cannot_change_what_others_read(here: Path) -> None:
+    status, text = simulate("clearing")
+    assert status == 0 and "True" in text
+    assert vnet("check", "run")[0] == 0
 
 
 def test_a_failed_check_makes_the_run_invalid_and_shows_its_rows(here: Path) -> None:
