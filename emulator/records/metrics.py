@@ -173,7 +173,7 @@ class Metrics:
         """A row for each node and period; the columns of `STATES`, then those of reported values."""
         if self._table is None:
             self._pack()
-            packed = pa.concat_tables(self._packed) if self._packed else STATES.schema.empty_table()
+            packed = pa.concat_tables(self._packed) if self._packed else self.schema.empty_table()
             self._table = self._values.add_to(packed.unify_dictionaries())
         return self._table
 

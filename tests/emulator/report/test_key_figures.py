@@ -236,3 +236,11 @@ def test_a_declaration_that_cannot_be_is_refused(kind: type, monkeypatch: pytest
     monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:{kind.__name__}")
     with pytest.raises(ScenarioError, match=f"DECLARES: '{__name__}:{kind.__name__}' declares no figures"):
         program_figures(Program(entry=f"{__name__}:guess"))
+
+
+@pytest.mark.slow
+def test_a_run_that_ends_before_its_first_period_has_the_columns_of_its_program(tmp_path: Path) -> None:
+    scenario = Scenario.model_validate({**SCENARIO, "program": {"entry": "agents.cooperative:main"}})
+    Session(scenario, tmp_path / "run").open().close()
+    judged = check_run(tmp_path / "run", own_checks=True)
+    assert not [check.text for check in judged.checks if check.name.startswith("own:")], "none is applicable"
