@@ -321,7 +321,7 @@ CHECKS: list[Check] = [
         "second or every two periods. A program that usually reports less often has twice its usual time, at most "
         "two seconds or four periods. A process that starts in real time has 5 s; without faults, so has every "
         "program at first and after it enters. A program that never reported is not expected to, unless a fault "
-        "took its vehicle and the program reports elsewhere.",
+        "acted on its vehicle before it had as long as others took for their first report, and a second.",
         invalid="a longer silence",
         unknown=BEHIND,
         not_applicable="no program reports so often, or less than a second is left",

@@ -250,20 +250,29 @@ def _where(silent: list[dict[str, Any]], recorded: RecordedRun, bound_s: Array) 
 def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
     """Periods (N,) that nodes may be silent: `window`, or up to twice that by twice their program's usual time.
 
-    0, for ever, unless a node reports within `window` at some time, or a fault took it and its program does
-    elsewhere. The usual time is that which three of four times between reports do not exceed.
+    0, for ever, unless a node reports within `window` at some time, or its program does elsewhere and a fault acted
+    on it before it had as much time to begin as the last that has begun, and `window`. The usual time is that which
+    three of four times between reports do not exceed.
     """
+    period_ns = recorded.scenario.period_ns
     programs = [recorded.scenario.program.of(node).entry for node in recorded.node_ids]
     apart = [np.diff(np.flatnonzero(reported)) for reported in recorded.reported.T]
     able = np.array([bool((each <= window).any()) for each in apart])
+    up_ns = np.array([_times_up(recorded, node)[:1] or [(END_OF_TIME_NS, 0)] for node in range(len(able))])[:, 0, 0]
+    begun_ns = recorded.reported.argmax(axis=0) * period_ns - up_ns
+    struck_ns = np.full(len(able), END_OF_TIME_NS)
+    for planned in recorded.plan:
+        struck = planned.nodes & (up_ns <= planned.end_ns)
+        struck_ns[struck] = np.minimum(struck_ns[struck], planned.start_ns)
     longest: dict[str, int] = {}
+    slowest_ns: dict[str, int] = {}
     for program in {programs[node] for node in np.flatnonzero(able)}:
         its_own = [each for each, of in zip(apart, programs, strict=True) if of == program]
         usual = np.percentile(np.concatenate(its_own), 75)
         longest[program] = min(max(window, int(2 * usual)), 2 * window)
-    taken = np.zeros(len(able), dtype=bool)
-    for planned in recorded.plan:
-        taken |= planned.nodes
+        of_it = [node for node in np.flatnonzero(able).tolist() if programs[node] == program]
+        slowest_ns[program] = int(begun_ns[of_it].max()) + window * period_ns
+    taken = struck_ns - up_ns < np.array([slowest_ns.get(program, 0) for program in programs])
     return np.where(able | taken, [longest.get(program, 0) for program in programs], 0)
 
 

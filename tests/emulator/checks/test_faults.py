@@ -592,6 +592,24 @@ def test_a_program_that_nearly_stops_is_not_its_own_measure() -> None:
     assert verdict(simulated(program=f"{__name__}:nearly_stops"), "liveness") is Verdict.INVALID
 
 
+async def first_is_silent(node: Node) -> None:
+    """Report with each fix from 0.5 s on, but for the first vehicle, which never does."""
+    async for fix in node.gnss:
+        if node.id != "v01" and fix.time_ns >= 500_000_000:
+            node.report(fix.position_m, fix.covariance_m2)
+
+
+@pytest.mark.parametrize(("at_s", "expected"), [(2.0, Verdict.VALID), (1.0, Verdict.INVALID)])
+@pytest.mark.parametrize("kind", ["kill", "pause", "gnss_outage"])
+def test_one_that_never_reports_is_expected_to_only_if_a_fault_left_it_no_time(
+    kind: str, at_s: float, expected: Verdict
+) -> None:
+    """As the leader of a platoon, which has no gap to report; others began after 0.5 s."""
+    fault = {"kind": kind, "at_s": at_s, "duration_s": 1.0, "nodes": ["v01"]}
+    recorded = simulated(fault, program=f"{__name__}:first_is_silent")
+    assert verdict(recorded, "liveness") is expected
+
+
 async def starts_late_and_ends(node: Node) -> None:
     """Report from the third second on; one vehicle ends right after a report."""
     async for fix in node.gnss:
