@@ -322,6 +322,7 @@ def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
     """
     frames = verdict["frames_by_outcome"]
     broken = [check for check in verdict["checks"] if check["verdict"] == verdict["verdict"] != "valid"]
+    broken.sort(key=lambda check: check["name"] != "progress")  # what cut a run explains what else it lacks
     row = {
         "verdict": verdict["verdict"],
         "failed": ", ".join(check["name"] for check in broken),
