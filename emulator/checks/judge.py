@@ -320,10 +320,10 @@ CHECKS: list[Check] = [
         "Once no fault acts any more, and restarts are over, each vehicle that is up reports at least once a "
         "second or every two periods. A program that usually reports less often has twice its usual time, at most "
         "two seconds or four periods. A process that starts in real time has 5 s; without faults, so has every "
-        "program at first and after it enters. A program that never reported is not expected to, unless a fault "
-        "acted on its vehicle before it had as long as others took for their first report, and a second.",
+        "program at first and after it enters. A program that never reported is not expected to.",
         invalid="a longer silence",
-        unknown=BEHIND,
+        unknown="a fault took a vehicle that never reported, or its fixes, before it had as long as others took for "
+        f"their first report, and a second; {BEHIND}",
         not_applicable="no program reports so often, or less than a second is left",
         realtime_sensitive=True,
     ),

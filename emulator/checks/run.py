@@ -28,7 +28,7 @@ from emulator.records.verdicts import (
     unknown,
     valid,
 )
-from emulator.scenario.faults import ProcessFault
+from emulator.scenario.faults import GnssOutage, ProcessFault
 from vnet.errors import counted, first_names, printable
 from vnet.reports import COVARIANCE_TOLERANCE, LONGEST_TEXT, check_name
 from vnet.types import Array, IntArray, Mask
@@ -236,6 +236,8 @@ def check_liveness(recorded: RecordedRun) -> Finding:
     if recorded.plan:
         text += " after the last fault"
     broken_text = f"{len(silent)} of {counted(count, 'node')} silent {_where(silent, recorded, bound_s)}"
+    if silent and not recorded.reported[:, [recorded.number[each["node"]] for each in silent]].any():
+        return unknown(f"{broken_text}: it never reported, and a fault left it no time to", rows=silent[:MOST_ROWS])
     return result(len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
 
 
@@ -250,8 +252,8 @@ def _where(silent: list[dict[str, Any]], recorded: RecordedRun, bound_s: Array) 
 def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
     """Periods (N,) that nodes may be silent: `window`, or up to twice that by twice their program's usual time.
 
-    0, for ever, unless a node reports within `window` at some time, or its program does elsewhere and a fault acted
-    on it before it had as much time to begin as the last that has begun, and `window`. The usual time is that which
+    0, for ever, unless a node reports within `window` at some time, or its program does elsewhere and a fault took
+    it, or its fixes, before it had as much time to begin as the last that has begun, and `window`. The usual time is that which
     three of four times between reports do not exceed.
     """
     period_ns = recorded.scenario.period_ns
@@ -262,7 +264,8 @@ def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
     begun_ns = recorded.reported.argmax(axis=0) * period_ns - up_ns
     struck_ns = np.full(len(able), END_OF_TIME_NS)
     for planned in recorded.plan:
-        struck = planned.nodes & (up_ns <= planned.end_ns)
+        takes = isinstance(planned.fault, (ProcessFault, GnssOutage))
+        struck = planned.nodes & (up_ns <= planned.end_ns) & takes
         struck_ns[struck] = np.minimum(struck_ns[struck], planned.start_ns)
     longest: dict[str, int] = {}
     slowest_ns: dict[str, int] = {}

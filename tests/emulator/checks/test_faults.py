@@ -599,8 +599,17 @@ async def first_is_silent(node: Node) -> None:
             node.report(fix.position_m, fix.covariance_m2)
 
 
-@pytest.mark.parametrize(("at_s", "expected"), [(2.0, Verdict.VALID), (1.0, Verdict.INVALID)])
-@pytest.mark.parametrize("kind", ["kill", "pause", "gnss_outage"])
+@pytest.mark.parametrize(
+    ("kind", "at_s", "expected"),
+    [
+        ("kill", 2.0, Verdict.VALID),
+        ("pause", 2.0, Verdict.VALID),
+        ("gnss_outage", 2.0, Verdict.VALID),
+        ("gnss_freeze", 0.0, Verdict.VALID),
+        ("pause", 1.0, Verdict.UNKNOWN),
+        ("kill", 0.0, Verdict.UNKNOWN),
+    ],
+)
 def test_one_that_never_reports_is_expected_to_only_if_a_fault_left_it_no_time(
     kind: str, at_s: float, expected: Verdict
 ) -> None:
