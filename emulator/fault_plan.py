@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import count
 
 import numpy as np
@@ -193,7 +194,7 @@ class FaultPlan:
             if self._nodes_at is None or not _selects_by_position(fault):
                 nodes, links = _selection(fault, self._nodes, fault_stream(self._seed, drawn, "select"))
             else:
-                moving = _MovingSelection(fault, self._nodes_at, self._period_ns, self._seed, drawn)
+                moving = self._moving(fault, drawn, self._nodes_at)
                 nodes, links = moving(start_ns)
         except ScenarioError as error:
             raise ScenarioError(f"{fault.title}-{number}: {error}") from None
@@ -203,6 +204,15 @@ class FaultPlan:
         self._refuse_parts_of_processes(planned)
         self.faults.append(planned)
         return planned
+
+    def _moving(self, fault: Fault, draws_of: int, nodes_at: Callable[[int], Nodes]) -> Callable[[int], Selection]:
+        """Return what gives the nodes and links of a fault at an instant; an answer holds for a whole period."""
+
+        @lru_cache(1)
+        def in_period(period: int) -> Selection:
+            return _selection(fault, nodes_at(period), fault_stream(self._seed, draws_of, "select"))
+
+        return lambda time_ns: in_period(time_ns // self._period_ns)
 
     def _refuse_parts_of_processes(self, planned: PlannedFault) -> None:
         """Raise ScenarioError for a fault of some nodes of a process: they start, pause and die together."""
@@ -263,27 +273,6 @@ def _selects_by_position(fault: Fault) -> bool:
     """Return whether a selector of the fault depends on positions."""
     selectors = (getattr(fault, name, None) for name in ("nodes", "senders", "receivers"))
     return any(selector is not None and selector.by_position for selector in selectors)
-
-
-class _MovingSelection:
-    """The nodes and links of a fault at each instant; the last answer is kept, as it holds for a whole period."""
-
-    def __init__(
-        self, fault: Fault, nodes_at: Callable[[int], Nodes], period_ns: int, seed: int, draws_of: int
-    ) -> None:
-        self._fault = fault
-        self._nodes_at = nodes_at
-        self._period_ns = period_ns
-        self._seed = seed
-        self._draws_of = draws_of
-        self._last: tuple[int, Selection] | None = None
-
-    def __call__(self, time_ns: int) -> Selection:
-        period = time_ns // self._period_ns
-        if self._last is None or self._last[0] != period:
-            rng = fault_stream(self._seed, self._draws_of, "select")
-            self._last = period, _selection(self._fault, self._nodes_at(period), rng)
-        return self._last[1]
 
 
 def _selection(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> Selection:

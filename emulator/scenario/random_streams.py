@@ -37,9 +37,9 @@ def named_key(name: str) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little")
 
 
-def philox(seed: int, key: int, item: int = 0) -> np.random.Philox:
-    """Return the bit generator of number `item` among the streams of a seed and a key."""
-    counter = np.array([0, 0, item, 0], dtype=np.uint64)
+def philox(seed: int, key: int, item: int = 0, seq: int = 0, copy: int = 0) -> np.random.Philox:
+    """Return the bit generator of number `item`, or of a frame of this sender, of a seed and a key."""
+    counter = np.array([0, seq, item, copy], dtype=np.uint64)
     return np.random.Philox(key=np.array([seed, key], dtype=np.uint64), counter=counter)
 
 
@@ -50,9 +50,7 @@ def stream(seed: int, name: str, item: int = 0) -> np.random.Generator:
 
 def frame_stream(seed: int, name: str, sender: int, seq: int, copy: int = 0) -> np.random.Generator:
     """Return the stream of one frame, or a copy of it, among those of a name."""
-    counter = np.array([0, seq, sender, copy], dtype=np.uint64)
-    key = np.array([seed, named_key(name)], dtype=np.uint64)
-    return np.random.Generator(np.random.Philox(key=key, counter=counter))
+    return np.random.Generator(philox(seed, named_key(name), sender, seq, copy))
 
 
 def philox_words_at(
