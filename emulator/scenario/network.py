@@ -329,3 +329,8 @@ class Map(Section):
     common error: programs add it to the covariances that they state, not to what they exchange."""
     margin_m: float = Field(300.0, ge=0, le=FAR_M)
     """Programs are given the roads within so much of the box in which vehicles drive."""
+
+    @property
+    def side(self) -> float:
+        """1 where people drive on the right, else -1."""
+        return 1.0 if self.drive_on == "right" else -1.0

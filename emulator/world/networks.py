@@ -106,6 +106,12 @@ def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, t
     return name, (values[0], values[1], values[2])
 
 
+def numbered_ids(vehicles: int) -> tuple[str, ...]:
+    """Return the ids v01, v02, … of vehicles, which sort as they are numbered."""
+    width = max(2, len(str(vehicles)))
+    return tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
+
+
 def generate_network(layout: str, vehicles: int, seed: int) -> PlacedVehicles:
     """Draw a network of `vehicles`; the same arguments give the same network.
 
@@ -114,8 +120,7 @@ def generate_network(layout: str, vehicles: int, seed: int) -> PlacedVehicles:
     other.
     """
     rng = np.random.Generator(philox(seed, NETWORK_KEY))
-    width = max(2, len(str(vehicles)))
-    node_ids = tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
+    node_ids = numbered_ids(vehicles)
     heading_rad = _draw_headings(rng, vehicles)
     if layout == "dense":
         return PlacedVehicles(node_ids, rng.uniform(0, 1.4 * REFERENCE_RANGE_M, (vehicles, 2)), heading_rad)

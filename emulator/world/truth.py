@@ -50,24 +50,15 @@ EVERY = slice(None)
 """All periods."""
 
 
-@dataclass(frozen=True)
-class CommonErrors:
-    """The common error `common_m` (K, 2) at the start of each period, in metres.
+def common_errors(scenario: Scenario, periods: int) -> tuple[Array, Array | None]:
+    """Return the common error (K, 2) at the start of each period, in metres, and what receivers have beyond it.
 
-    `receiver_m` (K, R, 2) is what each of a file's receivers has beyond it; None without several. Vehicle n has
-    that of receiver n mod R.
+    The latter is (K, R, 2) for each of a file's receivers; None without several. Vehicle n has that of receiver n
+    mod R. Raise ScenarioError for a file that cannot be used.
     """
-
-    common_m: Array
-    receiver_m: Array | None = None
-
-
-def common_errors(scenario: Scenario, periods: int) -> CommonErrors:
-    """Return the common error of a run. Raise ScenarioError for a file that cannot be used."""
     common = scenario.world.common_error
     if common.path is None:
-        error_m = gauss_markov(scenario, "common error", (common.sigma_m, common.tau_s), (periods, 2))
-        return CommonErrors(error_m)
+        return gauss_markov(scenario, "common error", (common.sigma_m, common.tau_s), (periods, 2)), None
     time_s, error_m = _read(common.path)
     start_s = time_s[0] if common.start_s is None else common.start_s
     at_s = start_s + np.arange(periods) * scenario.period_ns / NS_PER_S
@@ -79,7 +70,7 @@ def common_errors(scenario: Scenario, periods: int) -> CommonErrors:
     columns = [np.interp(at_s, time_s, column) for column in error_m.reshape(len(time_s), -1).T]
     recorded_m = np.stack(columns, axis=1).reshape(periods, -1, 2)
     common_m = recorded_m.mean(axis=1)
-    return CommonErrors(common_m, recorded_m - common_m[:, None] if recorded_m.shape[1] > 1 else None)
+    return common_m, recorded_m - common_m[:, None] if recorded_m.shape[1] > 1 else None
 
 
 def gauss_markov(
@@ -321,7 +312,6 @@ class World:
         self.lane_of = lane_of
         self.notes = motion.notes
         self.course_m, self._heading_rad = motion.position_m, motion.heading_rad
-        scenario.require_extras()
         buildings = load_buildings(scenario, frame, self.area_m)
         self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings, scenario.roadside)
         if buildings is not None and not len(buildings):
@@ -334,8 +324,7 @@ class World:
         self._multipath = _stated_multipath(scenario.world.gnss)
         self._covariance_m2 = np.eye(2) * (scenario.world.gnss.sigma_m**2 + self._multipath[0] ** 2)
         self._covariance_m2.flags.writeable = False  # one for all fixes
-        common = common_errors(scenario, self.periods)
-        self._common_m, self.receiver_m = common.common_m, common.receiver_m
+        self._common_m, self.receiver_m = common_errors(scenario, self.periods)
         self._noise_m = noise_m(scenario, self.periods, count)
         further_m = further_error_m(scenario, self.course_m, self.area_m.mean(axis=0), self.receiver_m)
         if further_m is not None:

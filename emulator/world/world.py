@@ -78,6 +78,7 @@ def _drive(scenario: Scenario) -> World:
 
 def build_world(scenario: Scenario) -> World:
     """Return the world of a scenario. Raise ScenarioError if its network, map or links cannot be used."""
+    scenario.require_extras()
     network = scenario.network
     if network.kind == "driven":
         return DrivenWorld(scenario)

@@ -10,12 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.scenario.network import Driven, Map
+from emulator.scenario.network import Driven
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.road import Start, check_room, one_each, queue_m
-from emulator.world.maps.city import city_roads
-from emulator.world.maps.files import lanes_in_box, notes_of, read_roads
+from emulator.world.maps.files import lanes_in_box, notes_of, roads_of
 from emulator.world.maps.roads import NUMBER, Ints, Roads
 from emulator.world.neighbours import links_within
 from emulator.world.projection import CoordinateFrame
@@ -624,30 +623,17 @@ class _StartPlace(NamedTuple):
     position_m: Array
 
 
-@dataclass(frozen=True)
-class MapStart:
-    """Vehicles at the start, the lanes that programs know, the frame of the metres, and notes for the user."""
-
-    start: Start
-    lanes: RoadMap
-    frame: CoordinateFrame | None
-    notes: tuple[str, ...]
-
-
-def start_on_map(scenario: Scenario) -> MapStart:
+def start_on_map(scenario: Scenario) -> tuple[Start, RoadMap, CoordinateFrame | None, tuple[str, ...]]:
     """Return where vehicles are on the scenario's map, or in a generated city without one.
 
+    Return also the lanes that programs know, the frame of the metres, and notes for the user.
     Raise ScenarioError if the map cannot be read, for a route that is none, and if there is no room.
     """
     section, driven, network = scenario.map, scenario.driven, scenario.network
     count = network.vehicles
-    if section is None:
-        source: object = "the generated city"
-        roads = city_roads(network.seed, network.size_m)
-    else:
-        source, roads = section.path, read_roads(section.path, section.origin_deg)
+    source, roads = roads_of(network, section)
     links = RoadLinks(roads, driven.vehicle_width_m)
-    paths = Paths(*((links, 1.0, 0.0) if section is None else (links, _side(section), section.aside_m)))
+    paths = Paths(*((links, 1.0, 0.0) if section is None else (links, section.side, section.aside_m)))
     reach_m = driven.max_speed_mps * scenario.run.duration_s
     if scenario.world.ranging is not None:
         reach_m += scenario.world.ranging.range_m
@@ -655,18 +641,14 @@ def start_on_map(scenario: Scenario) -> MapStart:
     start = ways.named(driven.routes, count) if driven.routes else ways.drawn(count, network.seed)
     assert isinstance(start.road, MapRoads)
     if section is None:
-        return MapStart(start, roads.lane_map(), roads.frame, ())
+        return start, roads.lane_map(), roads.frame, ()
     lanes = lanes_in_box(roads, section, *start.road.area_m(start.along_m))
     if lanes is None:
         raise ScenarioError(
             f"map.aside_m = {section.aside_m:g}: vehicles would be further than margin_m = {section.margin_m:g} m "
             f"from all roads of {source}"
         )
-    return MapStart(start, lanes, roads.frame, notes_of(section.path, roads))
-
-
-def _side(section: Map) -> float:
-    return 1.0 if section.drive_on == "right" else -1.0
+    return start, lanes, roads.frame, notes_of(section.path, roads)
 
 
 class _Ways:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +14,13 @@ from emulator.scenario.network import control_step_ns
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.road import Start, start_on_single_road
-from emulator.world.driven.vehicles import DrivenVehicles, Happening, Log
+from emulator.world.driven.vehicles import DrivenVehicles, Happening, SteppedVehicles
+from emulator.world.networks import numbered_ids
 from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion
 from emulator.world.truth import MotionSensors, World, periods_of, refuse_shared_processes
 from vnet.errors import ScenarioError
-from vnet.node import Action, Fix
+from vnet.node import Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array, Mask
@@ -44,42 +44,6 @@ class Background:
         self.time_ns.append(time_ns)
         self.numbers.append(np.array([self.names.setdefault(each, len(self.names)) for each in ids], np.int32))
         self.position_m.append(position_m)
-
-
-class SteppedVehicles(Protocol):
-    """Vehicles from control instant to control instant, `step_ns` apart. `now_ns` is the last they have come to."""
-
-    step_ns: int
-    now_ns: int
-
-    @property
-    def speed(self) -> Array:
-        """Speeds (N,) in m/s; NaN for an absent vehicle."""
-        ...
-
-    def place(self) -> tuple[Array, Array]:
-        """Return positions (N, 2) in m and headings (N,) in [0, 2π); NaN for an absent vehicle."""
-        ...
-
-    def gaps(self, range_m: float) -> tuple[Array, Array]:
-        """Return the gaps (N,) to the vehicles ahead, in m, and their rates in m/s; NaN where none is in range."""
-        ...
-
-    def take(self, time_ns: int, number: int, action: Action) -> list[Happening]:
-        """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
-        ...
-
-    def advance(self) -> list[Happening]:
-        """Let all drive to the next control instant; returns what happens."""
-        ...
-
-    def remove_arrived(self) -> bool:
-        """Take those off the road that have come to its end; returns whether there are any."""
-        ...
-
-    def finished_log(self) -> Log:
-        """Return the log of a run that is over, up to the last control instant."""
-        ...
 
 
 class SteppedWorld(World):
@@ -217,7 +181,7 @@ class DrivenWorld(SteppedWorld):
     vehicles: DrivenVehicles
 
     def __init__(self, scenario: Scenario) -> None:
-        node_ids = _node_ids(scenario.network.vehicles)
+        node_ids = numbered_ids(scenario.network.vehicles)
         start, lanes, frame, notes = _start(scenario, len(node_ids))
         self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz), start)
         self._furthest_m = start.along_m + scenario.driven.max_speed_mps * scenario.run.duration_s
@@ -242,11 +206,6 @@ class DrivenWorld(SteppedWorld):
         return self.vehicles.road.area_m(self._furthest_m)
 
 
-def _node_ids(vehicles: int) -> tuple[str, ...]:
-    width = max(2, len(str(vehicles)))
-    return tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
-
-
 def _start(
     scenario: Scenario, count: int
 ) -> tuple[Start, LaneMap | RoadMap, CoordinateFrame | None, tuple[str, ...]]:
@@ -254,8 +213,7 @@ def _start(
     if scenario.driven.road == "map":
         from emulator.world.driven.map_driving import start_on_map
 
-        found = start_on_map(scenario)
-        return found.start, found.lanes, found.frame, found.notes
+        return start_on_map(scenario)
     start = start_on_single_road(scenario.driven, count)
     return start, _lane_map(scenario), None, ()
 

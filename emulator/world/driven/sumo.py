@@ -11,7 +11,6 @@ import tempfile
 import threading
 import time
 import weakref
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import IO, TypeVar
 import msgspec
 import numpy as np
 
-from emulator.scenario.network import LIBSUMO, Network, Sumo, control_step_ns, node_id, read_begin_s
+from emulator.scenario.network import Network, Sumo, control_step_ns, node_id, read_begin_s
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.stepped import Background, SteppedWorld
 from emulator.world.driven.sumo_process import (
@@ -42,12 +41,11 @@ from emulator.world.driven.sumo_process import (
     decode_answer,
     write,
 )
-from emulator.world.driven.vehicles import COLLISION, LIMITED, Happening, Log
+from emulator.world.driven.vehicles import COLLISION, LIMITED, Happening, Log, SteppedVehicles
 from emulator.world.projection import CoordinateFrame
 from emulator.world.truth import refuse_shared_processes
 from vnet.errors import ScenarioError, VnetError, first_names, printable, shown
-from vnet.extras import require
-from vnet.node import Action, Fix
+from vnet.node import Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
@@ -65,11 +63,6 @@ STEPS = 100
 """Steps that SUMO makes for one answer before the run, so that this comes well within the time for it."""
 TRAFFIC_LIGHTS = "traffic_lights"
 """Name of the reading of a node that is told the traffic lights."""
-
-
-def require_libsumo(path: Path) -> None:
-    """Raise ScenarioError unless libsumo is installed; `path` is the configuration that needs it."""
-    require(f"{path}: network.step = true", LIBSUMO, error=ScenarioError)
 
 
 class SumoProcess:
@@ -272,29 +265,27 @@ def _options(path: Path, seed: int, step_ns: int) -> list[str]:
     return [part for name, value in options.items() for part in (f"--{name}", str(value))]
 
 
-class SumoVehicles:
+class SumoVehicles(SteppedVehicles):
     """Vehicles in SUMO, of which programs drive those that they have asked something of.
 
-    `sumo_ids` are the vehicles' ids in SUMO, `range_m` that of their ranging, if they have any. A command holds
-    from the first control instant at or after it until the next one, or until it is given back. `lights` is the
-    state of each traffic light at `now_ns`, if these are `with_lights`; `in_all` counts SUMO's vehicles, `others`
-    are the ids of those without a program, and `other_m` (k, 2) their positions.
+    `sumo_ids` are the vehicles' ids in SUMO, `range_m` that of their ranging, if they have any. A command also ends
+    where it is given back. `lights` is the state of each traffic light at `now_ns`, if these are `with_lights`;
+    `in_all` counts SUMO's vehicles, `others` are the ids of those without a program, and `other_m` (k, 2) their
+    positions.
     """
 
     def __init__(
         self, process: SumoProcess, sumo_ids: Sequence[str], step_ns: int, range_m: float | None, with_lights: bool
     ) -> None:
         count = len(sumo_ids)
-        self._process, self.step_ns, self.now_ns = process, step_ns, 0
+        super().__init__(count, step_ns)
+        self._process = process
         self._number = {name: number for number, name in enumerate(sumo_ids)}
         self._properties = np.full((4, count), np.nan)
         """Length (m), largest acceleration and deceleration (m/s²) and largest speed (m/s) of each."""
         self._command = np.full(count, np.nan)
         """Acceleration (N,) that each has been told, in m/s²; NaN where SUMO drives."""
-        self._is_limited = np.zeros(count, dtype=bool)
-        self._pending: deque[tuple[int, int, Action]] = deque()
         self._collided: set[frozenset[str]] = set()
-        self._log = Log()
         self.lights: dict[str, str] = {}
         self._take_state(self._process.ask(Watch([*sumo_ids], range_m, with_lights), State))
 
@@ -319,19 +310,6 @@ class SumoVehicles:
         gap_m, rate = self._values[COLUMNS.index("gap") :]
         return gap_m, rate
 
-    def take(self, time_ns: int, number: int, action: Action) -> list[Happening]:
-        """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
-        self._pending.append((time_ns, number, action))
-        asked = action.acceleration_m_s2
-        if asked is None:
-            return []
-        limit = self._limited(number, asked)
-        was_limited, self._is_limited[number] = bool(self._is_limited[number]), limit != asked
-        if limit == asked or was_limited:
-            return []
-        details = {"acceleration_m_s2": asked, "limit_m_s2": limit}
-        return [Happening(time_ns, LIMITED, number, details)]
-
     def advance(self) -> list[Happening]:
         """Have SUMO make a step, to the next control instant; returns what happens."""
         commands = self._commands()
@@ -342,15 +320,11 @@ class SumoVehicles:
         self._take_state(state)
         return refused + self._collisions(state)
 
-    def remove_arrived(self) -> bool:
-        """Do nothing: SUMO removes vehicles that have arrived."""
-        return False
-
     def finished_log(self) -> Log:
         """Return the log of a run that is over, up to the last control instant."""
-        if self._log.time_ns[-1:] != [self.now_ns]:
+        if self.log.time_ns[-1:] != [self.now_ns]:
             self._record()
-        return self._log
+        return self.log
 
     # What programs have asked for.
 
@@ -408,8 +382,8 @@ class SumoVehicles:
 
     def _record(self) -> None:
         speed, acceleration, along_m, left_m = self._values[3:7]
-        self._log.time_ns.append(self.now_ns)
-        self._log.rows.append(np.array([along_m, left_m, speed, acceleration, self._command]))
+        self.log.time_ns.append(self.now_ns)
+        self.log.rows.append(np.array([along_m, left_m, speed, acceleration, self._command]))
 
 
 class SumoWorld(SteppedWorld):
@@ -421,7 +395,6 @@ class SumoWorld(SteppedWorld):
     def __init__(self, scenario: Scenario) -> None:
         path, sumo = scenario.network.path, scenario.network.sumo or Sumo()
         assert path is not None
-        require_libsumo(path)
         step_ns = control_step_ns(scenario.run.control_hz)
         self._process, begun, sumo_ids = start_sumo(scenario, path, step_ns)
         ranging = scenario.world.ranging

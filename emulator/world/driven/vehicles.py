@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from emulator.scenario.network import Driven
-from emulator.world.driven.road import Start, one_each, start_on_single_road
+from emulator.world.driven.road import Start, one_each
 from vnet.errors import ScenarioError
 from vnet.node import Action
 from vnet.types import Array, Mask
@@ -58,10 +58,6 @@ class Limits:
     acceleration: float
     braking: float
     speed: float
-
-    def limited(self, command: float) -> float:
-        """Return the acceleration nearest to what is asked for, in m/s²."""
-        return min(max(command, -self.braking), self.acceleration)
 
 
 class Longitudinal:
@@ -190,19 +186,71 @@ class Log:
     """Arrays (5, N): along_m, left_m, speed, acceleration, command; NaN for an absent vehicle."""
 
 
-class DrivenVehicles:
-    """The true state of driven vehicles. `now_ns` is the last control instant that they have come to.
+class SteppedVehicles:
+    """N vehicles from control instant to control instant, `step_ns` apart. `now_ns` is the last they have come to.
 
-    A command holds from the first control instant at or after it until the next one. Vehicles are on `road`, their
-    centres at `along_m` and `left_m` (N,), with `speed` and `acceleration` (N,), all NaN once they have left. They
-    are at `start`, or if it is left out where `driven` has them on a single road.
+    A command holds from the first control instant at or after it until the next one.
     """
 
-    def __init__(self, driven: Driven, node_ids: Sequence[str], step_ns: int, start: Start | None = None) -> None:
+    def __init__(self, count: int, step_ns: int) -> None:
+        self.step_ns, self.now_ns = step_ns, 0
+        self._is_limited = np.zeros(count, dtype=bool)
+        self._pending: deque[tuple[int, int, Action]] = deque()
+        self.log = Log()
+
+    @property
+    def speed(self) -> Array:
+        """Speeds (N,) in m/s; NaN for an absent vehicle."""
+        raise NotImplementedError
+
+    def place(self) -> tuple[Array, Array]:
+        """Return positions (N, 2) in m and headings (N,) in [0, 2π); NaN for an absent vehicle."""
+        raise NotImplementedError
+
+    def gaps(self, range_m: float) -> tuple[Array, Array]:
+        """Return the gaps (N,) to the vehicles ahead, in m, and their rates in m/s; NaN where none is in range."""
+        raise NotImplementedError
+
+    def take(self, time_ns: int, number: int, action: Action) -> list[Happening]:
+        """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
+        self._pending.append((time_ns, number, action))
+        asked = action.acceleration_m_s2
+        if asked is None:
+            return []
+        limit = self._limited(number, asked)
+        was_limited, self._is_limited[number] = bool(self._is_limited[number]), limit != asked
+        if limit == asked or was_limited:
+            return []
+        details = {"acceleration_m_s2": asked, "limit_m_s2": limit}
+        return [Happening(time_ns, LIMITED, number, details)]
+
+    def advance(self) -> list[Happening]:
+        """Let all drive to the next control instant; returns what happens."""
+        raise NotImplementedError
+
+    def remove_arrived(self) -> None:
+        """Take those off the road that have passed the end of their way."""
+
+    def finished_log(self) -> Log:
+        """Return the log of a run that is over, up to the last control instant."""
+        raise NotImplementedError
+
+    def _limited(self, number: int, asked: float) -> float:
+        """Return the acceleration nearest to what is asked for."""
+        raise NotImplementedError
+
+
+class DrivenVehicles(SteppedVehicles):
+    """The true state of driven vehicles, which are at `start` at first.
+
+    Vehicles are on `road`, their centres at `along_m` and `left_m` (N,), with `speed` and `acceleration` (N,), all
+    NaN once they have left.
+    """
+
+    def __init__(self, driven: Driven, node_ids: Sequence[str], step_ns: int, start: Start) -> None:
         count = len(node_ids)
-        start = start_on_single_road(driven, count) if start is None else start
-        self._driven, self._node_ids, self.step_ns = driven, node_ids, step_ns
-        self.now_ns = 0
+        super().__init__(count, step_ns)
+        self._driven, self._node_ids = driven, node_ids
         self.road = start.road
         self._limits = Limits(
             driven.lag_s, driven.max_acceleration_mps2, driven.max_braking_mps2, driven.max_speed_mps
@@ -221,10 +269,8 @@ class DrivenVehicles:
         self._changing = np.full(count, self._change_steps)
         """Control intervals (N,) since the last lane change began."""
         self._command = np.zeros(count)
-        self._is_limited, self.is_wreck = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        self._pending: deque[tuple[int, int, Action]] = deque()
+        self.is_wreck = np.zeros(count, dtype=bool)
         self._collided: set[tuple[int, int]] = set()
-        self.log = Log()
         if crashed := self._overlapping() + self._crossing():
             one, other = crashed[0]
             raise ScenarioError(f"network.driven: {node_ids[one]} and {node_ids[other]} overlap at the start")
@@ -263,16 +309,7 @@ class DrivenVehicles:
         """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
         if action.release:  # nobody else drives: the vehicle keeps its speed
             action = Action(action.node, 0.0, action.lane)
-        self._pending.append((time_ns, number, action))
-        asked = action.acceleration_m_s2
-        if asked is None:
-            return []
-        limited = self._limits.limited(asked)
-        was_limited, self._is_limited[number] = bool(self._is_limited[number]), limited != asked
-        if limited == asked or was_limited:
-            return []
-        details = {"acceleration_m_s2": asked, "limit_m_s2": limited}
-        return [Happening(time_ns, LIMITED, number, details)]
+        return super().take(time_ns, number, action)
 
     def advance(self) -> list[Happening]:
         """Let all drive to the next control instant; returns what happens."""
@@ -296,11 +333,12 @@ class DrivenVehicles:
             self._record(self._told()[1])
         return self.log
 
-    def remove_arrived(self) -> bool:
-        """Take those off the road that have passed the end of their way; returns whether there are any."""
-        arrived = self._state[0] > self.road.end_m
-        self._state[:, arrived] = np.nan
-        return bool(arrived.any())
+    def remove_arrived(self) -> None:
+        """Take those off the road that have passed the end of their way."""
+        self._state[:, self._state[0] > self.road.end_m] = np.nan
+
+    def _limited(self, number: int, asked: float) -> float:
+        return min(max(asked, -self._limits.braking), self._limits.acceleration)
 
     # What vehicles do in one interval.
 
@@ -315,7 +353,7 @@ class DrivenVehicles:
     def _obey(self, number: int, action: Action) -> list[Happening]:
         """Have a vehicle do from now on what its program has asked for."""
         if action.acceleration_m_s2 is not None:
-            self._command[number] = self._limits.limited(action.acceleration_m_s2)
+            self._command[number] = self._limited(number, action.acceleration_m_s2)
         if not action.lane or self.is_wreck[number]:
             return []
         lane = int(self.lane[number]) + action.lane

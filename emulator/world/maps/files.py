@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 import numpy as np
 
-from emulator.scenario.network import OSM_ENDINGS, Map
+from emulator.scenario.network import OSM_ENDINGS, Map, Network
 from emulator.world.buildings import LEAST_CORNERS, Buildings
 from emulator.world.input_files import check_columns, number_within, open_csv
+from emulator.world.maps.city import city_roads
 from emulator.world.maps.formats import (
     check_on_earth,
     read_collection,
@@ -348,6 +349,16 @@ def read_roads(path: str | Path, origin_deg: tuple[float, float] | None = None) 
     if size > LARGEST_BYTES:
         raise ScenarioError(f"{path}: larger than {LARGEST_BYTES} bytes; cut out a part first")
     return reader(path, origin_deg)
+
+
+def roads_of(network: Network, section: Map | None) -> tuple[object, Roads]:
+    """Return the roads of `[map]`, or without it of a generated city, behind what messages call them.
+
+    Raise ScenarioError if they cannot be read.
+    """
+    if section is None:
+        return "the generated city", city_roads(network.seed, network.size_m)
+    return section.path, read_roads(section.path, section.origin_deg)
 
 
 def write_roads(roads: Roads, path: Path) -> None:

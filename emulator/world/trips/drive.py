@@ -38,8 +38,7 @@ from emulator.scenario.own_functions import in_words, line_of, load_function, ou
 from emulator.scenario.program import Program
 from emulator.scenario.sections import DAY_S
 from emulator.world.input_files import open_csv, read_arrays
-from emulator.world.maps.city import city_roads
-from emulator.world.maps.files import lanes_around, notes_of, read_roads
+from emulator.world.maps.files import lanes_around, notes_of, roads_of
 from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.generate import RIGHT, Side, generate_motion
 from emulator.world.trips.motion import (
@@ -474,17 +473,13 @@ def drive_through_city(
 
     Raise ScenarioError if the map cannot be read, or no vehicle can drive on it.
     """
-    if section is None:
-        source: object = "the generated city"
-        roads, side = city_roads(network.seed, network.size_m), RIGHT
-    else:
-        source, side = section.path, Side(1.0 if section.drive_on == "right" else -1.0, section.aside_m)
-        roads = read_roads(section.path, section.origin_deg)
+    source, roads = roads_of(network, section)
+    side = RIGHT if section is None else Side(section.side, section.aside_m)
     motion = generate_motion(source, roads, network.vehicles, network.seed, periods, period_ns, side)
-    if section is not None:
-        motion = replace(motion, notes=notes_of(section.path, roads))
-    lanes = roads.lane_map() if section is None else lanes_around(roads, section, motion.position_m)
-    return motion, lanes, roads.frame
+    if section is None:
+        return motion, roads.lane_map(), roads.frame
+    motion = replace(motion, notes=notes_of(section.path, roads))
+    return motion, lanes_around(roads, section, motion.position_m), roads.frame
 
 
 def _read(path: Path, window_s: tuple[float, float] | None) -> Samples:

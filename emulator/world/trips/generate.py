@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emulator.world.maps.roads import MIN_HALF_WIDTH_M, NAMES, VEHICLE_WIDTH_M, Ints, Roads
+from emulator.world.networks import numbered_ids
 from emulator.world.trips.motion import MOST_STATES, SHORTEST_STAY_S, Motion, lateral_offsets_m
 from vnet.errors import ScenarioError
 from vnet.extras import require
@@ -227,9 +228,8 @@ def generate_motion(
         raise ScenarioError(
             f"{source}: no vehicle is present within {time_s[-1]:g} s; set more vehicles or a longer duration"
         )
-    width = len(str(vehicles))
-    ids = tuple(f"v{number + 1:0{max(2, width)}d}" for number in present.tolist())
-    return Motion(ids, states[:, present, :2], states[:, present, 2])
+    ids = numbered_ids(vehicles)
+    return Motion(tuple(ids[number] for number in present.tolist()), states[:, present, :2], states[:, present, 2])
 
 
 class _Trip:
