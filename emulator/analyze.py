@@ -28,6 +28,7 @@ from emulator.radio.topology import Topology, connectivity_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import METRICS
 from emulator.scenario.scenario import Scenario, lookahead_ns
+from emulator.world import neighbours
 from emulator.world.world import World, build_world, components
 from vnet.errors import ScenarioError, VnetError
 from vnet.extras import is_installed, needs
@@ -91,7 +92,8 @@ def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
         raise ScenarioError("analyze: says what one graph is like, and where vehicles move the network has many")
     world = build_world(scenario)
     hears = hears_matrix(scenario, world)
-    weak = components(world.at(0).position_m, scenario.radio.range_m, hears)
+    position_m = world.at(0).position_m
+    weak = components(position_m, neighbours.Links.of_matrix(hears, position_m))
     result = {"weak_components": _sizes(weak)} | analyze_graph(hears)
     result["lookahead_ms"] = lookahead_ns(scenario) / NS_PER_MS
     if run is not None:

@@ -90,7 +90,7 @@ def scene_message(
     """
     radio = scenario.radio
     links = component_links(scenario, world.radio_inputs, world.position_m)
-    label = components(world.position_m, radio.range_m, links)
+    label = components(world.position_m, links)
     return {
         "name": scenario.run.name,
         "node_ids": list(world.node_ids),

@@ -138,7 +138,7 @@ def _computed_figures(recorded: RecordedRun) -> list[Any]:
     for period in range(recorded.periods):
         if component is None or recorded.topology_changes:
             links = recorded.places.links(period * period_ns)
-            component = components(recorded.places.position_m(period), recorded.scenario.radio.range_m, links)
+            component = components(recorded.places.position_m(period), links)
         instant = Instant(
             period, period * period_ns, position_m[period], heading, common_m[period, 0], fix_m[period], heading
         )

@@ -513,7 +513,7 @@ class Emulation:
 
     def _component(self, period: int) -> NDArray[np.intp]:
         """Connected component of each vehicle."""
-        return components(self.world.position_m(period), self.scenario.radio.range_m, self._links(period))
+        return components(self.world.position_m(period), self._links(period))
 
     def _absent(self, period: int) -> set[str]:
         """Vehicles that are not in the network."""

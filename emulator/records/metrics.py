@@ -304,7 +304,7 @@ def reference_series(recorded: RecordedRun) -> dict[str, Array]:
     if world is None:
         raise VnetError("the lanes of the run were not recorded")
     links = component_links(scenario, world.radio_inputs, world.position_m)
-    component = components(world.position_m, scenario.radio.range_m, links)
+    component = components(world.position_m, links)
     setting = Setting(scenario, component, world.lane_point_m, world.lane_heading_rad, recorded.periods)
     reference = made(setting)
     columns = {name: recorded.by_period(name) for name in made.COLUMNS}

@@ -175,7 +175,7 @@ def degrees(source: Source) -> Drawing:
         )
     start_m = source.places.position_m(0)
     links = component_links(source.scenario, source.radio_inputs, start_m)
-    parts = int(components(start_m, radio.range_m, links).max()) + 1
+    parts = int(components(start_m, links).max()) + 1
     if source.topology_changes:
         how += ", in the mean over the run"
     network = "one component" if parts == 1 else f"{parts} components out of range of each other"

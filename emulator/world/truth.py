@@ -341,7 +341,7 @@ class World:
 
     def present(self, period: int) -> NDArray[np.bool_]:
         """Return the mask (N,) of the vehicles that are present in `period`."""
-        return np.isfinite(self.course_m[period, :, 0])
+        return np.asarray(np.isfinite(self.position_m(period)[:, 0]))
 
     @property
     def area_m(self) -> Array:

@@ -19,7 +19,7 @@ from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.stepped import DrivenWorld
 from emulator.world.driven.sumo import SumoWorld
-from emulator.world.neighbours import Links, components_of_links, links_within
+from emulator.world.neighbours import Links, components_of_links
 from emulator.world.networks import PlacedVehicles, generate_network, load_network
 from emulator.world.projection import CoordinateFrame
 from emulator.world.trips.motion import Motion, lateral_offsets_m
@@ -100,21 +100,15 @@ def _generated(layout: str, vehicles: int, seed: int) -> PlacedVehicles:
     return network
 
 
-def components(
-    position_m: Array, range_m: float, links: NDArray[np.bool_] | Links | None = None
-) -> NDArray[np.intp]:
+def components(position_m: Array, links: Links) -> NDArray[np.intp]:
     """Return the connected component (N,) of each vehicle as a label; -1 for an absent vehicle.
 
-    Positions (N, 2) and the range are in metres. `links`, a matrix (N, N) or a list, replaces the range; a link in
-    one direction connects too (weak components).
+    Positions (N, 2) are in metres. A link in one direction connects too (weak components).
     """
-    pairs = links_within(position_m, range_m) if links is None else links
-    if not isinstance(pairs, Links):
-        pairs = Links.of_matrix(pairs, position_m)
     present = np.isfinite(position_m[:, 0])
     number = np.cumsum(present) - 1
-    both = present[pairs.sender] & present[pairs.receiver]
+    both = present[links.sender] & present[links.receiver]
     label = np.full(len(present), -1, dtype=np.intp)
-    sender, receiver = number[pairs.sender[both]], number[pairs.receiver[both]]
+    sender, receiver = number[links.sender[both]], number[links.receiver[both]]
     label[present] = components_of_links(sender, receiver, int(present.sum()))
     return label

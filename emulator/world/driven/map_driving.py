@@ -336,22 +336,6 @@ def _wrapped(angle: Array) -> Array:
     return np.asarray(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
 
 
-class _Place(NamedTuple):
-    """Places of vehicles (N,): entry of the routes' tables, path, position on the common scale in m."""
-
-    entry: Ints
-    path: Ints
-    at_m: Array
-
-
-class _Pairs(NamedTuple):
-    """Pairs (n,) of a vehicle and one ahead of it on its way, the nearest first, and the way between in m."""
-
-    rear: Ints
-    front: Ints
-    way_m: Array
-
-
 class MapRoads:
     """Roads of a map: `paths`, and the `routes` of the vehicles, whose entries are numbers of paths.
 
@@ -398,14 +382,15 @@ class MapRoads:
         found = np.searchsorted(self._scale_m, number * self._stride_m + along_m, side="right") - 1
         return np.clip(found, self._first_entry[number], self._last_entry[number])
 
-    def _locate(self, along_m: Array) -> _Place:
+    def _locate(self, along_m: Array) -> tuple[Ints, Array]:
+        """Return the paths (N,) of vehicles, and their positions on the common scale in m."""
         entry = self._entry(np.arange(len(along_m)), along_m)
         path = self._path[entry]
-        return _Place(entry, path, self._base_m[path] + (along_m - self._start_m[entry]))
+        return path, self._base_m[path] + (along_m - self._start_m[entry])
 
     def place(self, along_m: Array, left_m: Array) -> tuple[Array, Array]:
         """Return positions (N, 2) in m and headings (N,) in [0, 2π)."""
-        _, path, at_m = self._locate(along_m)
+        path, at_m = self._locate(along_m)
         point = np.searchsorted(self._at_m, at_m, side="right") - 1
         point = np.clip(point, self._first_point[path], self._last_point[path] - 1)
         beyond_m = at_m - self._at_m[point]
@@ -417,12 +402,12 @@ class MapRoads:
 
     def lane_count(self, along_m: Array) -> Ints:
         """Return the number (N,) of lanes at these positions: in a turn that of the road with more."""
-        _, path, _ = self._locate(along_m)
+        path, _ = self._locate(along_m)
         return np.asarray(self._lanes[path].max(axis=1))
 
     def left_m(self, along_m: Array, nominal_m: Array) -> Array:
         """Return distances (N,) from the rightmost lane. In a turn they change to those of the next road."""
-        _, path, at_m = self._locate(along_m)
+        path, at_m = self._locate(along_m)
         lane = nominal_m / self._nominal_m
         done = np.clip((at_m - self._base_m[path]) / self._path_m[path], 0.0, 1.0)
         done = done**2 * (3 - 2 * done)
@@ -431,7 +416,7 @@ class MapRoads:
 
     def rank(self, along_m: Array) -> Array:
         """Return the positions (N,) on the common scale."""
-        return self._locate(along_m).at_m
+        return self._locate(along_m)[1]
 
     def area_m(self, furthest_m: Array) -> Array:
         """Return the corners (2, 2) of a box around all paths, and the lanes beside them."""
@@ -476,8 +461,11 @@ class MapRoads:
         apart = ~np.isin(one * count + other, in_line)
         return one[apart], other[apart]
 
-    def _following(self, along_m: Array, range_m: float) -> _Pairs:
-        """Return all pairs of which one is at most `range_m` behind the other on its way."""
+    def _following(self, along_m: Array, range_m: float) -> tuple[Ints, Ints, Array]:
+        """Return all pairs (n,) of which one is at most `range_m` behind the other on its way, and the way in m.
+
+        The vehicle behind is the first of a pair. Its nearest comes first.
+        """
         number = np.flatnonzero(along_m < self.end_m + APART_M / 2)  # none that is absent: NaN
         own = self._entry(number, along_m[number])
         vehicle, path, there_m = self._occupants(number, along_m[number], own)
@@ -500,7 +488,7 @@ class MapRoads:
         later = (front != behind) & ((way_m > 0) | (front > behind))
         behind, front, way_m = behind[later], front[later], way_m[later]
         order = np.lexsort((front, way_m, behind))
-        return _Pairs(behind[order], front[order], way_m[order])
+        return behind[order], front[order], way_m[order]
 
     def _occupants(self, number: Ints, along_m: Array, entry: Ints) -> tuple[Ints, Ints, Array]:
         """Return vehicles, the paths on which they are or which they are leaving, and their positions on these."""

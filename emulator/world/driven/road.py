@@ -163,26 +163,17 @@ class Start:
 
 
 def start_on_single_road(driven: Driven, count: int) -> Start:
-    """Return where `count` vehicles are on a straight road or a ring. Raise ScenarioError if there is no room."""
-    lane = start_lanes(driven, count)
-    along_m = start_positions_m(driven, lane)
+    """Return where `count` vehicles are on a straight road or a ring. Raise ScenarioError if they do not fit."""
+    lane: Ints = np.arange(count) % driven.lanes
+    if driven.start_lanes is not None:
+        lane = np.array(one_each("start_lanes", driven.start_lanes, count), dtype=np.intp)
+    if driven.start_m is None:
+        check_room(driven, lane, driven.length_m, f"the road has length_m = {driven.length_m:g}")
+        along_m = queue_m(driven, lane)
+    else:
+        along_m = np.array(one_each("start_m", driven.start_m, count))
     road = SingleRoad(driven.length_m, driven.lanes, driven.lane_width_m, driven.road == "ring")
     return Start(road, along_m, lane)
-
-
-def start_lanes(driven: Driven, count: int) -> Ints:
-    """Return the lane (N,) of each vehicle on a single road. Raise ScenarioError unless each has one."""
-    if driven.start_lanes is None:
-        return np.arange(count) % driven.lanes
-    return np.array(one_each("start_lanes", driven.start_lanes, count), dtype=np.intp)
-
-
-def start_positions_m(driven: Driven, lane: Ints) -> Array:
-    """Return the positions (N,) along the road at the start, in m. Raise ScenarioError if there is no room."""
-    if driven.start_m is not None:
-        return np.array(one_each("start_m", driven.start_m, len(lane)))
-    check_room(driven, lane, driven.length_m, f"the road has length_m = {driven.length_m:g}")
-    return queue_m(driven, lane)
 
 
 def check_room(driven: Driven, lane: Ints, length_m: float, has: str) -> None:

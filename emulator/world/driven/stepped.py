@@ -23,7 +23,7 @@ from vnet.errors import ScenarioError
 from vnet.node import Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
-from vnet.types import Array, Mask
+from vnet.types import Array
 from vnet.units import NS_PER_S
 
 
@@ -99,10 +99,6 @@ class SteppedWorld(World):
         """Corners (2, 2) of the box in which nodes can be during the run."""
         corners_m = np.array([*self.vehicle_area_m, *self._units_m])
         return np.array([corners_m.min(axis=0), corners_m.max(axis=0)])
-
-    def present(self, period: int) -> Mask:
-        """Return the mask (N,) of the vehicles that are present in `period`."""
-        return np.asarray(np.isfinite(self.position_m(period)[:, 0]))
 
     @property
     def last_known_period(self) -> int:

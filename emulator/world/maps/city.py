@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +84,7 @@ class _Piece:
     street: int
     ends: tuple[int, int]
     shape: Ints
-    length_m: float = field(default=0.0)
+    length_m: float
 
 
 def divided(points_m: Array, step_m: float = STEP_M) -> Array:
@@ -349,10 +349,10 @@ class _City:
         line = np.vstack([[[side_m, 1.1 * self._half_m]], arc, [[-1.1 * self._half_m, -side_m]]])
         return divided(line, 10.0)
 
-    def _near_motorway(self, points_m: Array, near_m: float = _NEAR_MOTORWAY_M) -> NDArray[np.bool_]:
+    def _near_motorway(self, points_m: Array) -> NDArray[np.bool_]:
         """Return the mask (n,) of the points (n, 2) near the motorway."""
         offset = points_m[:, None] - self._motorway_m[None, ::4]
-        return np.asarray(np.hypot(offset[..., 0], offset[..., 1]).min(axis=1) < near_m)
+        return np.asarray(np.hypot(offset[..., 0], offset[..., 1]).min(axis=1) < _NEAR_MOTORWAY_M)
 
     def _motorway(self) -> list[CityStreet]:
         """Return both carriageways, and ramps to a road on the east side and one on the south side."""

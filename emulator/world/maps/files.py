@@ -149,7 +149,8 @@ def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
     position_m = course_m[np.isfinite(course_m[..., 0])]
     lanes = lanes_in_box(roads, section, position_m.min(axis=0), position_m.max(axis=0))
     if lanes is None or _far_share(lanes, position_m) > 0.5:
-        (x, y), (left, low), (right, high) = np.median(position_m, axis=0), *_extent(roads)
+        x, y = np.median(position_m, axis=0)
+        (left, low), (right, high) = roads.node_m.min(axis=0), roads.node_m.max(axis=0)
         raise ScenarioError(
             f"{section.path}: most positions of vehicles are over {FAR_M:g} m from all roads: vehicles are around "
             f"({x:.0f}, {y:.0f}) m, and the roads from ({left:.0f}, {low:.0f}) to ({right:.0f}, {high:.0f}) m; "
@@ -182,10 +183,6 @@ def _far_share(lanes: RoadMap, position_m: Array) -> float:
     sample_m = position_m[:: max(1, len(position_m) // SAMPLES)]
     row, _, _ = lanes.near(sample_m, np.full(len(sample_m), np.nan), np.full(len(sample_m), FAR_M))
     return 1 - len(np.unique(row)) / len(sample_m)
-
-
-def _extent(roads: Roads) -> tuple[Array, Array]:
-    return roads.node_m.min(axis=0), roads.node_m.max(axis=0)
 
 
 def read_buildings(path: Path, frame: Callable[[], CoordinateFrame]) -> Buildings:

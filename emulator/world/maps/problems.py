@@ -13,7 +13,7 @@ the standard error is the larger of what squares of that side tell and what the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,11 +168,6 @@ def _fit(found: Residuals, weight: Array, rounds: int = ROUNDS) -> _Fit:
         scale_m = NORMAL_MAD * float(np.median(np.abs(off_m))) + 1e-9
         weight = np.maximum(0.0, 1 - (off_m / (BIWEIGHT * scale_m)) ** 2) ** 2
     return _Fit(found_m, weighted, weight, off_m, np.asarray(inverse), scale_m)
-
-
-def moved(lanes: RoadMap, east_north_m: tuple[float, float] | Array) -> RoadMap:
-    """Return the lanes moved by (2,)."""
-    return replace(lanes, point_m=lanes.point_m + np.asarray(east_north_m))
 
 
 def _apart(position_m: Array, heading_rad: Array) -> NDArray[np.intp]:

@@ -20,6 +20,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.stream import messages, unpack
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
+from emulator.world.neighbours import Links, links_within
 from emulator.world.world import build_world, components
 from tests.emulator.checks.test_judge import checked, result, run_scenario, verdict
 from tests.emulator.terminal.test_dashboard import row as row_of
@@ -88,9 +89,9 @@ def test_one_more_vehicle_that_comes_later_changes_nothing_for_the_others(tmp_pa
 
 def test_components_are_of_those_that_are_there() -> None:
     position_m = np.array([[0, 0], [np.nan, np.nan], [50, 0], [1000, 0]])
-    assert components(position_m, 100.0).tolist() == [0, -1, 0, 1]
+    assert components(position_m, links_within(position_m, 100.0)).tolist() == [0, -1, 0, 1]
     links = np.ones((4, 4), dtype=bool)
-    assert components(position_m, 1.0, links).tolist() == [0, -1, 0, 0]
+    assert components(position_m, Links.of_matrix(links, position_m)).tolist() == [0, -1, 0, 0]
 
 
 def test_who_enters_or_leaves_shares_no_process(tmp_path: Path) -> None:

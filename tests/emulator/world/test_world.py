@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.scenario.scenario import Scenario
+from emulator.world.neighbours import Links, links_within
 from emulator.world.world import World, build_world, components
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import LaneMap
@@ -245,11 +246,11 @@ def test_another_seed_shuffles_the_map_in_another_way() -> None:
 def test_components_of_a_chain_and_its_gap() -> None:
     """Links reach `range_m` and no further, and go from one to the next."""
     position_m = np.array([[0, 0], [300, 0], [100, 0], [200, 0], [400.001, 0], [300, 100]])
-    labels = components(position_m, 100.0)
+    labels = components(position_m, links_within(position_m, 100.0))
     assert len(set(labels[[0, 1, 2, 3, 5]])) == 1
     assert labels[4] not in labels[[0, 1, 2, 3, 5]]
-    assert len(set(components(position_m, 99.9))) == 6
-    assert set(components(position_m, 500.0)) == {0}
+    assert len(set(components(position_m, links_within(position_m, 99.9)))) == 6
+    assert set(components(position_m, links_within(position_m, 500.0))) == {0}
 
 
 @pytest.mark.slow
@@ -265,14 +266,15 @@ def test_components_are_those_found_by_merging(cells: list[tuple[int, int]], ran
             if math.dist(one, other) <= range_m:
                 old, new = label[i], label[j]
                 label = [new if entry == old else entry for entry in label]
-    found = components(np.array(cells, dtype=float), range_m)
+    position_m = np.array(cells, dtype=float)
+    found = components(position_m, links_within(position_m, range_m))
     assert len(set(zip(label, found.tolist(), strict=True))) == len(set(label)) == len(set(found.tolist()))
 
 
 def test_components_of_a_matrix_are_connected_by_links_of_either_direction() -> None:
     links = np.zeros((5, 5), dtype=bool)
     links[0, 1] = links[2, 1] = links[3, 4] = True
-    labels = components(np.zeros((5, 2)), 3000.0, links).tolist()
+    labels = components(np.zeros((5, 2)), Links.of_matrix(links, np.zeros((5, 2)))).tolist()
     assert labels[0] == labels[1] == labels[2] != labels[3] == labels[4]
 
 

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from emulator.world.maps.city import city_roads
-from emulator.world.maps.problems import calibrate, moved, residuals
+from emulator.world.maps.problems import calibrate, residuals
 from emulator.world.trips.generate import RIGHT, generate_motion
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
+from vnet.types import Array
 
 NS = 1_000_000_000
+
+
+def moved(lanes: RoadMap, east_north_m: tuple[float, float] | Array) -> RoadMap:
+    return replace(lanes, point_m=lanes.point_m + np.asarray(east_north_m))
 
 
 @pytest.fixture(scope="module")
