@@ -265,7 +265,8 @@ class _Comments:
 
     def __init__(self, recorded: RecordedRun) -> None:
         self._recorded = recorded
-        self._outcome = _decoded(recorded.trace["outcome"])
+        outcome = recorded.trace["outcome"].cast(pa.string())
+        self._outcome = np.asarray(outcome.to_numpy(zero_copy_only=False), dtype=np.str_)
         self._cause = recorded.trace["cause"].cast(pa.string()).to_pylist()
         order = np.argsort(recorded.emission, kind="stable")
         self._order = order
@@ -300,10 +301,6 @@ class _Comments:
     def _outcomes(self, emission: int) -> str:
         outcomes, counts = np.unique(self._outcome[self._rows(emission)], return_counts=True)
         return ", ".join(f"{outcome} {count}" for outcome, count in zip(outcomes, counts.tolist(), strict=True))
-
-
-def _decoded(column: pa.ChunkedArray) -> NDArray[np.str_]:
-    return np.asarray(column.cast(pa.string()).to_numpy(zero_copy_only=False), dtype=np.str_)
 
 
 def _radiotap(bitrate_mbps: float) -> bytes:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:  # an extra, and slow to import: those who draw nothing do wit
 INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GREY, SAND, RUST, NAVY, *_ = (
     colour.light for colour in PALETTE.values()
 )
+CURVES = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
+"""Colours of curves, in their order."""
 _VARIABLE = {colour.light: f"var(--{name})" for name, colour in PALETTE.items()}
 
 WIDTH_PX, PLOT_PX = 400, 190

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from emulator.scenario.sections import validated
 
+SLOWEST = 10
+"""Vehicles in a table of what a run cost."""
 MOST_VEHICLES = 100
 """Vehicles that are listed, those that took most CPU time first: verdict.json stays small."""
 

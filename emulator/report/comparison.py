@@ -42,8 +42,7 @@ Row = dict[str, Any]
 class Comparison:
     """Two finished runs, and the first difference between their tables: valid where there is none."""
 
-    first: Source
-    second: Source
+    sources: tuple[Source, Source]
     runs: tuple[OpenedRun, OpenedRun]
     """The runs with all columns, of which pages need some."""
     finding: CheckResult
@@ -57,12 +56,13 @@ class Comparison:
         for source in sources:
             _ = source.record, source.scenario
         runs = RecordedRun.open(first), RecordedRun.open(second)
-        return cls(*sources, runs, compare_runs(*runs))
+        return cls(sources, runs, compare_runs(*runs))
 
     @property
     def records(self) -> tuple[Record, Record]:
         """The verdict files of the two runs."""
-        return self.first.record, self.second.record
+        first, second = self.sources
+        return first.record, second.record
 
     @property
     def same_trace(self) -> bool:
@@ -96,7 +96,7 @@ class Comparison:
     @cached_property
     def scenario(self) -> list[Row]:
         """The keys of the scenarios that differ, with both values; None where a run has no such key."""
-        ours, theirs = (dict(_flat(parse_toml(source.scenario_text))) for source in (self.first, self.second))
+        ours, theirs = (dict(_flat(parse_toml(source.scenario_text))) for source in self.sources)
         keys = [key for key in ours | theirs if ours.get(key) != theirs.get(key)]
         return [{"key": key, A: _short(ours.get(key)), B: _short(theirs.get(key))} for key in keys]
 
@@ -193,8 +193,8 @@ def _change(ours: ReportedFigure | None, theirs: ReportedFigure | None) -> str:
 
 def print_comparison(comparison: Comparison, console: Console) -> None:
     """The whole comparison, for a terminal."""
-    console.print(f"A  {comparison.first.folder}", highlight=False, soft_wrap=True)
-    console.print(f"B  {comparison.second.folder}", highlight=False, soft_wrap=True)
+    for letter, source in zip((A, B), comparison.sources, strict=True):
+        console.print(f"{letter}  {source.folder}", highlight=False, soft_wrap=True)
     if comparison.scenario:
         console.print(_table("scenario, where they differ", comparison.scenario))
     else:
@@ -257,8 +257,7 @@ def comparison_page(comparison: Comparison) -> str:
 
 
 def _runs(comparison: Comparison) -> Iterator[dict[str, Any]]:
-    sources = comparison.first, comparison.second
-    for letter, source, record in zip((A, B), sources, comparison.records, strict=True):
+    for letter, source, record in zip((A, B), comparison.sources, comparison.records, strict=True):
         name = source.folder.resolve().name
         yield {"letter": letter, "name": name, "folder": source.folder, "verdict": record.verdict}
 
@@ -288,7 +287,7 @@ def _of_both(comparison: Comparison, read: Callable[[Source], Any]) -> tuple[lis
     Raises VnetError if neither has.
     """
     found, note = [], ""
-    for look, source in zip(LOOKS, (comparison.first, comparison.second), strict=True):
+    for look, source in zip(LOOKS, comparison.sources, strict=True):
         try:
             found.append((look, read(source)))
         except VnetError as error:
@@ -305,22 +304,22 @@ def _over_time(
     found, note = _of_both(comparison, read)
     spans, said = _spans(comparison)
     lines = [Line(name, times, values, colour, dash) for (name, colour, dash), (times, values) in found]
-    made = time_figure(lines, y_label, max(comparison.first.end_s, comparison.second.end_s), spans, linear)
+    made = time_figure(lines, y_label, max(source.end_s for source in comparison.sources), spans, linear)
     return Drawing(made, f"{caption}{said}{note}".strip())
 
 
 def _spans(comparison: Comparison) -> tuple[list[FaultSpan], str]:
     """The spans of faults if both runs had the same, and the caption's sentence on them."""
-    if comparison.first.spans == comparison.second.spans:
-        return comparison.first.spans, " Shaded: active faults." if comparison.first.spans else ""
+    ours, theirs = (source.spans for source in comparison.sources)
+    if ours == theirs:
+        return ours, " Shaded: active faults." if ours else ""
     return [], " Faults differ, and are not shaded."
 
 
 def _own_names(comparison: Comparison) -> list[str]:
     """The names of numbers that programs of either run report."""
-    names = dict.fromkeys(name for source in (comparison.first, comparison.second) for name in source.drawn_names)
-    both = comparison.first, comparison.second
-    return [name for name in names if any(is_number(source, name) for source in both)][:MOST_CHARTS]
+    names = dict.fromkeys(name for source in comparison.sources for name in source.drawn_names)
+    return [name for name in names if any(is_number(each, name) for each in comparison.sources)][:MOST_CHARTS]
 
 
 def _own(comparison: Comparison, name: str) -> Drawing:
@@ -331,9 +330,7 @@ def _own(comparison: Comparison, name: str) -> Drawing:
             raise NothingToShow(f"its programs do not report {title_of(name)}")
         return mean_over_time(source, name)
 
-    is_share = any(
-        is_number(each, name) and each.is_boolean(name) for each in (comparison.first, comparison.second)
-    )
+    is_share = any(is_number(each, name) and each.is_boolean(name) for each in comparison.sources)
     label = f"{title_of(name)} (%)" if is_share else label_of(name)
     text = "Share of the vehicles that say true." if is_share else "Mean of the vehicles."
     return _over_time(comparison, read, label, text, linear=True)
@@ -344,7 +341,7 @@ def _metric(comparison: Comparison, name: str, y_label: str) -> Drawing:
 
 
 def _delivered(comparison: Comparison) -> Drawing:
-    width_ns = max(bin_width_ns(comparison.first), bin_width_ns(comparison.second))
+    width_ns = max(map(bin_width_ns, comparison.sources))
     width_s = width_ns / NS_PER_S
 
     def ratio(source: Source) -> Any:

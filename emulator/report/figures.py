@@ -13,14 +13,12 @@ import pyarrow.compute as pc
 
 from emulator.pages.canvas import (
     BLUE,
+    CURVES,
     GREEN,
     GREY,
     INK,
-    ORANGE,
-    PURPLE,
     QUIET,
     RED,
-    SKY,
     Canvas,
     canvas,
     legend,
@@ -320,7 +318,6 @@ def consistency(source: Source) -> Drawing:
 
 MOST_LINES = 12
 """Vehicles that have a line each; of more, every so many has one."""
-_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 
 
 def speeds(source: Source) -> Drawing:
@@ -331,7 +328,7 @@ def speeds(source: Source) -> Drawing:
         raise NothingToShow("no program drives")
     time_s, speed = of_vehicles(table, "speed_m_s", len(nodes))
     shown = np.unique(np.linspace(0, len(nodes) - 1, min(len(nodes), MOST_LINES)).round().astype(int)).tolist()
-    styles = [(_COLOURS[i % len(_COLOURS)], DASHES[i // len(_COLOURS) % len(DASHES)]) for i in range(len(shown))]
+    styles = [(CURVES[i % len(CURVES)], DASHES[i // len(CURVES) % len(DASHES)]) for i in range(len(shown))]
     lines = [Line(nodes[n], time_s, speed[:, n], *style) for n, style in zip(shown, styles, strict=True)]
     made = time_figure(lines, "speed (m/s)", source.end_s, source.spans, linear=True)
     collisions = source.event(EventKind.collision)

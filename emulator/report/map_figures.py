@@ -69,7 +69,7 @@ def _network(source: Source) -> Drawing:
         shown = _draw_links(made, source, scale)
         text = f"{_ground(source)} Lines: {shown}; points: vehicles."
     if len(background_m := _background_m(source)):
-        _draw_background(made, background_m * scale)
+        _draw_vehicles(made, background_m * scale, GREY, 2)
         text += " Small grey points: vehicles without programs, where they were at the end."
     _draw_vehicles(made, position_m * scale)
     if units := source.scenario.roadside:
@@ -206,12 +206,8 @@ def _draw_lines(made: Canvas, lines: Array, colour: str, opacity: float, width: 
     made.axes.add_patch(PathPatch(outline, fill=False, edgecolor=colour, alpha=opacity, linewidth=width))
 
 
-def _draw_vehicles(made: Canvas, position: Array, colour: str = BLUE) -> None:
-    made.axes.plot(*position.T, color=colour, linestyle="none", marker="o", markersize=5, markeredgewidth=0)
-
-
-def _draw_background(made: Canvas, position: Array) -> None:
-    made.axes.plot(*position.T, color=GREY, linestyle="none", marker="o", markersize=2, markeredgewidth=0)
+def _draw_vehicles(made: Canvas, position: Array, colour: str = BLUE, size: float = 5) -> None:
+    made.axes.plot(*position.T, color=colour, linestyle="none", marker="o", markersize=size, markeredgewidth=0)
 
 
 def _draw_names(made: Canvas, node_ids: Sequence[str], position: Array) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 
-from emulator.pages.canvas import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, canvas, legend
+from emulator.pages.canvas import BLUE, CURVES, GREY, RED, canvas, legend
 from emulator.records.reported import is_text
 from emulator.report.drawing import DASHES, TIME, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source
@@ -23,7 +23,6 @@ MOST_TEXTS = 6
 """Texts of one name that have a line; the others are counted together."""
 MOST_CHARTS = 24
 """Values that have a chart."""
-_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 
 Drawers = dict[str, tuple[str, Callable[[], Drawing]]]
 
@@ -100,7 +99,7 @@ def _texts(source: Source, name: str) -> Drawing:
     rows = (len(texts[:MOST_TEXTS]) + 2) // 3
     made = canvas(TIME, f"{title_of(name)} (% of vehicles)", rows, source.spans, source.end_s)
     for index, text in enumerate(texts[:MOST_TEXTS]):
-        made.axes.plot(time_s, 100 * shares[:, index], color=_COLOURS[index], label=text)
+        made.axes.plot(time_s, 100 * shares[:, index], color=CURVES[index], label=text)
     made.axes.set_ylim(0, 105)
     legend(made)
     more = f" {len(texts) - MOST_TEXTS} rarer ones are not shown." if len(texts) > MOST_TEXTS else ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
@@ -111,15 +111,12 @@ class Source(OpenedRun):
     @cached_property
     def spans(self) -> list[FaultSpan]:
         """Spans in which faults acted, as the events say."""
-        started: dict[str, float] = {}
         spans = []
-        for event in maybe(lambda: self.events) or ():
-            label = printable(str(event.details.get("fault")))
-            if event.kind == EventKind.fault_started:
-                started[label] = event.time_ns / 1e9
-            elif event.kind == EventKind.fault_ended and label in started:
-                spans.append(FaultSpan(label, started.pop(label), event.time_ns / 1e9))
-        return spans + [FaultSpan(label, start_s, max(start_s, self.end_s)) for label, start_s in started.items()]
+        for event, end_ns in acted(maybe(lambda: self.events) or ()):
+            start_s = event.time_ns / 1e9
+            end_s = max(start_s, self.end_s) if end_ns is None else end_ns / 1e9
+            spans.append(FaultSpan(printable(str(event.details.get("fault"))), start_s, end_s))
+        return spans
 
     @cached_property
     def damages(self) -> list[str]:
@@ -139,6 +136,19 @@ class Source(OpenedRun):
     def cut(self) -> Event | None:
         """The event that ended the run before its time."""
         return next((event for event in maybe(lambda: self.events) or () if event.has(CUTS_RUN)), None)
+
+
+def acted(events: Iterable[Event]) -> Iterator[tuple[Event, int | None]]:
+    """Yield the event that began each fault, and when it ended, in ns; None, at last, for one that did not."""
+    begun: dict[str, Event] = {}
+    for event in events:
+        label = str(event.details.get("fault"))
+        if event.kind == EventKind.fault_started:
+            begun[label] = event
+        elif event.kind == EventKind.fault_ended and label in begun:
+            yield begun.pop(label), event.time_ns
+    for event in begun.values():
+        yield event, None
 
 
 def maybe(read: Callable[[], T]) -> T | None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.pages.canvas import BLUE, GREEN, GREY, NAVY, ORANGE, PURPLE, RED, SKY, Canvas, canvas, legend
+from emulator.pages.canvas import CURVES, GREY, NAVY, Canvas, canvas, legend
 from emulator.pages.page import render, table
 from emulator.records.distributions import student_quantile
 from emulator.records.period_figures import KeyFigure, estimates_differ, figures_if_here
@@ -30,7 +30,7 @@ FEWEST_SEEDS = 5
 """Seeds from which on an interval says something: with 4 it is 1.6 standard deviations wide, with 2 nine."""
 PROGRAM = "program.entry"
 """The varied key whose values are compared in pairs, on the same seeds."""
-COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, NAVY, GREY)
+COLOURS = (*CURVES, NAVY, GREY)
 """Colours of the curves; a ninth curve is not drawn."""
 MOST_CHARTS = 24
 ASIDE = 0.012

@@ -20,7 +20,7 @@ from emulator.radio.outcomes import Outcome, Stage
 from emulator.records.events import Event, EventKind, Level
 from emulator.records.recorded_run import END_OF_TIME_NS, Emissions, OpenedRun, RecordedRun
 from emulator.records.tables import TRACE
-from emulator.report.source import Source, maybe
+from emulator.report.source import Source, acted, maybe
 from vnet.errors import printable
 from vnet.types import IntArray, Mask
 
@@ -167,23 +167,14 @@ def _first_marks(marks: Sequence[Mark]) -> list[Mark]:
 
 def bars_of(events: Iterable[Event], number: dict[str, int], end_us: int) -> list[Bar]:
     """Return the times in which faults acted, as the events say, with the nodes that they acted on."""
-    begun: dict[str, Event] = {}
     bars = []
-
-    def close(event: Event, until_us: int) -> None:
+    for event, end_ns in acted(events):
         nodes = event.details.get("nodes")
         known = [number[node] for node in nodes if node in number] if isinstance(nodes, list) else []
         label = printable(str(event.details.get("fault")), LONGEST_TEXT)
-        bars.append(Bar(label, event.time_ns // NS_PER_US, until_us, tuple(known)))
-
-    for event in events:
-        label = str(event.details.get("fault"))
-        if event.kind == EventKind.fault_started:
-            begun[label] = event
-        elif event.kind == EventKind.fault_ended and label in begun:
-            close(begun.pop(label), event.time_ns // NS_PER_US)
-    for event in begun.values():
-        close(event, max(end_us, event.time_ns // NS_PER_US))
+        start_us = event.time_ns // NS_PER_US
+        until_us = max(end_us, start_us) if end_ns is None else end_ns // NS_PER_US
+        bars.append(Bar(label, start_us, until_us, tuple(known)))
     return sorted(bars, key=lambda bar: bar.start_us)[:MOST_SPANS]
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from emulator.pages.page import Table, put_page, render, table
-from emulator.records.costs import HEADS
+from emulator.records.costs import HEADS, SLOWEST
 from emulator.records.events import SAID, SAMPLES, Event
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE
 from emulator.records.samples import key_figures as sample_figures
 from emulator.records.tables import on_backbone
-from emulator.records.verdicts import CheckResult, Record, Verdict
+from emulator.records.verdicts import Record, Verdict
 from emulator.report.figures import draw
 from emulator.report.index import write_index
 from emulator.report.radio_figures import radio_section
@@ -38,8 +38,6 @@ MOST_TEXTS = 3
 """Texts of several lines, as tracebacks, that are shown of a check's rows."""
 MOST_KEYS = 100
 """Keys of Zenoh programs that are shown."""
-SLOWEST = 10
-"""Vehicles in the table of what a run cost."""
 WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 
 
@@ -62,6 +60,7 @@ def write_report(source: Source) -> Path:
 def report_page(source: Source) -> str:
     """Return the whole page."""
     record = maybe(lambda: source.record)
+    checks = _checks(record) if record else []
     return render(
         "report.html.j2",
         name=source.folder.resolve().name,
@@ -69,8 +68,8 @@ def report_page(source: Source) -> str:
         facts=list(_facts(source, record)),
         note=_note(source, record),
         summary=_summary(source, record),
-        checks=_checks(record) if record else [],
-        problems=[check for check in _checks(record) if check["verdict"] is not Verdict.VALID] if record else [],
+        checks=checks,
+        problems=[check for check in checks if check["verdict"] is not Verdict.VALID],
         not_applicable=record.judgement.not_applicable if record else {},
         key_figures=key_figures(record) if record else {},
         has_errors=bool(record and record.shown_figures),
@@ -145,16 +144,10 @@ def _summary(source: Source, record: Record | None) -> str:
 def _checks(record: Record) -> list[dict[str, Any]]:
     """The checks, the worst verdict first."""
     ordered = sorted(record.checks, key=lambda check: WORST_FIRST.index(check.verdict))
-    return [_check(check) for check in ordered]
-
-
-def _check(check: CheckResult) -> dict[str, Any]:
-    return {
-        "name": check.name,
-        "verdict": check.verdict,
-        "text": check.text,
-        "details": _details(check.figures),
-    }
+    return [
+        {"name": check.name, "verdict": check.verdict, "text": check.text, "details": _details(check.figures)}
+        for check in ordered
+    ]
 
 
 def _details(figures: Mapping[str, Any]) -> Details:

@@ -19,7 +19,7 @@ from rich.text import Text
 from emulator.checks.judge import Judgement, Verdict
 from emulator.checks.own import PREFIX
 from emulator.pages.text import as_text, cell
-from emulator.records.costs import HEADS, RunCost, read_cost
+from emulator.records.costs import HEADS, SLOWEST, RunCost, read_cost
 from emulator.records.events import EventKind
 from emulator.records.period_figures import KeyFigure, shown_figures
 from emulator.records.reported import ReportedFigure
@@ -29,8 +29,6 @@ from emulator.records.verdicts import CheckResult
 from emulator.viewer.sinks import is_closed, repair_command
 from vnet.units import NS_PER_S
 
-SLOWEST = 10
-"""Vehicles in the table of what a run cost."""
 WIDEST = 10_000
 """Columns of a terminal on which every table has room."""
 STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
