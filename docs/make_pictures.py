@@ -91,7 +91,7 @@ def native_pictures(recording: Path, scratch: Path, out: Path) -> None:
     """Every tab in the native viewer."""
     for number, name in enumerate(TABS):
         tab = scratch / f"{name}.rbl"
-        blueprint(VEHICLE, number, CONTENT).save("vnet", str(tab))
+        blueprint(VEHICLE, CONTENT, number).save("vnet", str(tab))
         port = place_to_serve().port
         size = f"{DESK[0]}x{DESK[1]}"
         command = viewer_command("--headless", "--port", str(port), "--window-size", size, str(recording), str(tab))

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -227,6 +227,7 @@ class Canvas:
         self._strips: dict[str, _Rows] = defaultdict(_Rows)
         self._plots: dict[str, tuple[list[int], list[float]]] = {}
         self._bars: dict[str, Floats] = {}
+        self._announced: set[str] = set()
 
     def at(self, time_ns: int) -> None:
         """Set the emulated time of whatever is drawn from now on."""
@@ -307,16 +308,22 @@ class Canvas:
             self.strip_style(f"{entity}/truth", RED, 2.5, 50.0)
             self.strips(f"{entity}/truth", [[[-arm, 0], [arm, 0]], [[0, -arm], [0, arm]]], static=True)
 
-    def series(self, entity: str, styles: Sequence[tuple[str, Colour, float]]) -> None:
-        """Announce lines against time: names (with units, where the view has none), colours and widths."""
-        names, colours, widths = zip(*styles, strict=True)
-        lines = rr.SeriesLines(names=names, colors=colours, widths=widths)
-        self.log(entity, lines, static=True)
+    def series(
+        self, entity: str, styles: Sequence[tuple[str, Colour, float]], aggregation: Literal["MinMax"] | None = None
+    ) -> None:
+        """Announce lines against time, once: names (with units, where the view has none), colours and widths."""
+        if entity not in self._announced:
+            self._announced.add(entity)
+            names, colours, widths = zip(*styles, strict=True)
+            lines = rr.SeriesLines(names=names, colors=colours, widths=widths, aggregation_policy=aggregation)
+            self.log(entity, lines, static=True)
 
     def states(self, entity: str, colours: Mapping[str, Colour]) -> None:
-        """Announce states of a timeline, and their colours; others have colours of Rerun's choice."""
-        style = rr.StateConfiguration(values=list(colours), colors=list(colours.values()))
-        self.log(entity, style, static=True)
+        """Announce states of a timeline, once, and their colours; others have colours of Rerun's choice."""
+        if entity not in self._announced:
+            self._announced.add(entity)
+            style = rr.StateConfiguration(values=list(colours), colors=list(colours.values()))
+            self.log(entity, style, static=True)
 
     def plot(self, entity: str, *values: float) -> None:
         """One more value of each line of an entity against time, NaN for none."""

@@ -74,11 +74,7 @@ def _joined(known: tuple[T, ...], seen: Iterable[T]) -> tuple[T, ...]:
     return tuple(dict.fromkeys([*known, *seen]))
 
 
-EVERYTHING = Content(estimates=(POSITION,), busy=True)
-"""All of vnet's views of estimates and of the radio."""
-
-
-def blueprint(vehicle: str, tab: int = 0, content: Content = EVERYTHING) -> rrb.Blueprint:
+def blueprint(vehicle: str, content: Content, tab: int = 0) -> rrb.Blueprint:
     """All tabs, following what comes in, open at number `tab`; `vehicle` is the one that is looked at closely.
 
     Views are laid out for the `content` of the run alone.
@@ -308,7 +304,7 @@ class Recorder:
         ]
         self._vehicle = vehicle
         self._program = ProgramScene(self._canvas, scene, vehicle)
-        self._recording.send_blueprint(blueprint(vehicle, content=self._content))
+        self._recording.send_blueprint(blueprint(vehicle, self._content))
         written(self._recording, self._sinks)  # whatever happens now, it can be looked at
 
     def draw(self) -> None:
@@ -331,7 +327,7 @@ class Recorder:
         content = self._content.after(period, self._views, self._program.names, self._program.texts)
         if content != self._content:
             self._content = content
-            self._recording.send_blueprint(blueprint(self._vehicle, content=content))
+            self._recording.send_blueprint(blueprint(self._vehicle, content))
 
     def _tell_gap(self, count: int) -> None:
         self.missed += count

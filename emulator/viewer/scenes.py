@@ -136,7 +136,6 @@ class RadioScene:
         self._latency, self._sent, self._received = SlidingSum(periods), SlidingSum(periods), SlidingSum(periods)
         self._latency_bins = LEAST_LATENCY_BINS
         self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods)
-        self._announced: set[str] = set()
         self._next_s = 0.0
         loads = (("sent: mean", SKY, 2.0), ("sent: most", BLUE, 1.0), ("received: mean", GREEN, 2.0))
         canvas.series("radio/load", [*loads, ("received: most", ORANGE, 1.0)])
@@ -169,13 +168,8 @@ class RadioScene:
         for outcome, colour in OUTCOME_COLOURS.items():
             count = period.message["outcomes"].get(outcome.name, 0)
             entity = f"radio/frames/{outcome.name}"
-            if count and entity not in self._announced:
-                self._announced.add(entity)
-                style = rr.SeriesLines(
-                    names=outcome.title, colors=[colour], widths=[2.5], aggregation_policy="MinMax"
-                )
-                self._canvas.log(entity, style, static=True)
             if count:
+                self._canvas.series(entity, [(outcome.title, colour, 2.5)], "MinMax")
                 self._canvas.plot_at(entity, times_ns, [lower, lower + count] * STROKES + [np.nan])
             lower += count
 
@@ -187,9 +181,7 @@ class RadioScene:
         ratio = 100 * period.numbers("busy_ratio")[period.up]
         if not len(ratio) or np.isnan(ratio).any():  # senders share no medium, or no window is over
             return
-        if "radio/busy" not in self._announced:
-            self._announced.add("radio/busy")
-            self._canvas.series("radio/busy", [("mean", SKY, 2.0), ("most", BLUE, 1.0)])
+        self._canvas.series("radio/busy", [("mean", SKY, 2.0), ("most", BLUE, 1.0)])
         self._canvas.plot("radio/busy", float(ratio.mean()), float(ratio.max()))
 
     def _age(self, end_ms: float) -> None:
@@ -200,10 +192,8 @@ class RadioScene:
         self._canvas.bars("radio/ages", by_receiver_ms, np.arange(self._count), 0.8, SKY)
         if not known.any():
             return
-        if "radio/age" not in self._announced:
-            self._announced.add("radio/age")
-            lines = (("age: half of the links", SKY, 2.0), ("age: 95 % of the links", BLUE, 1.0))
-            self._canvas.series("radio/age", [*lines, ("between receptions: mean", PURPLE, 2.0)])
+        lines = (("age: half of the links", SKY, 2.0), ("age: 95 % of the links", BLUE, 1.0))
+        self._canvas.series("radio/age", [*lines, ("between receptions: mean", PURPLE, 2.0)])
         # Not the mean: a link that the peer cap closes for good would raise it for ever.
         half_ms, most_ms = np.quantile(ages_ms[known], [0.5, 0.95], method="higher").tolist()
         self._canvas.plot("radio/age", half_ms, most_ms, self._ages.mean_gap_ms)
@@ -500,8 +490,7 @@ class ProgramScene:
                 or (name not in self._told and len(self._told) == MOST_VALUES)
             ):
                 continue
-            if name not in self._told:
-                self._canvas.states(entity("texts", name), {text: SKY})
+            self._canvas.states(entity("texts", name), {text: SKY})
             self._told[name] = text
             self._canvas.log(entity("texts", name), rr.StateChange(state=text))
 
@@ -535,7 +524,6 @@ class OverviewScene:
         self._peers: dict[str, Floats] = {}
         """By name, the latest values that vehicles (rows) reported for others (columns)."""
         self._faults: set[str] = set()
-        self._known_faults: set[str] = set()
         self._down: list[str] | None = None
         self._up: bytes | None = None
         self._clouds: dict[str, dict[str, Floats]] = {each.name: {} for each in views.estimates}
@@ -663,9 +651,7 @@ class OverviewScene:
     def _faults_and_downs(self, period: PeriodArrays) -> None:
         acting = set(period.message["faults"])
         for label in sorted(acting ^ self._faults):
-            if label not in self._known_faults:
-                self._known_faults.add(label)
-                self._canvas.states(f"faults/{label}", {ACTING: PURPLE})
+            self._canvas.states(f"faults/{label}", {ACTING: PURPLE})
             state = ACTING if label in acting else ""  # an empty state ends the one before
             self._canvas.log(f"faults/{label}", rr.StateChange(state=state))
         self._faults = acting
