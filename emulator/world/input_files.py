@@ -58,12 +58,17 @@ def check_columns(path: Path, reader: csv.DictReader[str], columns: Sequence[str
             raise ScenarioError(f"{path}: {problem} {column!r}; needed are {', '.join(columns)}")
 
 
+def number_of(text: str | None) -> float:
+    """Return the number that a text is; NaN if it is none."""
+    try:
+        return float(text or "")
+    except ValueError:
+        return math.nan
+
+
 def number_within(path: Path, line: int, row: Mapping[str, str | None], column: str, most: float) -> float:
     """Return the number in a column of the row of a line. Raise ScenarioError unless it is within ± `most`."""
-    try:
-        value = float(row[column] or "")
-    except ValueError:
-        value = math.nan
+    value = number_of(row[column])
     if not abs(value) <= most:
         raise ScenarioError(
             f"{path}: line {line}: {column} = {shown(row[column])}: a finite number is needed, within ±{most:g}"

@@ -15,7 +15,7 @@ from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.scenario import Radio, Scenario
 from emulator.scenario.sections import DAY_S
 from emulator.world.buildings import Buildings
-from emulator.world.input_files import MAX_ROWS, check_columns, check_row_count, number_within, open_csv
+from emulator.world.input_files import MAX_ROWS, check_columns, check_row_count, number_of, number_within, open_csv
 from emulator.world.projection import CoordinateFrame
 from vnet.errors import ScenarioError, first_names, shown
 from vnet.types import Array, IntArray, Mask
@@ -141,10 +141,7 @@ def _read_row(
 
 def _probability(path: Path, line: int, text: str) -> float:
     """Return the loss in a row of a line. Raise ScenarioError unless it is from 0 to 1."""
-    try:
-        loss = float(text)
-    except ValueError:
-        loss = np.nan
+    loss = number_of(text)
     if not 0 <= loss <= 1:
         needed = "0 to 1, or nothing out of range, is needed"
         raise ScenarioError(f"{path}: line {line}: loss = {shown(text)}: {needed}")
@@ -207,18 +204,11 @@ def _read(path: Path) -> NDArray[np.bool_]:
 
 
 def _read_matrix_row(path: Path, line: int, row: list[str]) -> NDArray[np.bool_]:
-    entries = [_number(entry) for entry in row]
+    entries = [number_of(entry) for entry in row]
     for column, entry in enumerate(entries, start=1):
         if entry not in (0, 1):
             raise ScenarioError(f"{path}: line {line}: entry {column} = {shown(row[column - 1])}: 0 or 1 is needed")
     return np.array(entries, dtype=bool)
-
-
-def _number(entry: str) -> float | None:
-    try:
-        return float(entry)
-    except ValueError:
-        return None
 
 
 @dataclass(frozen=True, eq=False)

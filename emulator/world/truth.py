@@ -23,7 +23,7 @@ from emulator.scenario.program import RoadsideUnit
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Gnss, Scenario
 from emulator.scenario.sections import WILD_M
-from emulator.world.input_files import open_csv
+from emulator.world.input_files import number_of, open_csv
 from emulator.world.own_sensors import OwnSensors, Reading, SensedTruth
 from emulator.world.projection import CoordinateFrame
 from emulator.world.radio_inputs import RadioInputs, load_buildings, load_links
@@ -134,10 +134,7 @@ def _columns(path: Path, names: object) -> list[str]:
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:
-    try:
-        number = float(text or "")
-    except ValueError:
-        number = math.nan
+    number = number_of(text)
     if not math.isfinite(number):
         raise ScenarioError(f"{path}: line {line}: {name} = {shown(text)}: a finite number is needed")
     return number

@@ -20,7 +20,6 @@ SUMO's, so that they match its trips; its projection, if it states one, becomes 
 from __future__ import annotations
 
 import codecs
-import math
 import xml.parsers.expat
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -33,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.world.buildings import LEAST_CORNERS
-from emulator.world.input_files import read_arrays
+from emulator.world.input_files import number_of, read_arrays
 from emulator.world.maps.roads import (
     CLASSES,
     LANE_WIDTH_M,
@@ -644,10 +643,7 @@ class _Reader:
 
     def _width_m(self, attributes: dict[str, str]) -> float:
         text = attributes.get("width", str(_SUMO_WIDTH_M))
-        try:
-            width_m = float(text)
-        except ValueError:
-            width_m = math.nan
+        width_m = number_of(text)
         if not 0 < width_m <= MAX_LANE_WIDTH_M:
             raise self.wrong(
                 f"width = {shown(text)}: a positive number of metres up to {MAX_LANE_WIDTH_M:g} is needed"
