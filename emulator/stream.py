@@ -28,14 +28,13 @@ from emulator.records.metrics import rows_of
 from emulator.records.period_figures import NO_VIEWS, VECTORS, ProgramFigures, Views
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.recorded_world import RecordedWorld
-from emulator.records.reported import MOST_DOTTED, figures_among, is_text, numbers_of
+from emulator.records.reported import MOST_DOTTED, figures_among, is_text, named_numbers, numbers_of
 from emulator.records.run_folder import WORLD_FILE, check_is_run
 from emulator.records.tables import (
     BACKGROUND,
     BUSY,
     METRICS,
     STATES,
-    VALUES_AS_LIST,
     busy_windows,
     mean_busy,
     positions_by_time,
@@ -463,14 +462,9 @@ def _by_row(column: pa.Array) -> dict[int, Array]:
 
 def _recorded_of_peers(column: pa.Array, prefix: str, number: Mapping[str, int]) -> dict[int, Array]:
     """The values (n,) that each node has for others, by row; 0 where none, and no entry where none at all."""
-    lists = column.cast(VALUES_AS_LIST)
-    entries = lists.flatten()
-    name, value = pc.struct_field(entries, "key"), pc.struct_field(entries, "value")
-    one = pc.and_(pc.starts_with(name, prefix), pc.equal(pc.list_value_length(value), 1))
-    row = pc.list_parent_indices(lists).filter(one).to_numpy()
-    amount = np.asarray(value.filter(one).flatten(), dtype=float)
+    row, name, amount = named_numbers(column, prefix)
     found: dict[int, Array] = {}
-    for place, key, one_value in zip(row.tolist(), name.filter(one).to_pylist(), amount.tolist(), strict=True):
+    for place, key, one_value in zip(row.tolist(), name.to_pylist(), amount.tolist(), strict=True):
         other = number.get(key.removeprefix(prefix))
         if other is not None:
             found.setdefault(place, np.zeros(len(number)))[other] = one_value

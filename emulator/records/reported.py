@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.records.period_figures import ProgramFigures
-from emulator.records.tables import STATES, TRUTH
+from emulator.records.tables import STATES, TRUTH, VALUES_AS_LIST
 from vnet.reports import Value
 from vnet.types import Array
 from vnet.units import label_of
@@ -135,6 +135,19 @@ def numbers_of(column: pa.ChunkedArray) -> Array:
     if is_text(column.type):
         return np.full(len(column), np.nan)
     return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=float)
+
+
+def named_numbers(column: pa.Array, prefix: str) -> tuple[NDArray[np.intp], pa.Array, Array]:
+    """Return row, name and number (n,) of each value in a column `values` whose name begins with `prefix`.
+
+    Lists of more or fewer numbers than one are left out.
+    """
+    lists = column.cast(VALUES_AS_LIST)
+    entries = lists.flatten()
+    name, value = pc.struct_field(entries, "key"), pc.struct_field(entries, "value")
+    one = pc.and_(pc.starts_with(name, prefix), pc.equal(pc.list_value_length(value), 1))
+    row = pc.list_parent_indices(lists).filter(one).to_numpy()
+    return row, name.filter(one), np.asarray(value.filter(one).flatten(), dtype=float)
 
 
 @dataclass(frozen=True)

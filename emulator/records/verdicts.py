@@ -36,6 +36,9 @@ class Verdict(StrEnum):
         return {Verdict.VALID: 0, Verdict.INVALID: 1, Verdict.UNKNOWN: 3}[self]
 
 
+WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
+
+
 @dataclass(frozen=True)
 class CheckResult:
     """One check's verdict, in words and figures. `figures["rows"]` of one that failed are its first offenders."""

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from emulator.pages.canvas import (
     BLUE,
@@ -31,6 +30,7 @@ from emulator.records.events import EventKind
 from emulator.records.metrics import anees_band
 from emulator.records.period_figures import DeclaredChart
 from emulator.records.radio_metrics import BIN_M, rows_of_pairs
+from emulator.records.reported import named_numbers
 from emulator.records.tables import DRIVEN, of_vehicles
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, faults_note, time_figure
 from emulator.report.map_figures import map_charts
@@ -51,7 +51,6 @@ LINK_BAND = 0.99
 """Share of the links that lie in the drawn band by chance alone."""
 OPACITY = {0.05: 0.16, 0.1: 0.32, 0.2: 0.52, 0.4: 0.76, 1.0: 1.0}
 """Opacity of a value of a pair, by the largest that has it."""
-_NAMED_VALUES = pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))])
 
 
 def links(source: Source) -> Drawing:
@@ -225,21 +224,16 @@ def mean_of_peers(prefix: str, source: Source) -> Array:
     Raises VnetError if nobody reported any.
     """
     count = len(source.node_ids)
-    lists = source.states["values"].combine_chunks().cast(pa.list_(_NAMED_VALUES))
-    row, pair = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
-    key, value = pair.field("key"), pair.field("value")
-    single = pc.and_(pc.starts_with(key, prefix), pc.equal(pc.list_value_length(value), 1))
-    chosen = np.flatnonzero(pc.fill_null(single, False).to_numpy(zero_copy_only=False))
-    names = key.take(pa.array(chosen)).dictionary_encode()
+    row, name, weight = named_numbers(source.states["values"].combine_chunks(), prefix)
+    names = name.dictionary_encode()
     numbers = [source.number.get(name.removeprefix(prefix), -1) for name in names.dictionary.to_pylist()]
     of = np.array(numbers, dtype=np.intp)[names.indices.to_numpy()]
-    weight = pc.list_flatten(value.take(pa.array(chosen))).to_numpy(zero_copy_only=False)
     node = np.array([source.number[node] for node in source.states["node"].to_pylist()], dtype=np.intp)
-    at, fits = node[row[chosen]], (of >= 0) & np.isfinite(weight)
+    at, fits = node[row], (of >= 0) & np.isfinite(weight)
     if not fits.any():
         raise NothingToShow("no program reported any")
     total = np.bincount((at * count + of)[fits], weights=weight[fits], minlength=count * count)
-    reports = np.bincount(node[np.unique(row[chosen])], minlength=count)
+    reports = np.bincount(node[np.unique(row)], minlength=count)
     return np.asarray(total.reshape(count, count) / np.maximum(1, reports)[:, None])
 
 

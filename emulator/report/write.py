@@ -19,7 +19,7 @@ from emulator.records.events import SAID, SAMPLES, Event
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE
 from emulator.records.samples import key_figures as sample_figures
 from emulator.records.tables import on_backbone
-from emulator.records.verdicts import Record, Verdict
+from emulator.records.verdicts import WORST_FIRST, Record, Verdict
 from emulator.report.figures import draw
 from emulator.report.index import write_index
 from emulator.report.radio_figures import radio_section
@@ -38,7 +38,6 @@ MOST_TEXTS = 3
 """Texts of several lines, as tracebacks, that are shown of a check's rows."""
 MOST_KEYS = 100
 """Keys of Zenoh programs that are shown."""
-WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 
 
 def write_report(source: Source) -> Path:
@@ -137,8 +136,7 @@ def _summary(source: Source, record: Record | None) -> str:
         return f"No check was judged: {why_not(lambda: source.record)}."
     counts = {verdict: sum(check.verdict is verdict for check in record.checks) for verdict in Verdict}
     said = ", ".join(f"{count} {verdict.value}" for verdict, count in counts.items() if count)
-    number = len(record.checks)
-    return f"{number} check{'s' if number != 1 else ''}: {said or 'none'}. Each opens on its figures."
+    return f"{counted(len(record.checks), 'check')}: {said or 'none'}. Each opens on its figures."
 
 
 def _checks(record: Record) -> list[dict[str, Any]]:

@@ -43,7 +43,7 @@ from emulator.records.distributions import lowest_share
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
-from emulator.records.verdicts import Verdict
+from emulator.records.verdicts import WORST_FIRST, Verdict
 from emulator.report.index import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign, write_index
 from emulator.report.source import Source, maybe
 from emulator.report.timeline import timeline
@@ -189,7 +189,6 @@ def _candidates(failing: Scenario, passed: Scenario | None) -> Iterator[tuple[st
     yield f"the campaign's run with seed {seed}", passed
 
 
-WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 NO_FAULTS = "no faults"
 """Row of the runs without any fault."""
 Matrix = Mapping[str, Mapping[str, Counter[Verdict]]]
@@ -616,7 +615,7 @@ class Campaign:
             f"{len(self.outcomes)} of {self._plan.runs} runs of {run.duration_s:g} emulated seconds, "
             f"seeds from {self._plan.seed} on; {len(self.failures)} failed.",
             *([self._plan.note + "."] if self._plan.note else []),
-            *(f"{kind.check} could not be made in {runs_of(kind)}: {kind.text}" for kind in self.broken),
+            *(f"{one.check} could not be made in {counted(one.runs, 'run')}: {one.text}" for one in self.broken),
         ]
         matrix = count_verdicts((outcome.kinds, outcome.trial.verdicts) for outcome in self.outcomes)
         failures = [self._described(outcome) for outcome in self.failures]
@@ -641,7 +640,7 @@ class Campaign:
         kinds = self.kinds
         if len(kinds) < len(self.failures):
             for kind in kinds:
-                yield Text(f"{runs_of(kind)}, first {kind.first}: {kind.check}: {kind.text}")
+                yield Text(f"{counted(kind.runs, 'run')}, first {kind.first}: {kind.check}: {kind.text}")
         first = {kind.first for kind in kinds}
         table = Table(title=f"failures: {len(self.failures)} of {len(self.outcomes)} runs", title_justify="left")
         for name in ("", "seed", "failed", "smallest schedule"):
@@ -660,11 +659,6 @@ class Campaign:
 def _distance(outcome: CampaignRun, other: CampaignRun) -> tuple[bool, int]:
     """Return by what to choose among runs to compare a run with: the last one before it, else the next."""
     return other.number > outcome.number, abs(other.number - outcome.number)
-
-
-def runs_of(kind: FailureKind) -> str:
-    """Return the number of a kind's runs with its noun."""
-    return f"{kind.runs} run{'s' if kind.runs != 1 else ''}"
 
 
 def _folders(name: str) -> Iterator[Path]:
@@ -739,11 +733,10 @@ def run_campaign(
     if campaign.failures:
         console.print(*campaign.summary(), sep="\n")
     for kind in campaign.broken:
-        console.print(Text(f"unknown in {runs_of(kind)}: {kind.check}: {kind.text}"))
+        console.print(Text(f"unknown in {counted(kind.runs, 'run')}: {kind.check}: {kind.text}"))
     for line in (*compared_with_before(earlier, campaign.rows), *after_a_fix(campaign.rows)):
         console.print(Text(line))
-    done = len(campaign.outcomes)
-    failed = f"{done} run{'s' if done != 1 else ''}, {len(campaign.failures)} failed"
+    failed = f"{counted(len(campaign.outcomes), 'run')}, {len(campaign.failures)} failed"
     console.print(f"{failed}: {folder / CAMPAIGN_PAGE}", highlight=False, soft_wrap=True)
     if campaign.interrupted:
         return 130

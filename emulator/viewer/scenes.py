@@ -48,7 +48,7 @@ from emulator.viewer.drawing import (
     nice_length,
     outcome_colours,
 )
-from vnet.errors import VnetError, first_names
+from vnet.errors import VnetError, counted, first_names
 from vnet.types import Array
 from vnet.units import label_of
 
@@ -739,7 +739,7 @@ def describe(scene: Mapping[str, Any]) -> str:
     count = int(np.frombuffer(scene["component"], dtype="<i2").max()) + 1
     at_first = " at first" if scene["moves"] else ""
     parts = [
-        f"{len(scene['node_ids'])} vehicles in {count} component{'s' if count > 1 else ''}{at_first}",
+        f"{len(scene['node_ids'])} vehicles in {counted(count, 'component')}{at_first}",
         program["entry"].removesuffix(":main"),
         f"{in_reach(radio)}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
         f"{run['pacing']}, {run['duration_s']:g} s, seed {run['seed']}",
