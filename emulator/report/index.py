@@ -46,11 +46,6 @@ class CampaignRecord:
     drawn_from: str = ""
     """Digest of what decides which runs can be drawn; "" in campaigns of earlier versions."""
 
-    @property
-    def failed(self) -> int:
-        """Number of runs that have failed."""
-        return sum("failed" in result for result in self.results)
-
 
 def read_campaign(folder: Path) -> CampaignRecord:
     """Read the campaign.json of a folder. Raises VnetError where it is not what vnet writes."""
@@ -63,30 +58,6 @@ def read_campaign(folder: Path) -> CampaignRecord:
         raise VnetError(f"{path}: {first_problem(error, CampaignRecord)}") from None
     except (ValueError, RecursionError) as error:
         raise VnetError(f"{path}: not JSON: {error}") from None
-
-
-@dataclass(frozen=True)
-class SweepRecord:
-    """The contents of sweep.parquet that a list of sweeps needs."""
-
-    varied: list[str]
-    runs: int
-    not_valid: int
-
-
-def read_sweep(folder: Path) -> SweepRecord:
-    """Read the sweep.parquet of a folder. Raises VnetError where it is not what vnet writes."""
-    path = folder / SWEEP_TABLE
-    try:
-        file = open_table(path, ["verdict"])
-        names = file.schema_arrow.names
-        varied = names[: names.index("seed")]
-        verdicts = file.read(["verdict"])["verdict"].to_pylist()
-    except OSError as error:
-        raise VnetError(f"{path}: cannot be read: {error.strerror or printable(str(error), 200)}") from None
-    except (ValueError, KeyError, pa.ArrowException) as error:
-        raise VnetError(f"{path}: not the table of a sweep: {printable(str(error), 200)}") from None
-    return SweepRecord(varied, len(verdicts), sum(verdict != Verdict.VALID for verdict in verdicts))
 
 
 @dataclass(frozen=True)
@@ -158,13 +129,24 @@ def _campaign(folder: Path) -> dict[str, Any]:
     record = read_campaign(folder)
     done = len(record.results)
     runs = str(done) if done == record.runs else f"{done} of {record.runs}"
-    return {"runs": runs, "failed": record.failed, "content": first_names(record.kinds, 4, with_total=True)}
+    failed = sum("failed" in result for result in record.results)
+    return {"runs": runs, "failed": failed, "content": first_names(record.kinds, 4, with_total=True)}
 
 
 def _sweep(folder: Path) -> dict[str, Any]:
-    record = read_sweep(folder)
-    content = first_names(record.varied, 4, with_total=True)
-    return {"runs": str(record.runs), "failed": record.not_valid, "content": content}
+    """Read the sweep.parquet of a folder. Raises VnetError where it is not what vnet writes."""
+    path = folder / SWEEP_TABLE
+    try:
+        file = open_table(path, ["verdict"])
+        names = file.schema_arrow.names
+        varied = names[: names.index("seed")]
+        verdicts = file.read(["verdict"])["verdict"].to_pylist()
+    except OSError as error:
+        raise VnetError(f"{path}: cannot be read: {error.strerror or printable(str(error), 200)}") from None
+    except (ValueError, KeyError, pa.ArrowException) as error:
+        raise VnetError(f"{path}: not the table of a sweep: {printable(str(error), 200)}") from None
+    failed = sum(verdict != Verdict.VALID for verdict in verdicts)
+    return {"runs": str(len(verdicts)), "failed": failed, "content": first_names(varied, 4, with_total=True)}
 
 
 def _studies(folder: Path, file: str, page: str, read: Callable[[Path], dict[str, Any]]) -> list[Study]:

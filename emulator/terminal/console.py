@@ -10,7 +10,6 @@ instead, in memory until there is a folder for it.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import errno
 import io
@@ -323,13 +322,13 @@ def _is_on_descriptor(stream: object) -> bool:
 
 def _flush() -> None:
     """Write what Python and C hold back for descriptor 1, which would end up where it leads later."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
+    with suppress(OSError, ValueError, AttributeError):
         sys.stdout.flush()
-    with contextlib.suppress(OSError, AttributeError):
+    with suppress(OSError, AttributeError):
         ctypes.CDLL(None).fflush(None)
 
 
-@contextlib.contextmanager
+@contextmanager
 def result_only(wanted: bool) -> Iterator[StandardOutput]:
     """Standard output that only a result reaches, if `wanted`; else as it is."""
     if not wanted:

@@ -77,6 +77,8 @@ class SingleRoad:
     lane_width_m: float
     is_ring: bool
 
+    has_crossings = False
+
     @property
     def radius_m(self) -> float:
         """Radius of a ring's rightmost lane."""
@@ -86,11 +88,6 @@ class SingleRoad:
     def end_m(self) -> Array:
         """End of the road (); infinite on a ring."""
         return np.array(math.inf if self.is_ring else self.length_m)
-
-    @property
-    def has_crossings(self) -> bool:
-        """False: all vehicles have the same way."""
-        return False
 
     def place(self, along_m: Array, left_m: Array) -> tuple[Array, Array]:
         """Return positions (N, 2) in m and headings (N,) in [0, 2π) at these positions (N,) on the road."""

@@ -111,7 +111,8 @@ class StreetNetwork:
         self._key = streets.start * count + streets.end  # ascending
         self._count = count
         self._starts = np.flatnonzero(inside)
-        sum_m = np.cumsum(edge_lengths_m(streets)[self._starts])
+        step_m = roads.node_m[streets.end[self._starts]] - roads.node_m[streets.start[self._starts]]
+        sum_m = np.cumsum(np.hypot(*step_m.T))
         self._starts_by_length = sum_m / sum_m[-1]
 
     def edge(self, start: Ints, end: Ints) -> Ints:
@@ -146,12 +147,6 @@ class StreetNetwork:
         """Return the points that follow the end of a route without a U-turn."""
         row = slice(*self._graph.indptr[route[-1] : route[-1] + 2])
         return [point for point in self._graph.indices[row].tolist() if point != route[-2]]
-
-
-def edge_lengths_m(streets: Streets) -> Array:
-    """Return the lengths (E,) of the edges."""
-    node_m = streets.roads.node_m
-    return np.asarray(np.hypot(*(node_m[streets.end] - node_m[streets.start]).T))
 
 
 def _streets(roads: Roads) -> Streets:
@@ -260,7 +255,8 @@ class _Trip:
         stops = np.zeros(len(along_m))
         for at_m in long_m[np.flatnonzero(crossing)].tolist():
             if self._rng.random() < STOPS_AT:
-                stops[min(int(max(at_m - 3, 0) / STEP_M), len(stops) - 1)] = self._stopped_s()
+                stopped_s = min(1.0 + self._rng.exponential(STOPPED_S), LONGEST_STOP_S)
+                stops[min(int(max(at_m - 3, 0) / STEP_M), len(stops) - 1)] = stopped_s
         if parked:
             stops[0] = self._rng.uniform(*PARKED_S)
         max_m_s[stops > 0] = 0.0
@@ -268,9 +264,6 @@ class _Trip:
         took_s = STEP_M / np.maximum((speed[1:] + speed[:-1]) / 2, 0.25)
         self._arrives_s = enters_s + np.concatenate([[0], np.cumsum(took_s + stops[:-1])])
         self._departs_s = self._arrives_s + stops
-
-    def _stopped_s(self) -> float:
-        return min(1.0 + self._rng.exponential(STOPPED_S), LONGEST_STOP_S)
 
     def at(self, time_s: Array) -> Array:
         """Return position and heading (K, 3) at these times; NaN while the vehicle is absent."""
