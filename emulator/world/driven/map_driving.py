@@ -15,7 +15,7 @@ from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.road import Start, check_room, one_each, queue_m
 from emulator.world.maps.files import lanes_in_box, notes_of, roads_of
-from emulator.world.maps.roads import NUMBER, Ints, Roads
+from emulator.world.maps.roads import MIN_ONE_PLUS_COSINE, NUMBER, Ints, Roads
 from emulator.world.neighbours import links_within
 from emulator.world.projection import CoordinateFrame
 from vnet.errors import ScenarioError, did_you_mean, first_names
@@ -42,8 +42,6 @@ ARC_POINTS = 7
 """Points of the arc that rounds a corner: of a right angle one every 15°."""
 _SAME_M = 1e-6
 """Points closer than this are the same."""
-_MIN_ONE_PLUS_COSINE = 0.5
-"""Lower bound of 1 + cos(turn): at a turn sharper than 120° the corner of a lane is cut off."""
 APART_M = 100.0
 """Distance between two paths on the common scale: more than a vehicle's length, and what it drives in a period."""
 _NEAR = 3
@@ -269,7 +267,7 @@ def offset_line(line_m: Array, right_m: float) -> Array:
     step = np.diff(line_m, axis=0)
     right = np.column_stack([step[:, 1], -step[:, 0]]) / np.hypot(*step.T)[:, None]
     inner = right[1:] + right[:-1]
-    scale = np.maximum(1 + np.einsum("ij,ij->i", right[1:], right[:-1]), _MIN_ONE_PLUS_COSINE)
+    scale = np.maximum(1 + np.einsum("ij,ij->i", right[1:], right[:-1]), MIN_ONE_PLUS_COSINE)
     moved_m = line_m + right_m * np.concatenate([right[:1], inner / scale[:, None], right[-1:]])
     if (np.einsum("ij,ij->i", np.diff(moved_m, axis=0), step) > 0).all():
         return np.asarray(moved_m)
@@ -462,9 +460,9 @@ class MapRoads:
         return one[apart], other[apart]
 
     def _following(self, along_m: Array, range_m: float) -> tuple[Ints, Ints, Array]:
-        """Return all pairs (n,) of which one is at most `range_m` behind the other on its way, and the way in m.
+        """Return all pairs, rear (n,) and front (n,), at most `range_m` apart on the way of the rear one.
 
-        The vehicle behind is the first of a pair. Its nearest comes first.
+        The third array is that distance in m. The nearest come first.
         """
         number = np.flatnonzero(along_m < self.end_m + APART_M / 2)  # none that is absent: NaN
         own = self._entry(number, along_m[number])

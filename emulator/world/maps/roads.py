@@ -40,7 +40,7 @@ MAX_POINTS = 5_000_000
 """Most points of a map: ten times those of a large city."""
 MIN_HALF_WIDTH_M = 0.3
 """Least half-width left to a vehicle's centre, in a lane hardly wider than the vehicle."""
-_MIN_ONE_PLUS_COSINE = 0.5
+MIN_ONE_PLUS_COSINE = 0.5
 """Lower bound of 1 + cos(turn): at a turn sharper than 120° the corner of a lane is cut off."""
 Ints = NDArray[np.intp]
 
@@ -276,7 +276,7 @@ class Roads:
         right[self.road_of[:-1] != self.road_of[1:]] = 0.0
         after, before = np.vstack([right, [[0, 0]]]), np.vstack([[[0, 0]], right])
         both = after.any(axis=1) & before.any(axis=1)
-        scale = np.where(both, np.maximum(1 + np.einsum("ij,ij->i", after, before), _MIN_ONE_PLUS_COSINE), 1.0)
+        scale = np.where(both, np.maximum(1 + np.einsum("ij,ij->i", after, before), MIN_ONE_PLUS_COSINE), 1.0)
         return np.asarray((after + before) / scale[:, None])
 
 
