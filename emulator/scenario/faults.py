@@ -39,7 +39,7 @@ from pydantic import (
 )
 
 from emulator.scenario.program import Entry, split_file
-from emulator.scenario.sections import Section, first_problem
+from emulator.scenario.sections import DAY_S, Section, first_problem
 from vnet.errors import ScenarioError, shown
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
@@ -49,8 +49,6 @@ RENAMED_SELECTORS = {"random": "count"}
 """Keys of selectors: the old name, and today's."""
 Probability = Annotated[float, Field(ge=0, le=1)]
 Point = tuple[float, float]
-LONGEST_S = 86_400.0
-"""No fault starts later or lasts longer: a day."""
 DEFAULT_RULE = "rule"
 """Function of a file that is named as a rule without one."""
 
@@ -177,9 +175,9 @@ class Fault(Section):
 
     kind: str
     """Name of the kind."""
-    at_s: float = Field(0.0, ge=0, le=LONGEST_S)
+    at_s: float = Field(0.0, ge=0, le=DAY_S)
     """Start of the fault, in emulated time."""
-    duration_s: float = Field(gt=0, le=LONGEST_S)
+    duration_s: float = Field(gt=0, le=DAY_S)
     """Length of the fault, in emulated time."""
     draws_of: int | None = Field(None, ge=0, lt=2**16)
     """Place in the file, from 0 on, whose random draws the fault has: those that it had before others were taken
@@ -366,7 +364,7 @@ class Infrastructure(Fault):
     chapter: ClassVar[str] = "Infrastructure"
     live_only: ClassVar[bool] = True
 
-    duration_s: float = Field(0.001, gt=0, le=LONGEST_S)
+    duration_s: float = Field(0.001, gt=0, le=DAY_S)
     """Ignored."""
     down_s: float = Field(1.0, gt=0, le=60)
     """Time from the end to the new start (wall clock)."""
@@ -600,7 +598,7 @@ class Swizzle(NodeFault):
     cuts: ClassVar[bool] = True
 
     kind: Literal["swizzle"]
-    over_s: Annotated[float, Field(gt=0, le=LONGEST_S)] | None = None
+    over_s: Annotated[float, Field(gt=0, le=DAY_S)] | None = None
     """Time from the first cut to the last return; the duration, unless it is given."""
 
 

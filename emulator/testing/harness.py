@@ -31,9 +31,10 @@ from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.events import Event
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE
-from emulator.scenario.faults import LONGEST_S, Fault, OwnRule, parse_fault, refuse_router_restart
+from emulator.scenario.faults import Fault, OwnRule, parse_fault, refuse_router_restart
 from emulator.scenario.loading import with_modules
 from emulator.scenario.scenario import Scenario
+from emulator.scenario.sections import DAY_S
 from vnet.errors import ScenarioError, VnetError
 from vnet.units import NS_PER_S
 
@@ -189,7 +190,7 @@ class RunHarness:
         `parameters` are the kind's, as in a scenario; lists of ids do for selectors. Raises ScenarioError.
         """
         self._must_be_on(f"fault {kind!r}")
-        fault = parse_fault({"kind": kind, "duration_s": LONGEST_S, **parameters})
+        fault = parse_fault({"kind": kind, "duration_s": DAY_S, **parameters})
         if fault.kind == "router_restart" or (fault.kind == "emulator_restart" and not self.live):
             raise ScenarioError(f"fault {kind!r}: there is nothing here to restart")
         if self.now_s >= (healed_s := self.scenario.healed_s):
