@@ -322,8 +322,8 @@ CHECKS: list[Check] = [
         "two seconds or four periods. A process that starts in real time has 5 s; without faults, so has every "
         "program at first and after it enters. A program that never reported is not expected to.",
         invalid="a longer silence",
-        unknown="a fault took a vehicle that never reported, or its fixes, before it had as long as others took for "
-        f"their first report, and a second; {BEHIND}",
+        unknown="a fault took a vehicle that never reported, or its fixes, before it had as long as others took "
+        f"for their first report, and a second; {BEHIND}",
         not_applicable="no program reports so often, or less than a second is left",
         realtime_sensitive=True,
     ),
