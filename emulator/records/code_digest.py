@@ -156,7 +156,10 @@ def _find(module: str, searched: list[str]) -> ModuleSpec | None:
     parent, _, _ = module.rpartition(".")
     try:
         if not parent:
-            return importlib.util.find_spec(module) or PathFinder.find_spec(module, searched)
+            spec = importlib.util.find_spec(module)
+            if spec is None or spec.origin is None:  # a mere folder of that name, behind which a module wins
+                spec = PathFinder.find_spec(module, [*sys.path, *searched]) or spec
+            return spec
         package = _find(parent, searched)
         folders = None if package is None else package.submodule_search_locations
         return None if folders is None else _find_in(list(folders), module)

@@ -150,3 +150,15 @@ def test_a_source_that_nests_too_deeply_has_a_digest_all_the_same(
     (tmp_path / "deep.py").write_text("x = " + "-" * 100_000 + "1\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert digests_of(("deep:main",))["program"]
+
+
+def test_a_folder_with_the_name_of_a_program_does_not_hide_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `platoon/platoon.toml` with `platoon.py` beside it, run from above: the import finds the module, too."""
+    folder = tmp_path / "cd_same"
+    folder.mkdir()
+    (folder / "cd_same.py").write_text(MAIN)
+    digest = program_digest(("cd_same:main",), (folder,))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert program_digest(("cd_same:main",), (folder,)) == digest is not None
