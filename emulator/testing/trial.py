@@ -18,7 +18,7 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,6 +34,7 @@ from emulator.drivers.determinism import calls_recorded, scattered
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session
 from emulator.drivers.simulate import MOST_APART
+from emulator.records.period_figures import VECTORS
 from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.records.tape import TapeEntry, described, parse_tape, tape_lines
 from emulator.scenario.faults import Fault, Partition, Selector
@@ -104,11 +105,11 @@ def run_trial(scenario: Scenario, folder: RunFolder, twice: bool = False, apart:
     judgement = session.close()[0] if folder.is_open else session.judge()
     verdicts = {check.name: check.verdict for check in judgement.checks}
     texts = {check.name: check.text for check in judgement.checks if check.verdict is not Verdict.VALID}
-    greatest = _greatest(emulation)
+    greatest, where = _greatest(emulation)
     grows = greatest > GREATEST + float(np.abs(emulation.world.area_m).max())
     verdicts[GROWTH] = Verdict.INVALID if grows else Verdict.VALID
     if grows:
-        texts[GROWTH] = f"a report holds {greatest:.3g}"
+        texts[GROWTH] = f"{where} holds {greatest:.3g}"
     if twice and not apart:  # the instant at which a process ends depends on processes and windows
         differs = _difference_of_another(emulation)
         verdicts[REPLAY] = Verdict.INVALID if differs else Verdict.VALID
@@ -140,12 +141,20 @@ def _tables(emulation: Emulation) -> tuple[pa.Table, ...]:
     return emulation.engine.trace.to_table(), metrics.states_table(), metrics.metrics_table()
 
 
-def _greatest(emulation: Emulation) -> float:
-    """The greatest number of all positions, common errors and covariances that were reported."""
+def _greatest(emulation: Emulation) -> tuple[float, str]:
+    """The greatest number of all estimates and covariances that were reported, and which of which vehicle it is."""
     states = emulation.metrics.states_table()
-    columns = [pc.list_flatten(states[name]).to_numpy() for name in emulation.metrics.declared.vectors]
-    numbers = np.concatenate([np.asarray(column, dtype=float) for column in columns])
-    return float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
+    declared = emulation.metrics.declared
+    theirs = [(each.estimate, each.covariance) for each in declared.views.estimates]
+    found = [(0.0, "")]
+    for name in {*VECTORS, *chain(*theirs)} & declared.vectors.keys():
+        column = states[name].combine_chunks()
+        numbers = np.abs(np.asarray(pc.list_flatten(column), dtype=float))
+        numbers[~np.isfinite(numbers)] = 0.0
+        if len(numbers):
+            row = pc.list_parent_indices(column)[int(numbers.argmax())].as_py()
+            found.append((float(numbers.max()), f"{name} of {states['node'][row]}"))
+    return max(found)
 
 
 class TrialPool:

@@ -41,12 +41,12 @@ def check(run: Run) -> Iterator[Result]:
     text = f"{len(failed)} of {len(shares)} warnings reached less than {LEAST_SHARE:.0%} of the connected vehicles"
     if not failed:
         text = f"each of {len(shares)} warnings reached {LEAST_SHARE:.0%} or more of the connected vehicles"
-    rows = [{"warning": number, "informed": f"{share:.0%}"} for number, share in failed.items()]
+    rows = [{"warning": number, "informed": f"{share:.1%}"} for number, share in failed.items()]
     figures = {"least_share": shares[worst], "worst": worst, "rows": rows}
     yield Result(
         "informed_in_time",
         "invalid" if failed else "valid",
-        f"{text} within {WITHIN_MS:.0f} ms; the least {shares[worst]:.0%}",
+        f"{text} within {WITHIN_MS:.0f} ms; the least {shares[worst]:.1%}",
         figures,
     )
 

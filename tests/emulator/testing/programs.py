@@ -104,3 +104,10 @@ async def sends_a_set(node: Node) -> None:
         first, second = object(), object()
         for each in {first, second}:
             await node.radio.broadcast(b"1" if each is first else b"2")
+
+
+async def counts_far(node: Node) -> None:
+    """Report an estimate that is right, and a middle that is a large number."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        node.report(fix.position_m, fix.covariance_m2, middle_m=[1e12, 1e12])

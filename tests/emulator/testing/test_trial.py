@@ -10,6 +10,7 @@ from emulator.records.tables import TRACE
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
 from emulator.testing.trial import run_trial
+from tests.emulator.testing import programs
 
 CHECKS = "tests.emulator.testing.own_checks"
 
@@ -49,3 +50,20 @@ def test_a_kept_trial_and_one_that_is_not_give_the_same(tmp_path: Path) -> None:
     kept = run_trial(scenario, RunFolder.create(tmp_path / "kept", scenario))
     unkept = run_trial(scenario, RunFolder.scratch(tmp_path / "unkept"))
     assert (kept.verdicts, kept.texts, kept.trace_sha256) == (unkept.verdicts, unkept.texts, unkept.trace_sha256)
+
+
+@pytest.mark.slow
+def test_only_estimates_and_covariances_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A column of the program's own may hold any number, unless it is declared as an estimate."""
+    monkeypatch.setattr(programs, "DECLARES", programs.__name__, raising=False)
+    monkeypatch.setattr(programs, "FIGURES", "docs.examples.middle:Figures", raising=False)
+    run = {"duration_s": 1.0, "settle_s": 0.0}
+    entry = f"{programs.__name__}:counts_far"
+    scenario = {"run": run, "network": {"vehicles": 2}, "program": {"entry": entry}}
+    trial = run_trial(Scenario.model_validate(scenario), RunFolder.scratch(tmp_path))
+    assert trial.verdicts["growth"] is Verdict.VALID
+    scenario["program"] = {"entry": f"{programs.__name__}:growing"}
+    trial = run_trial(
+        Scenario.model_validate(scenario | {"run": run | {"duration_s": 2.0}}), RunFolder.scratch(tmp_path)
+    )
+    assert trial.texts["growth"].startswith("estimate_m of v")
