@@ -274,7 +274,8 @@ def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
         usual = np.percentile(np.concatenate(its_own), 75)
         longest[program] = min(max(window, int(2 * usual)), 2 * window)
         of_it = [node for node in np.flatnonzero(able).tolist() if programs[node] == program]
-        slowest_ns[program] = int(begun_ns[of_it].max()) + window * period_ns
+        free = [node for node in of_it if up_ns[node] + begun_ns[node] <= struck_ns[node]]
+        slowest_ns[program] = int(begun_ns[free or of_it].max()) + window * period_ns
     taken = struck_ns - up_ns < np.array([slowest_ns.get(program, 0) for program in programs])
     return np.where(able | taken, [longest.get(program, 0) for program in programs], 0)
 

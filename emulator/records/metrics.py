@@ -23,15 +23,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.topology import component_links
 from emulator.records.distributions import chi2_quantile
-from emulator.records.period_figures import (
-    NUMBER,
-    FiguresError,
-    Period,
-    ProgramFigures,
-    figures_of,
-    program_figures,
-    vectors,
-)
+from emulator.records.period_figures import NUMBER, Period, ProgramFigures, figures_of, program_figures, vectors
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import ValueColumns, figures_among
 from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, by_instant, columns_of, schema_of
@@ -113,23 +105,13 @@ class Metrics:
         first = (len(self._instants) - len(self._waiting)) * len(self._node_ids)
         of = self.declared
         reported = {name: vectors(self._states[name][first:], size) for name, size in of.vectors.items()}
-        try:
-            self._rows += figures_of(self._waiting, reported, of)
-        except FiguresError:
-            self._compute_one_by_one(reported)
+        rows, failure = figures_of(self._waiting, reported, of)
+        self._rows += rows
         self._waiting = []
-
-    def _compute_one_by_one(self, reported: Mapping[str, Array]) -> None:
-        """Find the period in which the program's figures fail, whatever the number computed together."""
-        count = len(self._node_ids)
-        for number, period in enumerate(self._waiting):
-            columns = {name: array[number * count : (number + 1) * count] for name, array in reported.items()}
-            try:
-                self._rows += figures_of([period], columns, self.declared)
-            except FiguresError as error:
-                self.on_failure(period.instant.time_ns, self.declared.entry, str(error), error.where)
-                self.declared = self.declared.absent()
-                self._rows += figures_of([period], columns, self.declared)
+        if failure is not None:
+            period, error = failure
+            self.declared = of.absent()
+            self.on_failure(period.instant.time_ns, of.entry, str(error), error.where)
 
     def _store(self, instant: Instant, last: dict[str, Report]) -> None:
         states, count = self._states, len(self._node_ids)

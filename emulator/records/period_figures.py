@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationError
 
-from emulator.scenario.own_functions import CONSTANT, NonsenseError, declared, load_entry, told
+from emulator.scenario.own_functions import (
+    CONSTANT,
+    NoAnswerError,
+    NonsenseError,
+    call_bounded,
+    declared,
+    load_entry,
+    told,
+)
 from emulator.scenario.program import Program
 from emulator.scenario.sections import FAR_M, first_problem, validated
 from emulator.world.world import Instant
@@ -29,6 +37,8 @@ VECTORS = {"estimate_m": 2, "covariance_m2": 4}
 """Columns of the states of which vnet's own figures are made, and the numbers that each entry has."""
 SAME = 1e-9
 """Relative difference of two errors up to which they are those of the same positions."""
+ROWS_TOGETHER = 20_000
+"""States of which figures are computed together: what a program's function does with them is bounded in time."""
 LONGEST_SHOWN = 400
 """Characters of a title, a label or a caption that a program declares."""
 NUMBER, NUMBERS = "float | None", "list[float | None]"
@@ -201,11 +211,11 @@ class ProgramFigures:
     def computed(self, periods: Periods, count: int) -> dict[str, Sequence[Any]]:
         """Return the program's figures of so many periods. Raises FiguresError."""
         try:
-            given = self.compute(periods)
+            given = call_bounded(self.compute, periods)
             if not isinstance(given, Mapping):
                 raise NonsenseError(f"{shown(given)}: figures by name are needed")
             return {name: _checked(name, kind, given.get(name), count) for name, kind in self.own.items()}
-        except (Exception, SystemExit) as error:
+        except (Exception, SystemExit, NoAnswerError) as error:
             raise FiguresError(*told(error, __file__)) from error
 
     def absent(self) -> ProgramFigures:
@@ -361,27 +371,43 @@ def vectors(values: Sequence[Sequence[float] | None], size: int) -> Array:
     return array
 
 
-def figures_of(periods: Sequence[Period], reported: Mapping[str, Array], of: ProgramFigures) -> list[Any]:
-    """Return the figures of each period, of the class `of.row`.
+def figures_of(
+    periods: Sequence[Period], reported: Mapping[str, Array], of: ProgramFigures
+) -> tuple[list[Any], tuple[Period, FiguresError] | None]:
+    """Return the figures of each period, of the class `of.row`, and where and how those of the program fail.
 
     `reported` has the columns `of.vectors`, each an array (rows, size) with a row for each vehicle and period,
-    vehicle by vehicle within a period. Raises FiguresError.
+    vehicle by vehicle within a period. From the period on in which they fail, the program's figures are unknown.
     """
     found: list[Any] = []
+    failure: tuple[Period, FiguresError] | None = None
     vehicles = len(periods[0].component)
-    for first, end in _alike(periods):
+
+    def compute(first: int, end: int) -> list[Any]:
         rows = slice(first * vehicles, end * vehicles)
-        columns = {name: array[rows].reshape(end - first, vehicles, -1) for name, array in reported.items()}
-        found += _figures(periods[first:end], columns, of)
-    return found
+        columns = {name: array[rows].reshape(end - first, vehicles, -1).copy() for name, array in reported.items()}
+        return _figures(periods[first:end], columns, of if failure is None else of.absent())
+
+    for first, end in _alike(periods, max(1, ROWS_TOGETHER // vehicles)):
+        try:
+            found += compute(first, end)
+        except FiguresError:
+            for number in range(first, end):
+                try:
+                    found += compute(number, number + 1)
+                except FiguresError as error:
+                    failure = periods[number], error
+                    found += compute(number, number + 1)
+    return found, failure
 
 
-def _alike(periods: Sequence[Period]) -> Iterator[tuple[int, int]]:
-    """Divide periods into ranges in which vehicles form the same components."""
+def _alike(periods: Sequence[Period], most: int) -> Iterator[tuple[int, int]]:
+    """Divide periods into ranges of at most `most`, in which vehicles form the same components."""
     first = 0
     for number, period in enumerate(periods):
         component = periods[first].component
-        if period.component is not component and not np.array_equal(period.component, component):
+        changes = period.component is not component and not np.array_equal(period.component, component)
+        if changes or number - first == most:
             yield first, number
             first = number
     yield first, len(periods)

@@ -619,6 +619,13 @@ def test_one_that_never_reports_is_expected_to_only_if_a_fault_left_it_no_time(
     assert verdict(recorded, "liveness") is expected
 
 
+def test_what_a_fault_kept_from_reporting_is_no_measure_of_the_time_that_others_take() -> None:
+    late = {"kind": "gnss_outage", "at_s": 0.0, "duration_s": 3.0, "nodes": ["v02"]}
+    killed = {"kind": "kill", "at_s": 2.0, "duration_s": 1.0, "nodes": ["v01"]}
+    recorded = simulated(late, killed, program=f"{__name__}:first_is_silent")
+    assert verdict(recorded, "liveness") is Verdict.VALID
+
+
 async def starts_late_and_ends(node: Node) -> None:
     """Report from the third second on; one vehicle ends right after a report."""
     async for fix in node.gnss:
