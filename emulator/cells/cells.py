@@ -304,6 +304,7 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
         _, verdict = session.close()
         figures, metrics = judged_figures(verdict), emulation.metrics.metrics_table()
     else:
+        _ = emulation.metrics.rows  # figures that fail are an event
         if broken := [event for event in session.folder.events if event.level is Level.FAILURE]:
             event = broken[0]
             raise VnetError(f"{event.node} {event.kind}: {event.details.get('error', '')}")

@@ -253,8 +253,8 @@ def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
     """Periods (N,) that nodes may be silent: `window`, or up to twice that by twice their program's usual time.
 
     0, for ever, unless a node reports within `window` at some time, or its program does elsewhere and a fault took
-    it, or its fixes, before it had as much time to begin as the last that has begun, and `window`. The usual time
-    is that which three of four times between reports do not exceed.
+    it, or its fixes, after a report, or before it had as much time to begin as the last that has begun, and
+    `window`. The usual time is that which three of four times between reports do not exceed.
     """
     period_ns = recorded.scenario.period_ns
     programs = [recorded.scenario.program.of(node).entry for node in recorded.node_ids]
@@ -277,6 +277,7 @@ def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
         free = [node for node in of_it if up_ns[node] + begun_ns[node] <= struck_ns[node]]
         slowest_ns[program] = int(begun_ns[free or of_it].max()) + window * period_ns
     taken = struck_ns - up_ns < np.array([slowest_ns.get(program, 0) for program in programs])
+    taken |= recorded.reported.any(axis=0) & (struck_ns < END_OF_TIME_NS)
     return np.where(able | taken, [longest.get(program, 0) for program in programs], 0)
 
 

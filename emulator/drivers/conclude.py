@@ -56,12 +56,13 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
         folder.event(
             emulation.emulated_ns, EventKind.files_left_out, node, count=left_out.count, which=left_out.which
         )
+    metrics = emulation.metrics.metrics_table()  # figures that fail are an event
     folder.event(emulation.emulated_ns, EventKind.ended, wall_s=round(wall_s, 3))
     return RecordedRun(
         emulation.scenario,
         emulation.engine.trace.to_table(),
         emulation.metrics.states_table(),
-        emulation.metrics.metrics_table(),
+        metrics,
         folder.events,
         world=RecordedWorld.of(emulation.world),
         more={

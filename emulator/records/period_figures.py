@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from functools import cache, partial
 from itertools import starmap
@@ -389,15 +390,15 @@ def figures_of(
         return _figures(periods[first:end], columns, of if failure is None else of.absent())
 
     for first, end in _alike(periods, max(1, ROWS_TOGETHER // vehicles)):
-        try:
+        with suppress(FiguresError):
             found += compute(first, end)
-        except FiguresError:
-            for number in range(first, end):
-                try:
-                    found += compute(number, number + 1)
-                except FiguresError as error:
-                    failure = periods[number], error
-                    found += compute(number, number + 1)
+            continue
+        for number in range(first, end):
+            try:
+                found += compute(number, number + 1)
+            except FiguresError as error:
+                failure = periods[number], error
+                found += compute(number, number + 1)
     return found, failure
 
 

@@ -619,6 +619,19 @@ def test_one_that_never_reports_is_expected_to_only_if_a_fault_left_it_no_time(
     assert verdict(recorded, "liveness") is expected
 
 
+async def second_begins_late_and_never_again(node: Node) -> None:
+    """Report with each fix; the second vehicle from 1.2 s on, and never after a restart."""
+    async for fix in node.gnss:
+        if node.id != "v02" or (fix.time_ns >= 1_200_000_000 and not node.incarnation):
+            node.report(fix.position_m, fix.covariance_m2)
+
+
+def test_one_that_had_reported_once_before_a_fault_is_expected_to_again() -> None:
+    fault = {"kind": "kill", "at_s": 1.25, "duration_s": 0.5, "nodes": ["v02"]}
+    recorded = simulated(fault, program=f"{__name__}:second_begins_late_and_never_again")
+    assert verdict(recorded, "liveness") is Verdict.INVALID
+
+
 def test_what_a_fault_kept_from_reporting_is_no_measure_of_the_time_that_others_take() -> None:
     late = {"kind": "gnss_outage", "at_s": 0.0, "duration_s": 3.0, "nodes": ["v02"]}
     killed = {"kind": "kill", "at_s": 2.0, "duration_s": 1.0, "nodes": ["v01"]}

@@ -215,6 +215,8 @@ def test_figures_that_fail_are_named_and_the_rest_is_kept(
     verdicts = {check.name: (check.verdict.value, check.text) for check in check_run(folder).checks}
     assert verdicts["own_rules"][0] == "invalid"
     assert verdicts["own_rules"][1].startswith(f"FIGURES ({__name__}:Broken) {said}")
+    events = RecordedRun.open(folder).events
+    assert events[-1].kind == "ended" and all("During handling" not in str(event.details) for event in events)
     assert verdicts["metrics"][0] == "valid", "unknown in the folder, and computed again"
     assert verdicts["verdict_file"][0] == "valid"
     metrics = pq.read_table(folder / "metrics.parquet")
