@@ -237,7 +237,8 @@ def check_liveness(recorded: RecordedRun) -> Finding:
         text += " after the last fault"
     broken_text = f"{len(silent)} of {counted(count, 'node')} silent {_where(silent, recorded, bound_s)}"
     if silent and not recorded.reported[:, [recorded.number[each["node"]] for each in silent]].any():
-        return unknown(f"{broken_text}: it never reported, and a fault left it no time to", rows=silent[:MOST_ROWS])
+        text = f"{broken_text}; nothing was reported before, and a fault left no time to"
+        return unknown(text, rows=silent[:MOST_ROWS])
     return result(len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
 
 
@@ -253,32 +254,43 @@ def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
     """Periods (N,) that nodes may be silent: `window`, or up to twice that by twice their program's usual time.
 
     0, for ever, unless a node reports within `window` at some time, or its program does elsewhere and a fault took
-    it, or its fixes, after a report, or before it had as much time to begin as the last that has begun, and
-    `window`. The usual time is that which three of four times between reports do not exceed.
+    it (`_taken`). The usual time is that which three of four times between reports do not exceed.
     """
-    period_ns = recorded.scenario.period_ns
     programs = [recorded.scenario.program.of(node).entry for node in recorded.node_ids]
     apart = [np.diff(np.flatnonzero(reported)) for reported in recorded.reported.T]
     able = np.array([bool((each <= window).any()) for each in apart])
-    up_ns = np.array([_times_up(recorded, node)[:1] or [(END_OF_TIME_NS, 0)] for node in range(len(able))])[:, 0, 0]
-    begun_ns = recorded.reported.argmax(axis=0) * period_ns - up_ns
-    struck_ns = np.full(len(able), END_OF_TIME_NS)
-    for planned in recorded.plan:
-        takes = isinstance(planned.fault, (ProcessFault, GnssOutage))
-        struck = planned.nodes & (up_ns <= planned.end_ns) & takes
-        struck_ns[struck] = np.minimum(struck_ns[struck], planned.start_ns)
     longest: dict[str, int] = {}
-    slowest_ns: dict[str, int] = {}
     for program in {programs[node] for node in np.flatnonzero(able)}:
         its_own = [each for each, of in zip(apart, programs, strict=True) if of == program]
         usual = np.percentile(np.concatenate(its_own), 75)
         longest[program] = min(max(window, int(2 * usual)), 2 * window)
-        of_it = [node for node in np.flatnonzero(able).tolist() if programs[node] == program]
-        free = [node for node in of_it if up_ns[node] + begun_ns[node] <= struck_ns[node]]
-        slowest_ns[program] = int(begun_ns[free or of_it].max()) + window * period_ns
-    taken = struck_ns - up_ns < np.array([slowest_ns.get(program, 0) for program in programs])
-    taken |= recorded.reported.any(axis=0) & (struck_ns < END_OF_TIME_NS)
-    return np.where(able | taken, [longest.get(program, 0) for program in programs], 0)
+    expected = able | _taken(recorded, able, programs, window)
+    return np.where(expected, [longest.get(program, 0) for program in programs], 0)
+
+
+def _taken(recorded: RecordedRun, able: Mask, programs: list[str], window: int) -> Mask:
+    """Return the nodes (N,) that a fault took, or their fixes, after a report or before they had time to begin.
+
+    That is as much as the last of their program that is `able` took before any fault, and `window` periods.
+    """
+    taking = [each for each in recorded.plan if isinstance(each.fault, (ProcessFault, GnssOutage))]
+    if not taking:
+        return np.zeros(len(able), dtype=bool)
+    up_ns = np.array([_times_up(recorded, node)[:1] or [(END_OF_TIME_NS, 0)] for node in range(len(able))])[:, 0, 0]
+    struck_ns = np.full(len(able), END_OF_TIME_NS)
+    for planned in taking:
+        struck = planned.nodes & (up_ns <= planned.end_ns)
+        struck_ns[struck] = np.minimum(struck_ns[struck], planned.start_ns)
+    first_ns = recorded.reported.argmax(axis=0) * recorded.scenario.period_ns
+    time_ns = np.zeros(len(able), dtype=np.int64)
+    for program in {programs[node] for node in np.flatnonzero(able)}:
+        its_own = np.array([each == program for each in programs])
+        begun = its_own & able & (first_ns <= struck_ns)
+        if not begun.any():
+            begun = its_own & able
+        time_ns[its_own] = (first_ns - up_ns)[begun].max() + window * recorded.scenario.period_ns
+    reported = recorded.reported.any(axis=0)
+    return (struck_ns - up_ns < time_ns) | (reported & (struck_ns < END_OF_TIME_NS))
 
 
 def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:

@@ -81,6 +81,7 @@ def sweep(
         parse_shard,
         write_sweep,
     )
+    from emulator.records.verdicts import WORST_FIRST
     from emulator.report.index import SWEEP_PAGE, SWEEP_TABLE
     from emulator.report.sweep_page import PROGRAM, too_few
 
@@ -108,7 +109,7 @@ def sweep(
         verdicts = table["verdict"].to_pylist()
         counts = ", ".join(f"{verdicts.count(name)} {name}" for name in sorted(set(verdicts)))
         lines = [f"{len(table)} runs: {counts}"]
-        if worst := next((each for each in ("invalid", "unknown") if each in verdicts), None):
+        if worst := next((each for each in WORST_FIRST[:-1] if each in verdicts), None):
             (row,) = table.slice(verdicts.index(worst), 1).to_pylist()
             where = ", ".join(f"{key} {row[key]}" for key in (*plan.varied, "seed"))
             lines.append(f"first {worst}: {where}: {row['failed'].partition(', ')[0]}: {row['failure']}")

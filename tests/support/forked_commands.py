@@ -29,8 +29,10 @@ from types import SimpleNamespace
 from typing import Any
 
 from vnet.errors import VnetError
+from vnet.runtime import running_node
 from vnet.runtime.environment import use_same_arithmetic
 from vnet.runtime.outside_loop import end_forked
+from vnet.runtime.running_node import RunningNode
 
 PYTHON = [sys.executable, "-P", "-m"]
 VNET = [*PYTHON, "emulator"]
@@ -226,6 +228,7 @@ def _become(request: dict[str, Any], descriptors: list[int], address: bytes) -> 
     module, *words = request["words"]
     sys.argv = ["vnet", *(passed.get(word, word) for word in words)]
     vars(forked_commands)["_address"] = lambda: address
+    running_node.running = RunningNode()  # where no killed command has left a vehicle
     forked_commands.fork_processes()
     return str(module)
 

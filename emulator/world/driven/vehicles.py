@@ -7,6 +7,7 @@ between two control instants. So motion does not depend on how time is divided, 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -186,7 +187,7 @@ class Log:
     """Arrays (5, N): along_m, left_m, speed, acceleration, command; NaN for an absent vehicle."""
 
 
-class SteppedVehicles:
+class SteppedVehicles(ABC):
     """N vehicles from control instant to control instant, `step_ns` apart. `now_ns` is the last they have come to.
 
     A command holds from the first control instant at or after it until the next one.
@@ -199,17 +200,17 @@ class SteppedVehicles:
         self.log = Log()
 
     @property
+    @abstractmethod
     def speed(self) -> Array:
         """Speeds (N,) in m/s; NaN for an absent vehicle."""
-        raise NotImplementedError
 
+    @abstractmethod
     def place(self) -> tuple[Array, Array]:
         """Return positions (N, 2) in m and headings (N,) in [0, 2π); NaN for an absent vehicle."""
-        raise NotImplementedError
 
+    @abstractmethod
     def gaps(self, range_m: float) -> tuple[Array, Array]:
         """Return the gaps (N,) to the vehicles ahead, in m, and their rates in m/s; NaN where none is in range."""
-        raise NotImplementedError
 
     def take(self, time_ns: int, number: int, action: Action) -> list[Happening]:
         """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
@@ -224,20 +225,20 @@ class SteppedVehicles:
         details = {"acceleration_m_s2": asked, "limit_m_s2": limit}
         return [Happening(time_ns, LIMITED, number, details)]
 
+    @abstractmethod
     def advance(self) -> list[Happening]:
         """Let all drive to the next control instant; returns what happens."""
-        raise NotImplementedError
 
-    def remove_arrived(self) -> None:
+    def remove_arrived(self) -> None:  # noqa: B027  # nothing, where SUMO does
         """Take those off the road that have passed the end of their way."""
 
+    @abstractmethod
     def finished_log(self) -> Log:
         """Return the log of a run that is over, up to the last control instant."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _limited(self, number: int, asked: float) -> float:
         """Return the acceleration nearest to what is asked for."""
-        raise NotImplementedError
 
 
 class DrivenVehicles(SteppedVehicles):
