@@ -290,7 +290,8 @@ def _taken(recorded: RecordedRun, able: Mask, programs: list[str], window: int) 
             begun = its_own & able
         time_ns[its_own] = (first_ns - up_ns)[begun].max() + window * recorded.scenario.period_ns
     reported = recorded.reported.any(axis=0)
-    return (struck_ns - up_ns < time_ns) | (reported & (struck_ns < END_OF_TIME_NS))
+    taken: Mask = (struck_ns - up_ns < time_ns) | (reported & (struck_ns < END_OF_TIME_NS))
+    return taken
 
 
 def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
