@@ -66,9 +66,15 @@ class Gateway(RadioSide[zenoh.Query]):
     """
 
     def __init__(
-        self, node: str, keys: Sequence[str] | None, settings: ZenohSessions, hear: Hear, ros2: Ros2 | None = None
+        self,
+        node: str,
+        incarnation: int,
+        keys: Sequence[str] | None,
+        settings: ZenohSessions,
+        hear: Hear,
+        ros2: Ros2 | None = None,
     ) -> None:
-        super().__init__(node, keys, settings.query_s, settings.liveliness_s, ros2)
+        super().__init__(node, incarnation, keys, settings.query_s, settings.liveliness_s, ros2)
         self._settings, self._tell_run = settings, hear
         self._session: zenoh.Session | None = None
         self._watches: list[Any] = []

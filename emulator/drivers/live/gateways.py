@@ -173,7 +173,8 @@ class Gateways:
         """Open the gateways of these vehicles, and start their commands."""
         for (node,) in groups:
             rules = None if self._ros2 is None else Ros2(node, self._ros2.inside, self._ros2.domain)
-            gateway = Gateway(node, self._emulation.scenario.radio.keys, self._settings, self._hear, rules)
+            keys, incarnation = self._emulation.scenario.radio.keys, self._emulation.incarnation[node]
+            gateway = Gateway(node, incarnation, keys, self._settings, self._hear, rules)
             vehicle = self._vehicles[node] = _Vehicle(next(self._numbers), gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 

@@ -241,6 +241,31 @@ def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
 
 
 @pytest.mark.slow
+def test_a_reply_to_a_query_of_a_killed_program_is_none_to_one_of_its_next_life(drive: Drive) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        if sys.argv[1] == "v02":
+            def answer(query):
+                time.sleep(0.7)
+                query.reply("k", query.payload)
+            session.declare_queryable("k", answer)
+        else:
+            asked = f"{time.monotonic():.1f}"
+            every = zenoh.ConsolidationMode.NONE
+            for reply in session.get("k", payload=asked, timeout=1.9, consolidation=every):
+                print(asked, reply.ok.payload.to_string())
+        time.sleep(9)
+        """,
+        vehicles=2,
+        duration_s=4.0,
+        fault=[{"kind": "kill", "at_s": 0.4, "duration_s": 0.2, "nodes": ["v01"]}],
+    )
+    assert log(run)[:1] == ["0.6 0.6"]
+
+
+@pytest.mark.slow
 def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Drive) -> None:
     run = drive(
         """

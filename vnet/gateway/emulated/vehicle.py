@@ -61,7 +61,7 @@ class Vehicle(RadioSide[Asking]):
     def __init__(
         self, node: Node, keys: Sequence[str] | None, query_s: float, liveliness_s: float, ros2: Ros2 | None = None
     ) -> None:
-        super().__init__(node.id, keys, query_s, liveliness_s, ros2)
+        super().__init__(node.id, node.incarnation, keys, query_s, liveliness_s, ros2)
         self.node = node
         self.zid = ZenohId.of(node.id, node.incarnation, "router")
         self._liveliness_s = liveliness_s

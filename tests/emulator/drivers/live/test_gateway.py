@@ -47,7 +47,7 @@ class Vehicle:
     """A gateway and its radio: frames reach all of `others`, unless `is_lost` says so of their number."""
 
     def __init__(self, name: str, keys: tuple[str, ...], max_payload: int, ros2: Ros2 | None) -> None:
-        self.gateway = Gateway(name, keys, QUIET, self._hear, ros2)
+        self.gateway = Gateway(name, 0, keys, QUIET, self._hear, ros2)
         self.others: list[Vehicle] = []
         self.is_lost: Callable[[int], bool] = lambda number: False
         self.frames: list[bytes] = []
@@ -430,7 +430,7 @@ def test_an_exception_on_a_thread_of_zenohs_is_told(monkeypatch: pytest.MonkeyPa
         def hear(kind: str, what: str, item: tuple[Gateway, Any]) -> None:
             loop.call_soon_threadsafe(told.put_nowait, (what, item[1]))
 
-        gateway = Gateway("v01", RADIO_KEYS, QUIET, hear)
+        gateway = Gateway("v01", 0, RADIO_KEYS, QUIET, hear)
         with connected(await asyncio.to_thread(gateway.open, QUIET.listen)) as session:
             session.put("car/v01/pose", b"")
             while (heard := await asyncio.wait_for(told.get(), PATIENCE_S))[0] != "bug":
