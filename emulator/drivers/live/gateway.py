@@ -76,6 +76,7 @@ class Gateway(RadioSide[zenoh.Query]):
     ) -> None:
         super().__init__(node, incarnation, keys, settings.query_s, settings.liveliness_s, ros2)
         self._settings, self._tell_run = settings, hear
+        self.is_paused = False
         self._session: zenoh.Session | None = None
         self._watches: list[Any] = []
         self._declared: dict[str, zenoh.LivelinessToken | None] = {}
@@ -187,6 +188,13 @@ class Gateway(RadioSide[zenoh.Query]):
                 who, is_there = item
                 (self.sessions.add if is_there else self.sessions.discard)(who)
         return None
+
+    def _end(self, numbers: list[int]) -> None:
+        """As `RadioSide._end`, but not in a pause: what was heard meanwhile follows."""
+        if self.is_paused:
+            asyncio.get_running_loop().call_later(self._query_s, self._end, numbers)
+        else:
+            super()._end(numbers)
 
     def _conclude(self, query: zenoh.Query) -> None:
         query.drop()  # type: ignore[no-untyped-call]

@@ -266,6 +266,48 @@ def test_a_reply_to_a_query_of_a_killed_program_is_none_to_one_of_its_next_life(
 
 
 @pytest.mark.slow
+def test_a_query_crosses_beside_complete_queryables_of_the_own_vehicle(drive: Drive) -> None:
+    """Zenoh's router asks the nearest complete queryable, and one of its own, as a gateway has."""
+    serve = """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        session.declare_queryable("c/**", lambda query: query.reply("c", sys.argv[1]), complete=True)
+        time.sleep(9)
+        """
+    ask = """
+        import time, zenoh
+        session = zenoh.open(zenoh.Config())
+        time.sleep(0.1)
+        replies = session.get("c/**", consolidation=zenoh.ConsolidationMode.NONE)
+        print(sorted(reply.ok.payload.to_string() for reply in replies))
+        """
+    run = drive(serve, ask, vehicles=2)
+    assert log(run)[:1] == ["['v01', 'v02']"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset_ms", [2500.0, -60000.0])
+def test_a_clock_fault_changes_no_token(drive: Drive, offset_ms: float) -> None:
+    run = drive(
+        """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        token = session.liveliness().declare_token(f"alive/{sys.argv[1]}")
+        tell = lambda token: print(token.key_expr, token.kind)
+        session.liveliness().declare_subscriber("alive/v03", tell, history=True)
+        time.sleep(99)
+        """,
+        vehicles=3,
+        duration_s=9.0,
+        fault=[
+            {"kind": "skew", "at_s": 2.5, "duration_s": 6.4, "nodes": ["v02"], "offset_ms": offset_ms},
+            {"kind": "kill", "at_s": 4.0, "duration_s": 5.0, "nodes": ["v03"]},
+        ],
+    )
+    assert log(run, "v02")[:3] == log(run, "v01")[:3] == ["alive/v03 SampleKind.PUT", "alive/v03 SampleKind.DELETE"]
+
+
+@pytest.mark.slow
 def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Drive) -> None:
     run = drive(
         """
