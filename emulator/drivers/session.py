@@ -198,7 +198,7 @@ class Session:
         return self.stands
 
     def hold(self) -> int:
-        """Have a run that is on its way held where it stands; returns the emulated time (ns) at which it is then."""
+        """Have a run that is on its way held where it stands; returns that emulated time (ns)."""
         if self._lockstep is not None:
             self._lockstep.is_to_hold = True
         self.stands.result()

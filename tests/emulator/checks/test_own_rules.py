@@ -220,7 +220,8 @@ def test_a_function_that_no_module_has_is_no_rule(tmp_path: Path) -> None:
 
 def test_campaigns_draw_no_rule_and_keep_the_faults_of_their_scenario() -> None:
     scenario = ruled("drops")
-    scenario = make_scenario(scenario, {"faults": [*scenario.fault, {"kind": "kill", "duration_s": 0.5}, {"kind": "emulator_restart"}]})
+    more = [{"kind": "kill", "duration_s": 0.5}, {"kind": "emulator_restart"}]
+    scenario = make_scenario(scenario, {"faults": [*scenario.fault, *more]})
     for faults in ("random", "none"):
         plan = Plan.of(scenario, faults, 5, seed=1)
         for number in range(5):

@@ -200,7 +200,7 @@ class Vehicle(RadioSide[Asking]):
             if all_complete:
                 others = complete
             elif complete and asking.target == zenoh.QueryTarget.BEST_MATCHING:
-                # As Zenoh does: of others the nearest alone, and the router's own, as a gateway has one for the radio.
+                # Zenoh asks of others the nearest alone; and the router's own, as a gateway has for the radio.
                 nearest = complete[0].session
                 others = [each for each in others if each.session is nearest]
             if crosses:

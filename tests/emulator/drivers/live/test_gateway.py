@@ -301,6 +301,32 @@ def test_tokens_of_a_vehicle_are_seen_by_those_in_range_late_ones_too_and_are_go
     two(test)
 
 
+def test_a_token_that_two_vehicles_have_is_there_until_both_are_gone() -> None:
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        first, second = vehicles
+        tokens = [sessions[0].liveliness().declare_token("leader")]
+        seen = [watch(session, "leader") for session in sessions]
+        assert [await each.get() for each in seen] == [("leader", True)] * 2
+        tokens.append(sessions[1].liveliness().declare_token("leader"))
+        settle(sessions[1])
+        told = second.gateway.tokens()
+        assert told == CrossingTokens(("leader",)), "Zenoh has told of the other's alone"
+        for payload in Fragments(2000).of(told):
+            second.broadcast(payload)
+        tokens[0].undeclare()  # type: ignore[no-untyped-call]
+        while first.gateway.tokens():
+            await first.told.get()
+        for session in sessions:
+            settle(session)
+        tokens[1].undeclare()  # type: ignore[no-untyped-call]
+        assert [await each.get() for each in seen] == [("leader", False)] * 2
+        assert second.gateway.tokens() is None
+        tokens[1] = sessions[1].liveliness().declare_token("leader")  # as soon as the other's is gone
+        assert [await each.get() for each in seen] == [("leader", True)] * 2
+
+    two(test)
+
+
 def test_bytes_that_a_fault_has_changed_harm_nobody() -> None:
     async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
         heard = listen(sessions[1], "last")
