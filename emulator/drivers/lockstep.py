@@ -485,15 +485,15 @@ async def run_in_lockstep(
     try:
         await before_horizon(lockstep)
         grants = lockstep.start()
-        while grants:
-            await _act(lockstep, processes)
-            for process_id, grant in grants.items():
-                processes.send(process_id, grant, lockstep.take_mail(process_id))
-            await _all_yielded(lockstep, processes)
-            grants = lockstep.step()
-            while lockstep.held:
+        while grants or lockstep.held:
+            if lockstep.held:
                 await before_horizon(lockstep)
-                grants = lockstep.step()
+            else:
+                await _act(lockstep, processes)
+                for process_id, grant in grants.items():
+                    processes.send(process_id, grant, lockstep.take_mail(process_id))
+                await _all_yielded(lockstep, processes)
+            grants = lockstep.step()
         await _act(lockstep, processes)  # faults after which nobody has had anything to do
         for process_id, details in processes.ended().items():
             lockstep.died(process_id, **details)

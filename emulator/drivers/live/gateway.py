@@ -170,6 +170,8 @@ class Gateway(RadioSide[zenoh.Query]):
         session, self._session = self._session, None
         self._declared, self._watches = {}, []
         self._told = {}
+        self._tokens.clear()  # nobody tells of those that end while there is no router, and of sessions
+        self.sessions.clear()
         if session is not None:
             with suppress(zenoh.ZError):
                 await asyncio.to_thread(session.close)

@@ -259,6 +259,24 @@ async def test_left_on_its_way(vnet_emulation):
     result.assert_outcomes(passed=2)
 
 
+def test_faults_of_all_vehicles_from_the_beginning_on_end_no_run(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize("kind", ["kill", "pause"])
+async def test_all(vnet_emulation, kind, live):
+    async with vnet_emulation(BEACON, vehicles=2, duration=3, settle=1, live=live) as emu:
+        with emu.fault(kind):
+            await emu.run_for(0.25)
+            await emu.run_for(0.25)
+        await emu.run_until(2.0)
+        assert emu.figures.period == 19
+""",
+    )
+    result.assert_outcomes(passed=4)
+
+
 def test_a_block_that_an_error_leaves_ends_its_run_where_it_stands(pytester: pytest.Pytester) -> None:
     result = run_tests(
         pytester,

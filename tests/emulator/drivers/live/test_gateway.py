@@ -327,6 +327,20 @@ def test_a_token_that_two_vehicles_have_is_there_until_both_are_gone() -> None:
     two(test)
 
 
+def test_a_router_that_goes_takes_tokens_and_sessions_along() -> None:
+    """What ends until there is one again is told by nobody."""
+
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        gateway, token = vehicles[0].gateway, sessions[0].liveliness().declare_token("car/a")
+        while not (gateway.tokens() and gateway.sessions):
+            await vehicles[0].told.get()
+        await gateway.close()
+        assert not (gateway.tokens() or gateway.sessions)
+        del token
+
+    two(test)
+
+
 def test_bytes_that_a_fault_has_changed_harm_nobody() -> None:
     async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
         heard = listen(sessions[1], "last")
