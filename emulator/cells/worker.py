@@ -31,7 +31,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, TypeVar
 
-from emulator.records.code_digest import digests_of, entries_of, rules_of
+from emulator.records.code_digest import digests_of, rules_of, sources_of
 from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ProgramError, ScenarioError, VnetError, shown
@@ -86,8 +86,8 @@ class Place:
 
 
 def modules_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the entries of the programs, own checks and own rules of a scenario."""
-    return (*entries_of(scenario), *scenario.program.checks, *rules_of(scenario))
+    """Return the sources of the programs, and the entries of own checks and own rules of a scenario."""
+    return (*sources_of(scenario), *scenario.program.checks, *rules_of(scenario))
 
 
 def is_fit() -> bool:

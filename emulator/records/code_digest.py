@@ -1,8 +1,8 @@
 """SHA-256 of the code that a run depends on: the program, rules of the user's own, and vnet itself.
 
-The program is every module that its entry leads to by `import`, wherever in a module that stands, from outside the
-standard library and site-packages; modules of the entry's own package count wherever they are installed. Sources
-are read, and nothing is imported: whoever records a program need not run it.
+The program is every module that its entry leads to by `import`, wherever in a module that stands, or by a constant
+with which it declares others, from outside the standard library and site-packages; modules of the entry's own package
+count wherever they are installed. Sources are read, and nothing is imported: whoever records a program need not run it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,16 @@ from importlib.machinery import SOURCE_SUFFIXES, FileFinder, ModuleSpec, PathFin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vnet.gateway import python_words
+
 if TYPE_CHECKING:  # slow to import, and hosts need no scenario
     from emulator.scenario.scenario import Scenario
 
+SCRIPT = ".py"
 OWN = ("vnet", "emulator")
 """The packages that are vnet itself."""
+DECLARING = frozenset({"DECLARES", "CHECKS", "FIGURES", "REFERENCE", "PUBLISHED"})
+"""Constants that name modules, or `module:name` (`emulator.scenario.own_functions`)."""
 _SITE = ("purelib", "platlib", "stdlib", "platstdlib")
 _SITE_NAMES = frozenset({"site-packages", "dist-packages"})
 
@@ -33,7 +38,7 @@ def code_digests(scenario: Scenario) -> dict[str, str]:
 
     A program that cannot be found has none.
     """
-    return digests_of(_sources_of(scenario), scenario.program.folders) | rule_digests(scenario)
+    return digests_of(sources_of(scenario), scenario.program.folders) | rule_digests(scenario)
 
 
 def rule_digests(scenario: Scenario) -> dict[str, str]:
@@ -80,17 +85,23 @@ def entries_of(scenario: Scenario) -> tuple[str, ...]:
     return tuple(sorted({program.entry, *(exception.entry for exception in program.exceptions)}))
 
 
-def _sources_of(scenario: Scenario) -> tuple[str, ...]:
-    """The same, but scripts as modules in the place of the commands of Zenoh programs."""
+def sources_of(scenario: Scenario) -> tuple[str, ...]:
+    """The same, but in the place of the commands of Zenoh programs their modules, and their scripts as paths."""
     program = scenario.program
     if program.kind != "zenoh":
         return entries_of(scenario)
-    scripts = {Path(word).stem for words in program.all_commands for word in words[:2] if word.endswith(".py")}
-    return tuple(f"{script}:main" for script in sorted(scripts))
+    found = set()
+    for command in program.all_commands:
+        words = [command[0]] if command[0].endswith(SCRIPT) else python_words(command)
+        if words[:1] == ["-m"]:
+            found.add(f"{words[1]}:main")
+        elif words and words[0].endswith(SCRIPT):
+            found.add(words[0])
+    return tuple(sorted(found))
 
 
 def program_digest(entries: Iterable[str], folders: Iterable[Path] = ()) -> str | None:
-    """One digest of the programs with these entries, `package.module:function`; None if one cannot be found.
+    """One digest of the programs with these entries, or of scripts; None if one cannot be found.
 
     They are looked for among what is installed, in `folders`, and in the current folder.
     """
@@ -98,7 +109,12 @@ def program_digest(entries: Iterable[str], folders: Iterable[Path] = ()) -> str 
     searched = [*map(str, folders), str(Path.cwd())]
     for entry in entries:
         name = entry.partition(":")[0]
-        _collect(name, name.partition(".")[0], modules, searched)
+        if not name.endswith(SCRIPT):
+            _collect(name, name.partition(".")[0], modules, searched)
+        elif path := next((file for folder in searched if (file := Path(folder) / name).is_file()), None):
+            modules[name] = path
+            for imported in _imported(path.stem, path):
+                _collect(imported, "", modules, [str(path.parent), *searched])
         if modules.get(name) is None:
             return None
     digest = hashlib.sha256()
@@ -196,7 +212,7 @@ def _installed_folders() -> tuple[Path, ...]:
 
 
 def _imported(module: str, path: Path) -> Sequence[str]:
-    """Names that a source imports, absolute; a name that is imported from a package may be a module, or not."""
+    """Names that a source imports or declares, absolute; a name that is imported from a package may be a module, or not."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     try:
         return _names_imported(package, path.read_bytes())
@@ -221,6 +237,11 @@ def _names_imported(package: str, source: bytes) -> tuple[str, ...]:
             if base:
                 names.append(base)
                 names += (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
+        elif isinstance(node, ast.Assign) and any(
+            isinstance(t, ast.Name) and t.id in DECLARING for t in node.targets
+        ):
+            named = (each.value for each in ast.walk(node.value) if isinstance(each, ast.Constant))
+            names += (each.partition(":")[0] for each in named if isinstance(each, str))
     return tuple(names)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from emulator.cells.worker import modules_of
 from emulator.records.code_digest import changed_code, digests_of, entries_of, program_digest, vnet_digest
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Scenario
@@ -18,6 +19,7 @@ MAIN = """
 import json, numpy
 from .near import NAME
 from cd_tools.deep import thing
+DECLARES = "cd_declared"
 
 async def main(node):
     import cd_lazy
@@ -33,9 +35,16 @@ FILES = {
     "cd_tools/deep/thing.py": "import cd_broken\n",
     "cd_lazy.py": "",
     "cd_broken.py": "def (:\n",
+    "cd_declared.py": "CHECKS = ['cd_check:a', 'cd_check:b']\nFIGURES = 'cd_figures:F'\nTEXT = 'cd_elsewhere:a'\n",
+    "cd_check.py": "",
+    "cd_figures.py": "",
+    "scripts/cd_talker.py": "import cd_beside, cd_lazy\n",
+    "scripts/cd_beside.py": "",
     "cd_elsewhere.py": "",
 }
 OWN = {"cd_program/__init__.py", "cd_program/app.py", "cd_program/near.py", "cd_lazy.py", "cd_broken.py"}
+OWN |= {"cd_declared.py", "cd_check.py", "cd_figures.py"}
+SCRIPTS = {"scripts/cd_talker.py", "scripts/cd_beside.py", "cd_lazy.py"}
 ENTRY = "cd_program.app:main"
 
 
@@ -59,6 +68,16 @@ def test_each_module_of_a_program_counts_and_no_other(name: str, program: Path) 
     belongs = name in OWN or name.startswith("cd_tools")
     assert (program_digest([ENTRY]) != before) is belongs
     assert not any(module.startswith("cd_") for module in sys.modules), "nothing is imported"
+
+
+@pytest.mark.parametrize("command", [["python", "-u", "scripts/cd_talker.py"], ["python", "-m", "cd_lazy", "{id}"]])
+def test_sources_of_zenoh_programs_count(command: list[str], program: Path) -> None:
+    scenario = Scenario.model_validate({"program": {"kind": "zenoh", "command": command}})
+    own = SCRIPTS if "-u" in command else {"cd_lazy.py"}
+    for name, text in FILES.items():
+        before = program_digest(modules_of(scenario))
+        (program / name).write_text(text + "# changed\n")
+        assert before is not None and (program_digest(modules_of(scenario)) != before) is (name in own), name
 
 
 def test_a_namespace_package_within_a_package_counts(program: Path) -> None:
