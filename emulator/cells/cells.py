@@ -362,11 +362,16 @@ def keep(cell: Cell, result: CellResult, store: Path) -> None:
 
 
 def read_result(cell: Cell, folder: Path, live: bool = False) -> dict[str, Any]:
-    """Labels and figures of a finished cell. Raises VnetError for a file that is no result."""
+    """Labels and figures of a finished cell; a figure of a label's name is `reported.NAME`.
+
+    Raises VnetError for a file that is no result.
+    """
     path = _result_path(folder / ("live" if live else "cells"), cell)
     try:
         figures: dict[str, Any] = json.loads(path.read_text())
-        return {**cell.labels, **figures}
+        return cell.labels | {
+            f"reported.{name}" if name in cell.labels else name: figures[name] for name in figures
+        }
     except (OSError, ValueError, TypeError) as error:
         raise VnetError(f"{path}: not the result of a cell: {error}; remove it to run the cell again") from None
 

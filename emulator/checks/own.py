@@ -34,7 +34,7 @@ from emulator.records.verdicts import (
     valid,
 )
 from emulator.scenario.faults import OwnRule
-from emulator.scenario.own_functions import declared_checks, in_words, line_of, load_function, outside
+from emulator.scenario.own_functions import declared_checks, in_words, line_of, load_entry, load_function, outside
 from emulator.scenario.program import Program
 from vnet.errors import VnetError, counted, printable, shown
 from vnet.runtime.programs import search_programs_in
@@ -130,6 +130,8 @@ def _unknown(entry: str, error: BaseException) -> CheckResult:
 
 
 def _findings_of(entry: str, program: Program, run: Run) -> Iterator[Finding]:
+    if entry.endswith(":CHECKS"):  # what a program declares, and no entries
+        raise VnetError(f'{entry} = {shown(load_entry(entry))}: a list of "module:function" is needed')
     check = load_checks(program.model_copy(update={"checks": (entry,)}))[entry]
     answer = check(run)
     if isinstance(answer, tuple) and answer and isinstance(answer[0], str):

@@ -1,8 +1,8 @@
 """SHA-256 of the code that a run depends on: the program, rules of the user's own, and vnet itself.
 
 The program is every module that its entry leads to by `import`, wherever in a module that stands, or by a constant
-with which it declares others, from outside the standard library and site-packages; modules of the entry's own package
-count wherever they are installed. Sources are read, and nothing is imported: whoever records a program need not run it.
+that declares others, from outside the standard library and site-packages; modules of the entry's own package count
+wherever they are installed. Sources are read, and nothing is imported: whoever records a program need not run it.
 """
 
 from __future__ import annotations
@@ -212,7 +212,7 @@ def _installed_folders() -> tuple[Path, ...]:
 
 
 def _imported(module: str, path: Path) -> Sequence[str]:
-    """Names that a source imports or declares, absolute; a name that is imported from a package may be a module, or not."""
+    """Names that a source imports or declares, absolute; one imported from a package may be a module, or not."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     try:
         return _names_imported(package, path.read_bytes())

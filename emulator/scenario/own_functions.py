@@ -110,9 +110,11 @@ def declared_checks(program: Program) -> list[str]:
     entries: list[str] = []
     for module in _declared(program):
         try:
-            entries += getattr(_imported(module), "CHECKS", ())
+            checks = getattr(_imported(module), "CHECKS", ())
         except ScenarioError:
-            entries.append(f"{module}:CHECKS")  # its check says why
+            checks = None
+        are_entries = isinstance(checks, (list, tuple)) and all(isinstance(each, str) for each in checks)
+        entries += checks if are_entries else [f"{module}:CHECKS"]  # whose check says why
     return entries
 
 

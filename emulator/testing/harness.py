@@ -281,6 +281,12 @@ class RunHarness:
             raise VnetError(f"{PREFIX}{name}: there is a promise of this name")
         self._promises[name] = partial(judge, name=name)
 
+    def _must_be_new(self, judgement: Judgement) -> None:
+        taken = {each.name for each in (*judgement.checks, *judgement.not_exercised)}
+        for name in self._promises:
+            if PREFIX + name in taken:
+                raise VnetError(f"{PREFIX}{name}: the scenario has a check of this name: give the promise another")
+
     def _kept(self) -> Iterator[Result]:
         """Judge the promises. Raises VnetError for a predicate that raises."""
         run = Run.open(self.folder)
@@ -307,6 +313,7 @@ class RunHarness:
             self._finish()
             self._judgement, verdict = self._run.close()
             if self._promises:
+                self._must_be_new(self._judgement)
                 findings = [finding_of(result) for result in self._kept()]
                 judge_further(self._emulation, self._judgement, verdict, findings)
         return self._judgement

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import emulator
 from emulator.cells import sweep as subject
-from emulator.cells.cells import WALL_CLOCK, Cell, compute, judged_figures
+from emulator.cells.cells import WALL_CLOCK, Cell, compute, judged_figures, read_result
 from emulator.cells.sweep import SweepPlan, parse_shard
 from emulator.cli.studies import sweep as command
 from emulator.report.sweep_page import Mean, differences, mean_of
@@ -247,6 +247,15 @@ def test_numbers_of_own_checks_are_columns() -> None:
         "own:warned.late": 3,
     }
     assert (row["failed"], row["failure"]) == ("own:warned", "3 late")
+
+
+def test_a_figure_with_the_name_of_what_is_varied_is_another_column(tmp_path: Path) -> None:
+    (cell,) = plan({"radio.loss": [0.5]}, range(3, 4)).cells
+    (tmp_path / "cells").mkdir()
+    (tmp_path / f"cells/{cell.digest}.json").write_text('{"radio.loss": 0.4, "seed": 7.5, "speed": 1}')
+    row = read_result(cell, tmp_path)
+    reported = {"reported.radio.loss": 0.4, "reported.seed": 7.5, "speed": 1}
+    assert row == {"radio.loss": 0.5, "seed": 3} | reported
 
 
 @pytest.mark.slow

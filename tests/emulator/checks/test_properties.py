@@ -281,6 +281,26 @@ def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_promise_with_the_name_of_a_check_is_refused(tmp_path: Path) -> None:
+    scenario = make_scenario(
+        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
+        {
+            "program": "tests.emulator.checks.test_properties:brakes",
+            "program.checks": ["tests.emulator.testing.own_checks:reads_files"],
+        },
+    )
+
+    async def story() -> None:
+        async with RunHarness(scenario, tmp_path / "run") as emu:
+            emu.always(lambda moment: True, name="files")
+            await emu.run_until(0.5)
+            with pytest.raises(VnetError, match="own:files: the scenario has a check of this name"):
+                emu.end()
+
+    asyncio.run(story())
+
+
+@pytest.mark.slow
 def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: Path) -> None:
     scenario = make_scenario(
         {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},

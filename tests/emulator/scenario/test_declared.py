@@ -76,9 +76,20 @@ def test_a_declaration_is_read_without_the_program(tmp_path: Path, monkeypatch: 
     assert not are_here(Program(entry="nowhere_to_be_found:main"))
 
 
-def test_a_declared_module_that_fails_makes_a_check_unknown(tmp_path: Path) -> None:
-    run = simulate_into(written(tmp_path, "failing", "raise RuntimeError('broken')"), tmp_path / "run")
+@pytest.mark.parametrize(
+    ("name", "declared", "said"),
+    [
+        ("failing", "raise RuntimeError('broken')", "RuntimeError: broken"),
+        ("functions", "CHECKS = (print,)", 'a list of "module:function" is needed'),
+        ("one", "CHECKS = ('one:check')", 'a list of "module:function" is needed'),
+        ("none", "CHECKS = 5", 'a list of "module:function" is needed'),
+    ],
+)
+def test_a_declared_module_that_fails_makes_a_check_unknown(
+    name: str, declared: str, said: str, tmp_path: Path
+) -> None:
+    run = simulate_into(written(tmp_path, name, declared), tmp_path / "run")
     record = json.loads((run / "verdict.json").read_text())
-    failed = {check["name"]: check for check in record["checks"]}["own:failing_declared.CHECKS"]
+    failed = {check["name"]: check for check in record["checks"]}[f"own:{name}_declared.CHECKS"]
     assert failed["verdict"] == record["verdict"] == "unknown"
-    assert "RuntimeError: broken" in failed["text"]
+    assert said in failed["text"]

@@ -328,7 +328,7 @@ def test_a_token_that_two_vehicles_have_is_there_until_both_are_gone() -> None:
 
 
 def test_a_router_that_goes_takes_tokens_and_sessions_along() -> None:
-    """What ends until there is one again is told by nobody."""
+    """Nobody tells of those that end before there is one again."""
 
     async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
         gateway, token = vehicles[0].gateway, sessions[0].liveliness().declare_token("car/a")
