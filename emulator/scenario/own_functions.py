@@ -113,8 +113,10 @@ def declared_checks(program: Program) -> list[str]:
             checks = getattr(_imported(module), "CHECKS", ())
         except ScenarioError:
             checks = None
-        are_entries = isinstance(checks, (list, tuple)) and all(isinstance(each, str) for each in checks)
-        entries += checks if are_entries else [f"{module}:CHECKS"]  # whose check says why
+        if isinstance(checks, (list, tuple)) and all(isinstance(each, str) for each in checks):
+            entries += checks
+        else:
+            entries.append(f"{module}:CHECKS")  # its check says why
     return entries
 
 

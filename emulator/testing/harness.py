@@ -282,7 +282,7 @@ class RunHarness:
         self._promises[name] = partial(judge, name=name)
 
     def _must_be_new(self, judgement: Judgement) -> None:
-        taken = {each.name for each in (*judgement.checks, *judgement.not_exercised)}
+        taken = {each.name for each in judgement.checks} | {each.name for each in judgement.not_exercised}
         for name in self._promises:
             if PREFIX + name in taken:
                 raise VnetError(f"{PREFIX}{name}: the scenario has a check of this name: give the promise another")
