@@ -369,10 +369,9 @@ def read_result(cell: Cell, folder: Path, live: bool = False) -> dict[str, Any]:
     path = _result_path(folder / ("live" if live else "cells"), cell)
     try:
         figures: dict[str, Any] = json.loads(path.read_text())
-        return cell.labels | {
-            f"reported.{name}" if name in cell.labels else name: figures[name] for name in figures
-        }
-    except (OSError, ValueError, TypeError) as error:
+        named = {f"reported.{name}" if name in cell.labels else name: value for name, value in figures.items()}
+        return {**cell.labels, **named}
+    except (OSError, ValueError, AttributeError) as error:
         raise VnetError(f"{path}: not the result of a cell: {error}; remove it to run the cell again") from None
 
 
