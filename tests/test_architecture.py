@@ -165,10 +165,7 @@ def test_circles_and_upward_imports_would_be_seen() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set(), "e": {"a"}}) == [["a", "b", "c"]]
     assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
     graph = {"vnet.errors": {"emulator.cli"}, "emulator.checks.run": {"emulator.stream", "vnet.errors"}}
-    assert violations(graph, LAYERS) == [
-        "vnet.errors -> emulator.cli",
-        "emulator.checks.run -> emulator.stream",
-    ]
+    assert violations(graph, LAYERS) == ["vnet.errors -> emulator.cli", "emulator.checks.run -> emulator.stream"]
 
 
 def test_imports_only_go_down() -> None:

@@ -53,9 +53,7 @@ def granted(time_ns: int) -> wire.Grant:
     return wire.Grant(0, time_ns, time_ns + 2 * MS, quiet_ns=100 * MS)
 
 
-def test_the_end_of_the_run_does_not_pass_through_the_program(
-    run: Callable[[Program, Swap], wire.Traffic],
-) -> None:
+def test_the_end_of_the_run_does_not_pass_through_the_program(run: Callable[[Program, Swap], wire.Traffic]) -> None:
     asked: list[int | None] = []
     seen: list[str] = []
 

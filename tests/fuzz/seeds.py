@@ -285,8 +285,4 @@ JSON_WORDS = (
 )
 
 
-QUERIES = (
-    b"status\n",
-    *(b"inject\n" + seed for seed in FAULT_SEEDS),
-    b'heal\n"all"',
-)
+QUERIES = (b"status\n", *(b"inject\n" + seed for seed in FAULT_SEEDS), b'heal\n"all"')

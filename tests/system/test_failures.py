@@ -80,9 +80,7 @@ def test_an_interruption_before_the_start_is_as_clean(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options",
-    [[], ["--set", "run.start=spawn"], ["--hosts", "1"]],
-    ids=["forked", "spawned", "on hosts"],
+    "options", [[], ["--set", "run.start=spawn"], ["--hosts", "1"]], ids=["forked", "spawned", "on hosts"]
 )
 def test_agents_end_with_an_emulator_that_is_killed_also_in_a_busy_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]

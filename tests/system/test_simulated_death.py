@@ -41,12 +41,7 @@ def scenario(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "end",
-    [
-        FAULT,
-        "ctypes.CDLL(None)._exit(0)",
-        "await asyncio.to_thread(ctypes.string_at, 0)",
-    ],
+    "end", [FAULT, "ctypes.CDLL(None)._exit(0)", "await asyncio.to_thread(ctypes.string_at, 0)"]
 )
 def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end: str) -> None:
     done = run(command(tmp_path, end), cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)

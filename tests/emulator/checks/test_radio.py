@@ -135,9 +135,7 @@ def test_with_fading_any_pair_may_do_anything_once(faded: RecordedRun) -> None:
     assert verdict(changed(faded, arrives), "fading") is Verdict.VALID
 
 
-def test_too_much_and_too_little_fading_is_seen_where_no_link_alone_tells(
-    faded: RecordedRun,
-) -> None:
+def test_too_much_and_too_little_fading_is_seen_where_no_link_alone_tells(faded: RecordedRun) -> None:
     few = replace(faded, trace=faded.trace.slice(0, faded.trace.num_rows // 4))
 
     def fade(columns: dict[str, Any], arrived: np.ndarray) -> None:

@@ -161,10 +161,5 @@ def test_what_may_change_or_go_in_any_version_is_marked_in_help_and_reference() 
         for option in command.params
         if "(experimental)" in (getattr(option, "help", None) or "")
     }
-    assert marked == {
-        "vnet host",
-        "vnet run --hosts",
-        "vnet emulator --hosts",
-        "vnet access --hosts",
-    }
+    assert marked == {"vnet host", "vnet run --hosts", "vnet emulator --hosts", "vnet access --hosts"}
     assert "(experimental)" in str(environment.__doc__).splitlines()[0]

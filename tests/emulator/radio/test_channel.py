@@ -222,8 +222,7 @@ def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.tuples(st.integers(0, 2_000_000), st.integers(0, 1400)), min_size=1, max_size=25),
-    st.integers(1, 4),
+    st.lists(st.tuples(st.integers(0, 2_000_000), st.integers(0, 1400)), min_size=1, max_size=25), st.integers(1, 4)
 )
 def test_the_queue_fills_and_drains_with_the_bit_rate(gaps: list[tuple[int, int]], limit: int) -> None:
     times = np.cumsum([gap for gap, _ in gaps]).tolist()

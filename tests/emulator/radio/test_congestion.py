@@ -9,10 +9,7 @@ from emulator.radio.csma import BusyRatioMeter, LimericControl, ReactiveControl
 from emulator.radio.engine import Engine
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.outcomes import Outcome
-from emulator.scenario.radio import (
-    EtsiReactive,
-    Limeric,
-)
+from emulator.scenario.radio import EtsiReactive, Limeric
 from tests.support.radio import engine, line
 
 MS = 1_000_000

@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from emulator.radio.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
 from emulator.radio.reception import reception_draws
-from emulator.scenario.radio import (
-    RATES_MBPS,
-)
+from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio
 from tests.support.radio import nist_qpsk_half
 

@@ -341,10 +341,7 @@ def test_calls_are_bounded_one_by_one_and_not_in_sum(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        (
-            "tests.support.nowhere:rule",
-            "cannot import: ModuleNotFoundError: No module .*nowhere'",
-        ),
+        ("tests.support.nowhere:rule", "cannot import: ModuleNotFoundError: No module .*nowhere'"),
         ("tests.support.rules:nobody", r"module tests.support.rules \(.*rules.py\) has no 'nobody'"),
         ("tests.support.rules:NUMBER", r"is not a function of a frame and a state: def NUMBER\(frame, state\)"),
         ("tests.support.rules:waits", r"is not a function of a frame and a state: def waits\(frame, state\)"),

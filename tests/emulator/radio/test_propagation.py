@@ -7,14 +7,7 @@ import pytest
 
 from emulator.radio.propagation import QUANTILES, Nakagami, ShadowField, loss_db
 from emulator.radio.topology import distances_m
-from emulator.scenario.radio import (
-    DualSlope,
-    Fading,
-    FreeSpace,
-    LogDistance,
-    Shadowing,
-    TwoRay,
-)
+from emulator.scenario.radio import DualSlope, Fading, FreeSpace, LogDistance, Shadowing, TwoRay
 from tests.support.radio import line
 
 LIGHT_M_S = 299_792_458.0

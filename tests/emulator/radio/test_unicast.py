@@ -30,9 +30,7 @@ sends = st.lists(
 """Frames: time, sender, and addressee: one of five vehicles, or nobody, or all."""
 radios = st.fixed_dictionaries(
     {
-        "mac": st.fixed_dictionaries(
-            {"access_category": st.sampled_from([*AIFSN_AND_CW]), "eifs": st.booleans()},
-        ),
+        "mac": st.fixed_dictionaries({"access_category": st.sampled_from([*AIFSN_AND_CW]), "eifs": st.booleans()}),
         "loss": st.sampled_from([0.0, 0.4, 0.9]),
         "fading": st.sampled_from([None, {}]),
         "max_peers": st.sampled_from([2, 1000]),

@@ -121,10 +121,7 @@ def test_a_folder_shows_declared_charts_where_the_program_is_not_installed(run: 
 def test_views_of_a_folder_that_cannot_be_are_one_line(run: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(run, tmp_path / "run"))
     verdict = json.loads((folder / "verdict.json").read_text())
-    for change, said in {
-        "id": "<b>",
-        "lines": {},
-    }.items():
+    for change, said in {"id": "<b>", "lines": {}}.items():
         wrong = {**verdict, "views": {"charts": [{**verdict["views"]["charts"][0], change: said}]}}
         (folder / "verdict.json").write_text(json.dumps(wrong))
         with pytest.raises(VnetError, match=rf"verdict\.json: views\.charts\.0\.{change}"):

@@ -44,9 +44,7 @@ def test_what_prints_is_kept_and_the_result_is_printed(tmp_path: Path, capfd: py
     assert sorted(kept[1:]) == ["from C", "from Python", "from a descriptor", "late"]
 
 
-def test_a_caller_with_another_standard_output_gets_the_result_alone(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_caller_with_another_standard_output_gets_the_result_alone(capsys: pytest.CaptureFixture[str]) -> None:
     with result_only(True) as output:
         print("noise")
         output.print("the result")

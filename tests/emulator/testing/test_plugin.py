@@ -373,9 +373,7 @@ async def test_order(vnet_emulation):
     assert tapes[0] == tapes[1] and len(tapes[0].splitlines()) > 1
 
 
-def test_a_live_run_whose_program_cannot_be_imported_is_refused_before_it_starts(
-    pytester: pytest.Pytester,
-) -> None:
+def test_a_live_run_whose_program_cannot_be_imported_is_refused_before_it_starts(pytester: pytest.Pytester) -> None:
     result = run_tests(
         pytester,
         """

@@ -11,12 +11,7 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.scenario import Scenario
-from emulator.viewer.drawing import (
-    OUTCOME_COLOURS,
-    PeriodArrays,
-    ellipses,
-    link_states,
-)
+from emulator.viewer.drawing import OUTCOME_COLOURS, PeriodArrays, ellipses, link_states
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.scenes import STROKES
 from emulator.viewer.sinks import Sinks, is_closed

@@ -600,7 +600,7 @@ def test_input_and_output_are_not_closed_by_a_program(drive: Drive) -> None:
             time.sleep(float("nan"))
         except ValueError as error:
             print(error)
-        """,
+        """
     )
     assert ["virtual time" in line for line in log(run)[:3]] == [True] * 3, log(run)
     assert log(run)[3] == "Invalid value NaN (not a number)"

@@ -17,10 +17,7 @@ from tests.vnet.gateway.conftest import Drive, events, log, printed
 from vnet.gateway.emulated import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
-MODULES = zenoh_modules(
-    cast(Any, SimpleNamespace(due=None)),
-    cast(Any, SimpleNamespace(threads=None, environ={})),
-)
+MODULES = zenoh_modules(cast(Any, SimpleNamespace(due=None)), cast(Any, SimpleNamespace(threads=None, environ={})))
 
 
 def declared(module: str) -> Iterator[ast.stmt]:

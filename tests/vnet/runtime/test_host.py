@@ -396,10 +396,7 @@ def test_reports_and_frames_travel_with_the_yield_of_their_instant() -> None:
         (lambda node: node.report(delay_ms=10**400), r"delay_ms=1000.*: a number within ±1.8e\+308 is expected"),
         (lambda node: node.report(delay_ms=10**9000), r"delay_ms=\(int\)\): a number within"),
         (lambda node: node.report(covariance_m2=[[1, 0.5], [0.4, 1]]), "not symmetric, so no covariance"),
-        (
-            lambda node: node.report(covariance_m2=[[1, 2], [2, 1]]),
-            r"\[2, 1\]\]\): not positive semidefinite",
-        ),
+        (lambda node: node.report(covariance_m2=[[1, 2], [2, 1]]), r"\[2, 1\]\]\): not positive semidefinite"),
         (lambda node: node.report(covariance_m2=-np.eye(2)), "not positive semidefinite"),
         (lambda node: node.report(covariance_m2=[[np.nan, 0], [0, 1]]), "not finite, so no covariance"),
         (lambda node: node.report(common_error_covariance_m2=[[1, 0], [0, np.inf]]), "common_.*not finite"),

@@ -24,12 +24,7 @@ clocks = st.lists(
 )
 busy = st.lists(st.builds(wire.BusyRatios, times, st.lists(st.floats(0, 1), max_size=3)), max_size=2)
 fixes = st.builds(
-    wire.WireFix,
-    names,
-    times,
-    st.tuples(reals, reals),
-    st.tuples(reals, reals, reals, reals),
-    st.none() | reals,
+    wire.WireFix, names, times, st.tuples(reals, reals), st.tuples(reals, reals, reals, reals), st.none() | reals
 )
 reports = st.builds(
     Report,

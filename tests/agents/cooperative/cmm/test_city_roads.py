@@ -68,10 +68,7 @@ def test_of_a_winding_lane_only_the_nearest_piece_is_a_candidate() -> None:
 @pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
-    st.lists(st.floats(-60, 60), min_size=1, max_size=6),
-    st.floats(0.05, 5),
-    st.floats(0, 4),
-    st.floats(0.001, 0.9),
+    st.lists(st.floats(-60, 60), min_size=1, max_size=6), st.floats(0.05, 5), st.floats(0, 4), st.floats(0.001, 0.9)
 )
 def test_hypotheses_add_up(offsets: list[float], sigma_m: float, map_sigma_m: float, off_road: float) -> None:
     roads = road_map([(-500, 3.5 * k, EAST, 1000) for k in range(3)], sigma_m=map_sigma_m)

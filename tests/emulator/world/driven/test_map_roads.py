@@ -318,16 +318,8 @@ def brute_force_way_m(road: MapRoads, along_m: Any, left_m: Any, number: int, ra
         (9, {"routes": [EAST], "gap_m": 50.0}, "9 vehicles a lane with gap_m = 50 take 490.5 m: route"),
         (1, {"routes": [EAST], "start_m": [500]}, r"start_m: 500: route \['edge 0', 'edge 1'\] has 400 m"),
         (2, {"routes": [EAST], "start_m": [50]}, "start_m: 1 value for 2 vehicles"),
-        (
-            1,
-            {"routes": [EAST], "start_m": [50], "start_lanes": [1]},
-            "start_lanes: 1 for vehicle 1: its road",
-        ),
-        (
-            2,
-            {"routes": [EAST, NORTH], "start_m": [199, 199]},
-            "v0[12] and v0[12] overlap at the start",
-        ),
+        (1, {"routes": [EAST], "start_m": [50], "start_lanes": [1]}, "start_lanes: 1 for vehicle 1: its road"),
+        (2, {"routes": [EAST, NORTH], "start_m": [199, 199]}, "v0[12] and v0[12] overlap at the start"),
         (40, {}, "no room for vehicle .* with gap_m = 30"),
     ],
 )
