@@ -36,7 +36,6 @@ async def computes_for_ever(node: Node) -> None:
             signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("program", ["is_interrupted", "computes_for_ever"])
 def test_an_interruption_is_recorded_and_the_run_judged(
     tmp_path: Path, program: str, caplog: pytest.LogCaptureFixture
@@ -59,7 +58,6 @@ def test_an_interruption_is_recorded_and_the_run_judged(
         assert caplog.text == "", "asyncio has nothing to complain of"
 
 
-@pytest.mark.slow
 def test_whoever_sees_to_interruptions_goes_on_doing_so(tmp_path: Path) -> None:
     seen: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, frame: seen.append(number))
@@ -85,7 +83,6 @@ async def two_wake_ups_a_second(node: Node) -> None:
         await node.radio.broadcast(b"x" * (40 if node.id == "v02" else 7))
 
 
-@pytest.mark.slow
 def test_costs_are_those_of_each_vehicles_program(tmp_path: Path) -> None:
     program = {"entry": "tests.emulator.drivers.test_simulate:two_wake_ups_a_second"}
     emulation = emulate(tmp_path / "run", program=program)

@@ -62,22 +62,19 @@ async def test_steps(vnet_emulation):
 
 @pytest.mark.parametrize("options", [["-p", "no:xdist"], ["-n", "2"], ["-s", "-p", "no:faulthandler"]])
 def test_a_fatal_signal_ends_pytest_and_the_vehicle_is_named(pytester: pytest.Pytester, options: list[str]) -> None:
-    pytester.makepyfile(
-        f"""
+    pytester.makepyfile(f"""
 async def test_fatal(vnet_emulation):
     changes = dict(duration=2, settle=0.5, program="tests.emulator.testing.programs:faulty")
     async with vnet_emulation({str(BEACON)!r}, vehicles=3, **changes) as emu:
         await emu.run_until(1.0)
-"""
-    )
+""")
     done = session_of_its_own(pytester, *options)
     assert done.returncode != 0, done.stdout
     assert "vnet: pytest's process ended while the program of v01 ran" in done.stderr.splitlines()
 
 
 def test_a_session_that_ends_as_it_should_says_nothing(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(
-        f"""
+    pytester.makepyfile(f"""
 import os
 async def test_leaves_in_the_midst(vnet_emulation):
     async with vnet_emulation({str(BEACON)!r}, vehicles=2, duration=2, settle=0.5) as emu:
@@ -86,8 +83,7 @@ async def test_leaves_in_the_midst(vnet_emulation):
     if not pid:
         os._exit(0)
     os.waitpid(pid, 0)
-"""
-    )
+""")
     done = session_of_its_own(pytester)
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -397,13 +393,11 @@ def test_the_plugin_imports_nothing_heavy() -> None:
 
 
 def test_a_program_that_ends_the_process_late_does_not_make_it_a_success(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(
-        f"""
+    pytester.makepyfile(f"""
 import atexit, os
 async def test_ends(vnet_emulation):
     async with vnet_emulation({str(BEACON)!r}, vehicles=2, duration=2, settle=0.5) as emu:
         await emu.run_until(1.0)
     atexit.register(os._exit, 0)
-"""
-    )
+""")
     assert session_of_its_own(pytester, "-p", "no:xdist").returncode == 71
