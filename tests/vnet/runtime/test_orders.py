@@ -256,7 +256,7 @@ PRIMITIVES = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", PRIMITIVES, ids=lambda program: program.__name__)
+@pytest.mark.parametrize("program", PRIMITIVES)
 def test_asyncio_s_primitives_hold_in_every_order(program: Callable[[Node], Awaitable[None]]) -> None:
     """Without an alarm. In CI there are 626 shuffles and 626 times PCT of each of eight programs: 10 016 orders."""
     different = set()
