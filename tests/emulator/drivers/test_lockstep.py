@@ -15,7 +15,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep, run_in_lockstep
 from emulator.drivers.processes import Heard, Processes, ProtocolError
 from emulator.radio.outcomes import Outcome
-from tests.support.multi_loop_driver import emulation_of, scenario_of
+from tests.support.multi_loop_driver import emulation_of, fault, scenario_of
 from vnet.radio import Packet, SentFrame
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
@@ -32,11 +32,6 @@ def barrier(
     sections = {"radio": {"loss": 0.0}, **sections}
     emulation = emulation_of(scenario_of(list(faults), "agents.beacon:main", **sections))
     return Lockstep(emulation, processes), emulation
-
-
-def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
-    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
-    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
 
 
 def yielded(

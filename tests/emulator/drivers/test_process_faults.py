@@ -12,7 +12,7 @@ import pytest
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario
-from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
+from tests.support.multi_loop_driver import emulation_of, fault, run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.radio import SentFrame
 from vnet.reports import Report
@@ -159,11 +159,6 @@ async def wakes_up(node: Node) -> None:
 
     asyncio.get_running_loop().call_later(0.25, strike)
     await asyncio.gather(tick("first"), tick("second"), locate(), hear())
-
-
-def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
-    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
-    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
 
 
 def both(faults: list[dict[str, Any]], program: str, **sections: Any) -> tuple[Emulation, dict[str, list[Entry]]]:

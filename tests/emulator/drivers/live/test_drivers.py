@@ -11,6 +11,7 @@ from emulator.drivers.lockstep import Lockstep, run_in_lockstep
 from emulator.drivers.processes import Stalled
 from emulator.drivers.realtime import RealTime, run_in_real_time
 from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
+from tests.support.multi_loop_driver import fault
 from vnet.radio import SentFrame
 from vnet.transport import wire
 from vnet.transport.wire import MessageRef, Sent, SentMessage
@@ -66,11 +67,6 @@ def yields(node: str, message: Any, nonce: bytes = b"1") -> wire.AgentMessage | 
     frames = [SentFrame(node, b"x")] if node == "v01" else []
     steps = [wire.Step(message.time_ns, wire.Traffic(frames))]
     return wire.Yield(nonce, message.seq, message.time_ns + 100 * MS, (), (), steps, 1)
-
-
-def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
-    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
-    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
 
 
 @in_virtual_time
