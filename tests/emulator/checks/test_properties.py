@@ -41,9 +41,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         "run": {"duration_s": 2.0, "settle_s": 0.0},
         "network": {"vehicles": 4},
         "radio": {"range_m": 1e6},
-        "program": {"entry": "tests.emulator.checks.test_properties:brakes"},
+        "program": {"entry": f"{__name__}:brakes"},
     }
     return Run.open(recorded(scenario, tmp_path_factory.mktemp("run") / "run"))
+
+
+BRAKES = "tests.emulator.checks.test_properties:brakes"
+SHORT = {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}}
 
 
 def braked(moment: Moment) -> bool:
@@ -159,8 +163,9 @@ def fault_scenario() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    program = "tests.emulator.checks.test_properties:counts_the_dead"
-    return simulate(fault_scenario(), program=program, out=tmp_path_factory.mktemp("run") / "run")
+    return simulate(
+        fault_scenario(), program=f"{__name__}:counts_the_dead", out=tmp_path_factory.mktemp("run") / "run"
+    )
 
 
 def kill(moment: Moment) -> bool:
@@ -207,9 +212,7 @@ def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty:
 
 @pytest.mark.slow
 def test_a_test_promises_what_follows_a_fault_that_it_injects(tmp_path: Path) -> None:
-    scenario = make_scenario(
-        fault_scenario() | {"fault": []}, {"program": "tests.emulator.checks.test_properties:counts_the_dead"}
-    )
+    scenario = make_scenario(fault_scenario() | {"fault": []}, {"program": f"{__name__}:counts_the_dead"})
 
     async def story() -> None:
         async with RunHarness(scenario, tmp_path / "run") as emu:
@@ -240,22 +243,14 @@ def test_the_result_is_one_of_a_check_of_ones_own(tmp_path: Path, monkeypatch: p
         "from emulator.checks.properties import always\n\n\n"
         "def check(run):\n    yield always(run, 'small', lambda m: m['count'] < 0.5)\n"
     )
-    judged = simulate(
-        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
-        program="tests.emulator.checks.test_properties:brakes",
-        checks=[str(checks) + ":check"],
-        out=tmp_path / "run",
-    )
+    judged = simulate(SHORT, program=BRAKES, checks=[f"{checks}:check"], out=tmp_path / "run")
     (check,) = [check for check in judged.checks if check.name == "own:small"]
     assert judged.verdict == "invalid" and check.text.startswith("is false: first of v01 at 0.5 s")
 
 
 @pytest.mark.slow
 def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
-    scenario = make_scenario(
-        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
-        {"program": "tests.emulator.checks.test_properties:brakes"},
-    )
+    scenario = make_scenario(SHORT, {"program": BRAKES})
 
     def counts(moment: Moment) -> bool:
         return bool(moment["count"] >= 0)
@@ -281,10 +276,7 @@ def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: Path) -> None:
-    scenario = make_scenario(
-        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
-        {"program": "tests.emulator.checks.test_properties:brakes"},
-    )
+    scenario = make_scenario(SHORT, {"program": BRAKES})
 
     async def story(folder: str, promise: Callable[[RunHarness], None]) -> None:
         async with RunHarness(scenario, tmp_path / folder) as emu:
