@@ -19,6 +19,7 @@ from emulator.radio.topology import Disc, Topology
 from emulator.records.distributions import binomial_interval
 from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of
 from emulator.scenario.scenario import Radio
+from tests.support.radio import drained
 
 MS = 1_000_000
 seeds = st.integers(0, 2**63 - 1)
@@ -237,8 +238,7 @@ def test_oversize_frames_and_other_senders_take_no_place_in_a_queue() -> None:
     subject = Engine(["a", "b", "c"], quick.model_copy(update={"jitter_ms": 0.0}), 1, np.zeros((3, 2)), None)
     subject.transmit(0, 0, [bytes(100), *[bytes(101)] * 4, bytes(100), bytes(100)])
     subject.transmit(0, 1, [bytes(100)])
-    subject.drain()
-    rows = [row for row in subject.trace.to_table().to_pylist() if row["receiver"] == "c"]
+    rows = [row for row in drained(subject) if row["receiver"] == "c"]
     assert [row["outcome"] for row in rows] == [
         "delivered",
         *["oversize"] * 4,

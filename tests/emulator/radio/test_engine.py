@@ -17,6 +17,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.scenario.scenario import Radio
 from emulator.world.radio_inputs import RadioInputs
+from tests.support.radio import drained
 
 PERIOD_NS = 100_000_000
 seeds = st.integers(0, 2**63 - 1)
@@ -50,8 +51,7 @@ def test_every_pair_has_exactly_one_outcome(count: int, seed: int, loss: float, 
         subject.transmit(number * 1_000_000, number % count, [bytes(size)] * 2)
         if number == 3 and count > 1:
             subject.set_up(0, False)
-    subject.drain()
-    table = rows(subject)
+    table = drained(subject)
     sent = Counter((row["sender"], row["seq"]) for row in table)
     degree = in_range(position).sum(axis=1)
     assert all(number == degree[int(sender[1:])] for (sender, _), number in sent.items())
@@ -105,8 +105,7 @@ def test_a_sender_that_is_down_sends_nothing_and_goes_on_counting() -> None:
     subject.transmit(1, 0, [b"x"])
     subject.set_up(0, True)
     subject.transmit(2, 0, [b"x"])
-    subject.drain()
-    assert [row["seq"] for row in rows(subject)] == [0, 1]
+    assert [row["seq"] for row in drained(subject)] == [0, 1]
 
 
 def test_what_the_transport_lost_is_said_so() -> None:
