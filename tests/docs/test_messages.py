@@ -94,7 +94,6 @@ def _fields_of(kind: Any) -> list[str]:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(agent_messages | emulator_messages | unit_messages | welcomes)
 def test_a_plain_reader_decodes_what_vnet_encodes(message: Any) -> None:
     kind, *values = msgpack.unpackb(wire.encode(message))
@@ -105,7 +104,6 @@ def test_a_plain_reader_decodes_what_vnet_encodes(message: Any) -> None:
     assert all(by_name[name] == getattr(message, name) for name in plain)
 
 
-@settings(max_examples=50, deadline=None)
 @given(reports)
 def test_a_plain_reader_decodes_reports(report: Report) -> None:
     assert PAGE.problem_of("Report", msgpack.unpackb(wire.encode(report))) == ""

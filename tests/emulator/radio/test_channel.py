@@ -89,7 +89,6 @@ def test_draws_depend_on_the_frame_and_not_on_what_was_drawn_before(
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(seeds, st.lists(st.tuples(frames_of, st.integers(0, 99)), min_size=1, max_size=6), st.data())
 def test_single_draws_are_those_of_the_frames_whole_vectors(
     seed: int, frames: list[tuple[tuple[int, int], int]], data: st.DataObject
@@ -157,7 +156,6 @@ def test_the_range_is_a_closed_disc_without_its_centre() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(lattice, st.integers(1, 5), st.integers(1, 6), st.sets(st.integers(0, 11), max_size=4))
 def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
     places: list[tuple[int, int]], cap: int, reach: int, down: set[int]
@@ -221,7 +219,6 @@ def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 2_000_000), st.integers(0, 1400)), min_size=1, max_size=25), st.integers(1, 4)
 )

@@ -94,7 +94,6 @@ options = st.fixed_dictionaries(
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(seeds, crowds, options, st.lists(st.integers(0, 8 * MS), max_size=40))
 def test_however_time_is_cut_the_same_happens(
     seed: int, sends: list[Send], radio: dict[str, Any], stops: list[int]
@@ -126,7 +125,6 @@ QUIET: dict[str, Any] = {"access_jitter_ms": 0.0, "loss": 0.0, "queue_frames": 6
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(seeds, crowds, options, st.lists(st.integers(0, 8 * MS), max_size=20), villains, spans, spans)
 @example(
     seed=1,
@@ -150,7 +148,6 @@ def test_however_time_is_cut_copies_have_the_same_numbers(
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(seeds, crowds, options)
 def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
     seed: int, sends: list[Send], radio: dict[str, Any]

@@ -224,7 +224,6 @@ def test_a_row_of_a_long_trace_in_which_bytes_were_changed_costs_no_more_than_of
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(seeds, st.integers(2, 9), st.integers(0, 3))
 def test_arrivals_at_one_time_are_ordered_and_are_shown_in_that_order(seed: int, count: int, tick_ms: int) -> None:
     """With a delivery tick many packets arrive at the same time: then sender, number and receiver decide."""

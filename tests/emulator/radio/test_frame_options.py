@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import emulator
@@ -48,7 +48,6 @@ def run(coroutine: Any) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
 @given(st.floats(-40, 0), st.sampled_from(RATES_MBPS), st.integers(20, 200))
 def test_power_shifts_the_received_one_and_rate_the_airtime(
     gain_db: float, rate_mbps: float, distance_m: int

@@ -116,7 +116,6 @@ def test_however_time_is_cut_the_same_happens(
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(0, 400 * MS), min_size=1, max_size=12, unique=True), kinds, keys)
 def test_frames_go_on_air_in_whole_slots_and_never_arrive_within_the_window(
     times_ns: list[int], radio: dict[str, Any], keys: dict[str, Any]
@@ -237,7 +236,6 @@ def test_a_frame_keeps_its_window_where_a_longer_one_ends_the_reservation_it_wai
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.tuples(st.sampled_from([0, 2, 30, 150]), st.sampled_from([50, 300, 500])), min_size=2, max_size=40),
     st.sampled_from([LTE, with_mac(LTE, one_shot=True), NR]),

@@ -125,7 +125,6 @@ def test_every_figure_is_the_one_that_its_definition_gives(seed: int, count: int
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 30), st.sampled_from([0.0, 0.02, 0.6, 1.0]))
 def test_the_figures_of_many_periods_are_those_of_each_bit_by_bit(
     seed: int, vehicles: int, periods: int, missing: float

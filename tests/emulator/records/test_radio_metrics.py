@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.checks.judge import RecordedRun
@@ -163,7 +163,6 @@ def close(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(traces())
 def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.ndarray, bool]) -> None:
     rows, position_m, moves = trace
@@ -176,7 +175,6 @@ def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.n
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(traces(), st.floats(5, 300), st.floats(0, 0.9))
 def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(
     trace: tuple[list[Row], np.ndarray, bool], within_m: float, from_s: float
@@ -190,7 +188,6 @@ def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(traces(), st.floats(5, 200))
 def test_vehicles_distances_and_totals_add_up(trace: tuple[list[Row], np.ndarray, bool], bin_m: float) -> None:
     rows, position_m, moves = trace

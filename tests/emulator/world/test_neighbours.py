@@ -73,7 +73,6 @@ def test_what_is_compared_follows_the_pairs_in_range() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(places(lattice), st.sampled_from([1.0, 2.0, 5.0]))
 def test_pairs_are_found_by_number_and_in_the_matrix(vehicles: list[tuple[float, float]], range_m: float) -> None:
     position_m = np.array(vehicles, float).reshape(-1, 2)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.scenario.scenario import Scenario
@@ -254,7 +254,6 @@ def test_components_of_a_chain_and_its_gap() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(
     cells=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=25),
     range_m=st.sampled_from([0.5, 1.0, 1.5, 3.0]),

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.scenario.scenario import Scenario
@@ -232,7 +232,6 @@ def test_a_file_without_end_in_sight_is_bounded(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(
     rows=st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 8), st.integers(0, 1)), min_size=1, max_size=30),
     batch=st.integers(1, 7),
