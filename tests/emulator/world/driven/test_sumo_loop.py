@@ -20,7 +20,6 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import RunFolder
 from emulator.records.tables import BACKGROUND, DRIVEN, positions_by_time
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
@@ -34,6 +33,7 @@ from emulator.viewer.sinks import Sinks
 from emulator.world.driven.sumo import SumoWorld
 from emulator.world.world import build_world
 from tests.support.multi_loop_driver import run_forked, run_other_ways, run_together
+from tests.support.recorded import prepared
 from tests.support.recordings import read_back
 from tests.support.sumo import install_fake, write_scenario
 from vnet import Node
@@ -121,7 +121,7 @@ def test_sumo_writes_its_files_in_a_run_in_several_processes(tmp_path: Path) -> 
 def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> None:
     """`behind` and `late` have none; `late` comes after a second."""
     scenario = Scenario.model_validate(write_scenario(tmp_path, network={"sumo": {"nodes": ["lead#1"]}}))
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     live, told = Messages(emulation), list[dict[str, Any]]()
     emulation.watch(lambda view: told.append(live.period(view)))
     conclude(emulation, simulate(emulation)[0], "simulate")

@@ -14,13 +14,8 @@ from emulator.world.maps.files import read_roads, write_roads
 from emulator.world.maps.roads import NAMES, Roads
 from emulator.world.projection import CoordinateFrame
 from tests.support import maps
+from tests.support.files import write
 from tests.support.maps import NODES, ORIGIN
-
-
-def write(folder: Path, name: str, text: str) -> Path:
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def write_npz(folder: Path, **changes: Any) -> Path:

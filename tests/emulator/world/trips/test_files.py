@@ -16,6 +16,7 @@ from emulator.world.trips import motion as samples_module
 from emulator.world.trips.drive import READERS, write_trips
 from emulator.world.trips.motion import Motion, Samples, Trip
 from emulator.world.world import World, build_world
+from tests.support.files import write
 from vnet.errors import ScenarioError
 
 TWO = "id,time_s,x_m,y_m\na,0,0,0\na,2,20,0\nb,1,0,50\nb,3,0,90\n"
@@ -34,12 +35,6 @@ FCD = """<?xml version="1.0" encoding="UTF-8"?>
     </timestep>
 </fcd-export>
 """
-
-
-def write(folder: Path, name: str, content: str | bytes) -> Path:
-    path = folder / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
 
 
 def read(path: Path, origin_deg: tuple[float, float] | None = None, **options: Any) -> dict[str, Trip]:
