@@ -12,6 +12,7 @@ import pytest
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario
+from tests.emulator.checks.test_faults import NEEDED
 from tests.support.multi_loop_driver import emulation_of, fault, run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.radio import SentFrame
@@ -420,19 +421,6 @@ def test_reports_of_who_was_killed_at_that_instant_are_discarded_with_its_frames
     assert all(row["estimate_m"] is None for row in emulation.metrics.states_table().to_pylist())
 
 
-PARAMETERS: dict[str, dict[str, Any]] = {
-    "loss": {"probability": 0.5},
-    "delay": {"delay_ms": 200},
-    "jitter": {"jitter_ms": 100},
-    "throttle": {"bitrate_mbps": 0.02},
-    "range": {"range_m": 500},
-    "gnss_jump": {"offset_m": [5, 5]},
-    "gnss_ramp": {"rate_m_s": [1, 0]},
-    "custom": {"rule": "tests.support.rules:everything"},
-    "custom_sender": {"rule": "tests.support.rules:babbles"},
-}
-
-
 def drawn(seed: int, kinds: list[str], together: int) -> list[dict[str, Any]]:
     """A schedule of faults drawn at random, many of them at the same instants."""
     rng = random.Random(seed)
@@ -441,7 +429,7 @@ def drawn(seed: int, kinds: list[str], together: int) -> list[dict[str, Any]]:
     for _ in range(rng.randint(2, 6)):
         kind = rng.choice(kinds)
         chosen = [node for group in rng.sample(groups, rng.randint(1, len(groups))) for node in group]
-        more = dict(PARAMETERS.get(kind, {}))
+        more = dict(NEEDED.get(kind, {}))
         if kind == "skew":
             more["offset_ms"] = rng.choice([-1000, -130, 50, 500])
         if kind == "drift":
@@ -453,8 +441,7 @@ def drawn(seed: int, kinds: list[str], together: int) -> list[dict[str, Any]]:
 
 
 def has_nodes(kind: str) -> bool:
-    needed = PARAMETERS.get(kind, {}) | {"skew": {"offset_ms": 0}, "drift": {"rate_ppm": 0}}.get(kind, {})
-    return "nodes" in type(parse_fault(fault(kind, 0, 1, **needed))).model_fields
+    return "nodes" in type(parse_fault(fault(kind, 0, 1, **NEEDED.get(kind, {})))).model_fields
 
 
 @pytest.mark.parametrize(("seed", "together"), [(0, 1), (1, 2), (2, 2), (3, 1)])

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emulator.pages.palette import PALETTE
 from emulator.radio.engine import INITIAL_CAPACITY, NO_ARRIVAL_NS, Delivery, Engine
-from emulator.radio.outcomes import Outcome
+from emulator.radio.outcomes import DRAWN, Outcome, Stage, decided_at
 from emulator.radio.trace import Trace
 from emulator.scenario.scenario import Radio
 from emulator.world.radio_inputs import RadioInputs
@@ -277,3 +278,21 @@ def test_frames_on_their_way_load_no_module(monkeypatch: pytest.MonkeyPatch) -> 
         subject.transmit(number * PERIOD_NS, number % 4, [b"x"])
         assert len(list(subject.advance(number * PERIOD_NS + PERIOD_NS // 2))) == 3
     assert set(sys.modules) == before
+
+
+def test_numbers_names_and_stages() -> None:
+    assert [outcome.value for outcome in Outcome] == list(range(len(Outcome))), "they index tables"
+    assert Outcome(7) is Outcome.fault and Outcome.fault.title == "fault" and Outcome.peer_cap.title == "peer cap"
+    assert set(Outcome) - set(DRAWN) == {Outcome.pending, Outcome.out_of_range}
+    assert DRAWN[0] is Outcome.delivered
+    staged = {outcome for outcome in Outcome if outcome.stage is not None}
+    assert staged == {*DRAWN}
+    assert decided_at(Stage.SENDER) == ("queue_full", "oversize", "held_back", "no_grant")
+    assert decided_at(Stage.ARRIVAL) == ("delivered", "receiver_down", "transport")
+
+
+def test_outcomes_are_told_apart_by_colour_and_by_sign() -> None:
+    colours = [PALETTE[outcome.colour] for outcome in DRAWN]
+    for shade in ("light", "dark", "either"):
+        assert len({getattr(colour, shade) for colour in colours}) == len(DRAWN)
+    assert len({outcome.sign for outcome in DRAWN}) == len(DRAWN)

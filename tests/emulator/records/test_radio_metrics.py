@@ -13,10 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.checks.judge import RecordedRun
-from emulator.records.radio_metrics import radio_metrics, rows_of_pairs
+from emulator.records.radio_metrics import radio_metrics, rows_of_pairs, unicast_figures
 from emulator.records.tables import STATES
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import run_scenario
+from tests.support.exchange_programs import COPYING, exchange_run
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
 PERIOD_NS = 100_000_000
@@ -268,3 +269,21 @@ def test_a_run_in_which_nothing_was_sent_has_no_links(tmp_path: Path) -> None:
     told = radio_metrics(evidence_of([], np.zeros((1, 3, 2)), moves=False))
     assert not len(told.links) and not len(told.distances) and len(told.vehicles) == 3
     assert told.totals["delivery_ratio"] is None
+
+
+@pytest.mark.slow
+def test_figures_of_frames_to_one_vehicle_are_what_the_program_was_told(tmp_path: Path) -> None:
+    """Also of those that faults have lost or altered, and without those that faults have sent again."""
+    lossy = [
+        {"kind": "loss", "at_s": 0.4, "duration_s": 0.2, "probability": 1.0, "nodes": ["b"]},
+        {"kind": "corrupt", "at_s": 0.0, "duration_s": 0.2, "probability": 1.0},
+        {"kind": "StaleMessages", "at_s": 0.6, "duration_s": 0.2, "age_s": 0.05, "nodes": ["a"]},
+    ]
+    recorded = exchange_run(tmp_path, [*COPYING, *lossy])
+    told = [event.details["details"] for event in recorded.event("event")]
+    assert len(told) == 80 and {row["cause"] for row in recorded.trace.to_pylist()} >= {"loss-2", "corrupt-3"}
+    figures = unicast_figures(recorded)
+    assert figures is not None
+    assert figures.sent == len(told)
+    assert figures.acknowledged == sum(each["delivered"] for each in told)
+    assert figures.retries == sum(each["attempts"] - 1 for each in told)

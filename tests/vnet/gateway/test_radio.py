@@ -343,20 +343,6 @@ def test_fixes_and_reports_go_by_own_keys(drive: Drive) -> None:
     assert len(run.trace) == 0
 
 
-def test_callback_that_fails_is_told_and_zenoh_goes_on(drive: Drive) -> None:
-    run = drive("""
-        import time, zenoh
-        session = zenoh.open(zenoh.Config())
-        session.declare_subscriber("a", lambda sample: print(1 / int(sample.payload.to_string())))
-        for number in ("1", "0", "2"):
-            session.put("a", number)
-        time.sleep(0.1)
-        """)
-    (told,) = events(run, "exception")
-    assert ("ZeroDivisionError" in told["error"], "in a callback of Zenoh" in told["place"]) == (True, True)
-    assert {"1.0", "0.5"} <= set(log(run))
-
-
 def test_command_that_is_no_python_and_keys_that_overlap_are_refused_by_name(drive: Drive) -> None:
     with pytest.raises(ScenarioError, match=r"program\.command = 'talker x'"):
         drive("", program={"command": ["talker", "x"]})
