@@ -62,14 +62,8 @@ def _toml() -> dict[str, bytes]:
         "a table": b"{}",
     }
     keys: tuple[bytes, ...] = (
-        b"radio.links",
-        b"radio.max_peers",
-        b"radio.loss",
-        b"run.seed",
-        b"run.name",
-        b"network.path",
-        b"inputs",
-    )
+        b"radio.links", b"radio.max_peers", b"radio.loss", b"run.seed", b"run.name", b"network.path", b"inputs",
+    )  # fmt: skip
     keys += (b"program.options.a", b"program.entry")
     nasty = {
         f"{key.decode()} = {name}": key + b" = " + value

@@ -38,17 +38,8 @@ NEEDED: dict[str, dict[str, Any]] = {
     "custom_sender": {"rule": "tests.support.rules:babbles", "name": "custom_sender"},
 }
 OF_LINKS = (
-    "partition",
-    "block",
-    "loss",
-    "burst_loss",
-    "delay",
-    "jitter",
-    "reorder",
-    "duplicate",
-    "corrupt",
-    "custom",
-)
+    "partition", "block", "loss", "burst_loss", "delay", "jitter", "reorder", "duplicate", "corrupt", "custom",
+)  # fmt: skip
 RESTARTS = ("emulator_restart", "router_restart")
 AT_S, DURATION_S = 2.0, 2.0
 
@@ -159,17 +150,8 @@ async def sends_by_the_clock(node: Node) -> None:
 @pytest.mark.slow
 def test_many_faults_at_once_are_told_apart() -> None:
     kinds: tuple[str, ...] = (
-        "partition",
-        "kill",
-        "pause",
-        "loss",
-        "burst_loss",
-        "duplicate",
-        "corrupt",
-        "delay",
-        "jitter",
-        "DoS",
-    )
+        "partition", "kill", "pause", "loss", "burst_loss", "duplicate", "corrupt", "delay", "jitter", "DoS",
+    )  # fmt: skip
     kinds += ("Sybil", "DataReplay", "StaleMessages", "swizzle", "range", "throttle", "gnss_outage", "gnss_jump")
     faults = [fault(kind, at_s=0.5 + 0.1 * place) for place, kind in enumerate(kinds)]
     recorded = simulated(*faults, radio={"loss": 0.1, "max_peers": 3, "queue_frames": 3, "delivery_tick_us": 100})

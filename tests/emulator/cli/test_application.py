@@ -21,17 +21,8 @@ from tests.support.paths import ROOT
 
 ALL = {context.command_path: context.command for context in contexts("vnet", typer.main.get_command(app))}
 SLOW_TO_IMPORT = [
-    "numpy",
-    "scipy",
-    "pydantic",
-    "zenoh",
-    "pyarrow",
-    "matplotlib",
-    "rerun",
-    "rich",
-    "msgspec",
-    "asyncio",
-]
+    "numpy", "scipy", "pydantic", "zenoh", "pyarrow", "matplotlib", "rerun", "rich", "msgspec", "asyncio",
+]  # fmt: skip
 # Imported at the start of Python: prints at its end, or where it would start again, which modules were imported.
 SPY = """
 import atexit, json, os, sys

@@ -281,19 +281,9 @@ def test_an_exception_handler_is_that_of_its_vehicle_alone(run: Run) -> None:
 
 
 HANDLED = [
-    gathers,
-    waits_for,
-    groups,
-    shields,
-    cancels,
-    awaits_late,
-    awaits_at_the_end,
-    awaits_a_job,
-    sleeps_for_ever,
-    listens_to_nobody,
-    waits_for_a_thread,
-    has_a_handler,
-]
+    gathers, waits_for, groups, shields, cancels, awaits_late, awaits_at_the_end, awaits_a_job, sleeps_for_ever,
+    listens_to_nobody, waits_for_a_thread, has_a_handler,
+]  # fmt: skip
 
 
 def entry(program: Program) -> str:

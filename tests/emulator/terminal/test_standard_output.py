@@ -14,6 +14,8 @@ from emulator.records.run_folder import PROGRAMS_LOG
 from emulator.terminal.console import Tolerant, result_only
 from tests.support.paths import ROOT
 
+VNET = [sys.executable, "-P", "-m", "emulator"]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 TALKATIVE = """
 import atexit, ctypes, os, subprocess, sys
 c = ctypes.CDLL(None)
@@ -65,17 +67,11 @@ def test_a_simulation_in_json_is_one_object(tmp_path: Path) -> None:
     scenario = str(ROOT / "scenarios" / "beacon.toml")
     command = ["simulate", scenario, "--program", "talkative:main", "--duration", "0.5", "--out", "run"]
     command += ["--log-format", "json", "--no-report", "--set", "network.vehicles=2"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    words = [sys.executable, "-P", "-m", "emulator", *command]
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    done = subprocess.run([*VNET, *command], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
     assert json.loads(done.stdout)["vehicles"] == 2, done.stderr
     assert done.stdout.count("\n") == 1
     log = (tmp_path / "run" / "logs" / PROGRAMS_LOG).read_text()
     assert sorted(log.splitlines()) == sorted(["from an import", *2 * SAID])
-
-
-VNET = [sys.executable, "-P", "-m", "emulator"]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 def with_closed_pipe(folder: Path, *arguments: str) -> tuple[int, bytes]:

@@ -985,14 +985,9 @@ def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) 
         """
     run = drive(text, program={"zenoh": {"query_s": 0.3}})
     assert [line.split(" ", 1)[1] for line in printed(run)] == [
-        "session closed",
-        "channel is empty and closed",
-        "1 0",
-        "0 1 for a reader that waits",
-        "0 of who has ended",
-        "0",
-        "The ringbuffer has been deleted",
-    ]
+        "session closed", "channel is empty and closed", "1 0", "0 1 for a reader that waits",
+        "0 of who has ended", "0", "The ringbuffer has been deleted",
+    ]  # fmt: skip
 
 
 def test_a_session_in_a_cycle_ends_as_it_is_collected_and_leaves_others_alone(drive: Drive) -> None:

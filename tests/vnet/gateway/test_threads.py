@@ -43,15 +43,9 @@ def test_threads_wait_on_emulated_time_for_queues_locks_events_and_each_other(dr
         """)
     assert run.verdict == "valid"
     assert printed(run) == [
-        "['MainThread', 'produce', 'consume']",
-        "nothing 0.20",
-        "0 0.25",
-        "nothing 0.45",
-        "1 0.50",
-        "nothing 0.70",
-        "2 0.75",
-        "joined 0.75 1",
-    ]
+        "['MainThread', 'produce', 'consume']", "nothing 0.20", "0 0.25", "nothing 0.45", "1 0.50",
+        "nothing 0.70", "2 0.75", "joined 0.75 1",
+    ]  # fmt: skip
     assert "finished" in log(run)[-1]
 
 
@@ -124,18 +118,9 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
         """)
     assert signal.getsignal(signal.SIGINT) is before, "signals of the process are not the program's"
     assert printed(run) == [
-        "slept 0.05",
-        "a 0 0.1",
-        "b 0 0.15",
-        "a 1 0.2",
-        "b 1 0.3",
-        "put",
-        "timeout 0.8",
-        "2",
-        "True 0.9",
-        "slept",
-        "no running event loop",
-    ]
+        "slept 0.05", "a 0 0.1", "b 0 0.15", "a 1 0.2", "b 1 0.3", "put", "timeout 0.8", "2", "True 0.9",
+        "slept", "no running event loop",
+    ]  # fmt: skip
 
 
 def test_asyncio_is_pythons_own(drive: Drive) -> None:

@@ -160,13 +160,8 @@ def test_ids_of_sumo_are_escaped_so_that_they_can_be_told_apart(tmp_path: Path) 
     rows = "".join(f"{name},{time_s},{9 * number},0\n" for number, name in enumerate(ids) for time_s in (0, 2))
     samples = READERS[".csv"](write(tmp_path, "t.csv", HEADER + rows), None)
     assert [trip.node_id for trip in samples.trips(None)] == [
-        "flow-23-1-3a-0-2f-2",
-        "x-3a-J1_0",
-        "plain-1.0",
-        "a-2d-b-20-c",
-        "x-2d-7",
-        "flow-23-1",
-    ]
+        "flow-23-1-3a-0-2f-2", "x-3a-J1_0", "plain-1.0", "a-2d-b-20-c", "x-2d-7", "flow-23-1",
+    ]  # fmt: skip
     (note,) = samples.notes
     assert "'flow#1:0/2' is flow-23-1-3a-0-2f-2" in note and note.endswith(", … (4)")
 
