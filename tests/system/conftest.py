@@ -171,7 +171,7 @@ def running_agents(of: Path) -> list[int]:
 
 
 def read_terminal(master: int, written: object) -> bytes:
-    """What comes next on a pseudo-terminal on which this has been written; nothing once its other end is closed."""
+    """Bytes that come next on a pseudo-terminal to which this was written; none once its other end is closed."""
     assert select.select([master], [], [], TIMEOUT_S)[0], f"nothing comes after {written!r}"
     try:
         return os.read(master, 65_536)

@@ -112,7 +112,7 @@ def town_after(periods: int) -> Town:
 
 
 def rejected_copies(copies: Callable[[Packet], list[Packet]]) -> list[Counter[str]]:
-    """What each other vehicle has rejected if for 20 periods each frame of v3 is followed by these, in vain."""
+    """Counts of what each other vehicle has rejected, if for 20 periods these follow each frame of v3 in vain."""
     town = Town()
     town.air = lambda _, packets: [
         each for packet in packets for each in ([packet, *copies(packet)] if packet.sender == "v3" else [packet])

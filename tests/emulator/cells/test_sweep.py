@@ -186,15 +186,7 @@ def test_programs_are_compared_on_the_same_seeds(tmp_path: Path, in_this_process
             f"        node.report(east_m={share} + fix.position_m[0])\n"
         )
     files = [str(tmp_path / name) for name in ("a.py", "b.py")]
-    given = [
-        str(tmp_path / "tiny.toml"),
-        "--program",
-        ",".join(files),
-        "--seeds",
-        "2",
-        "--out",
-        str(tmp_path / "o"),
-    ]
+    given = [str(tmp_path / "tiny.toml"), "--program", ",".join(files), "--seeds=2", f"--out={tmp_path / 'o'}"]
     result = CliRunner().invoke(command_app(command), given)
     assert result.exit_code == 0, result.output
     assert "note: 2 seeds: too few for a confidence interval" in result.output

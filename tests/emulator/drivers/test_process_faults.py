@@ -434,14 +434,10 @@ def drawn(seed: int, kinds: list[str], together: int) -> list[dict[str, Any]]:
             more["offset_ms"] = rng.choice([-1000, -130, 50, 500])
         if kind == "drift":
             more["rate_ppm"] = rng.choice([-500_000, 500_000, 1000, 333_333])
-        who = chosen if has_nodes(kind) else []
+        who = chosen if "nodes" in type(parse_fault(fault(kind, 0, 1, **more))).model_fields else []
         at_s = rng.choice([0, 0.2, 0.4, 1, rng.uniform(0, 2.4)])
         faults.append(fault(kind, round(at_s, 3), rng.choice([0.2, 0.4, 1, 1.7]), *who, **more))
     return faults
-
-
-def has_nodes(kind: str) -> bool:
-    return "nodes" in type(parse_fault(fault(kind, 0, 1, **NEEDED.get(kind, {})))).model_fields
 
 
 @pytest.mark.parametrize(("seed", "together"), [(0, 1), (1, 2), (2, 2), (3, 1)])
