@@ -197,11 +197,8 @@ def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
 
 @pytest.mark.slow
 def test_who_comes_late_is_told_of_whole_periods(watched: Watched, tmp_path: Path) -> None:
-    scenario = {
-        "run": {"duration_s": 1.0},
-        "network": {"vehicles": NODES},
-        "program": {"entry": "agents.beacon:main"},
-    }
+    network, program = {"vehicles": NODES}, {"entry": "agents.beacon:main"}
+    scenario = {"run": {"duration_s": 1.0}, "network": network, "program": program}
     emulation = prepared(scenario, tmp_path / "run")
     always, late = Messages(emulation), Messages(emulation)
     told: list[tuple[dict[str, Any], dict[str, Any]]] = []
@@ -297,11 +294,8 @@ def test_tables_that_do_not_fit_together(copied: Path, watched: Watched) -> None
 
 @pytest.mark.slow
 def test_a_run_without_a_period_has_a_scene_and_an_end(tmp_path: Path) -> None:
-    scenario = {
-        "run": {"duration_s": 0.05, "settle_s": 0.0},
-        "network": {"vehicles": 2},
-        "program": {"entry": "agents.beacon:main"},
-    }
+    run, program = {"duration_s": 0.05, "settle_s": 0.0}, {"entry": "agents.beacon:main"}
+    scenario = {"run": run, "network": {"vehicles": 2}, "program": program}
     emptied = watch(scenario, tmp_path / "run")
     assert [stream for stream, _ in messages(emptied.folder)] == ["scene", "end"]
 

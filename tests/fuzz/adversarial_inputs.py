@@ -148,9 +148,7 @@ def _json() -> dict[str, bytes]:
 def _xml() -> dict[str, bytes]:
     declared = b'<?xml version="1.0" encoding="%s"?>\n%s'
     roots = (b"net", b"osm", b"fcd-export", b"configuration")
-    nasty = {
-        f"XML in {name.decode()}": declared % (name, b"<net/>") for name in (b"klingon", b"shift_jis", b"base64")
-    }
+    nasty = {f"XML in {of.decode()}": declared % (of, b"<net/>") for of in (b"klingon", b"shift_jis", b"base64")}
     entities = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa">' + b"".join(
         b'<!ENTITY %c "%s">' % (98 + i, b"&%c;" % (97 + i) * 10) for i in range(9)
     )

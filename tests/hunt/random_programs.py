@@ -64,9 +64,7 @@ class Vehicle:
 
     def tasks(self, **options: Any) -> list[asyncio.Task[str]]:
         """Start some tasks that speak."""
-        return [
-            asyncio.create_task(self.speak(each, self.delay_s()), name=each, **options) for each in self.names()
-        ]
+        return [asyncio.create_task(self.speak(one, self.delay_s()), name=one, **options) for one in self.names()]
 
 
 class Discarded:

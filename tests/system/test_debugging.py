@@ -96,9 +96,7 @@ def test_quitting_ends_a_run_of_processes_that_host_several(folder: Path) -> Non
         "--set",
         "run.start=spawn",
     ]
-    status, written = converse(
-        folder, [("(Pdb) ", "q")], "run", *options, "--debug", "v02:prog.py:5", "--out", "run"
-    )
+    status, written = converse(folder, [("(Pdb) ", "q")], "run", *options, "--debug", "v02:prog.py:5", "--out=run")
     assert status == 130, written
     assert written.count("of emulated time\n") == 2, "the first line of the command, and one stop"
     events = [json.loads(line) for line in (folder / "run" / "events.jsonl").read_text().splitlines()]

@@ -126,8 +126,6 @@ def test_a_file_that_the_disk_refuses_is_one_line_and_no_process_stays(tmp_path:
 
 
 def test_nodes_that_never_join_are_named(vnet: Vnet) -> None:
-    done = vnet(
-        "emulator", "scenarios/beacon.toml", "--listen", "tcp/127.0.0.1:0", "--set", "run.join_timeout_s=0.2"
-    )
+    done = vnet("emulator", "scenarios/beacon.toml", "--listen", "tcp/127.0.0.1:0", "--set=run.join_timeout_s=0.2")
     assert done.status == 2
     assert "10 of 10 nodes have not joined within 0.2 s: v01, v02, v03" in done.stderr

@@ -38,11 +38,8 @@ async def say_nothing(node: Node) -> None:
 
 
 def scenario(**sections: Any) -> Scenario:
-    data: dict[str, Any] = {
-        "run": {"duration_s": 15.0, "settle_s": 0.0},
-        "network": {"vehicles": 12},
-        "program": {"entry": f"{__name__}:say_fix"},
-    }
+    run, program = {"duration_s": 15.0, "settle_s": 0.0}, {"entry": f"{__name__}:say_fix"}
+    data: dict[str, Any] = {"run": run, "network": {"vehicles": 12}, "program": program}
     return Scenario.model_validate({**data, **sections})
 
 

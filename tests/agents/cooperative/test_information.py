@@ -127,10 +127,8 @@ class MovingNetwork(Network):
         self._sigma_m = sigma_m
         self.change: Change = _honest
         self._rng = np.random.default_rng(seed)
-        self.common_m, self._offset_m = (
-            3 * self._rng.standard_normal(2),
-            0.38 * self._rng.standard_normal(len(sigma_m)),
-        )
+        self.common_m = 3 * self._rng.standard_normal(2)
+        self._offset_m = 0.38 * self._rng.standard_normal(len(sigma_m))
 
     def advance(self, periods: int) -> list[float]:
         """Run some periods; returns the mean of the normalized squared errors of c after each: 1 if consistent."""
@@ -446,11 +444,7 @@ def test_without_a_lane_a_vehicle_learns_from_the_others() -> None:
 def frames(draw: st.DrawFn) -> InformationFrame:
     """Draw a frame as a vehicle sends one, with single precision."""
     number = st.floats(-3, 3, width=32)
-    matrix = [
-        draw(st.floats(0.5, 4, width=32)),
-        draw(st.floats(-0.25, 0.25, width=32)),
-        draw(st.floats(0.5, 4, width=32)),
-    ]
+    matrix = [draw(st.floats(low, high, width=32)) for low, high in ((0.5, 4), (-0.25, 0.25), (0.5, 4))]
     information = matrix[0], matrix[1], matrix[2], draw(number), draw(number)
     heard = draw(st.dictionaries(st.integers(0, 2**32 - 1).map(name_of_code), st.booleans(), max_size=12))
     passed = np.zeros(draw(st.integers(0, 30)), dtype=PASSED)

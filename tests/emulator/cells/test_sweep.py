@@ -86,9 +86,7 @@ def test_a_sweep_leaves_a_table_and_a_page_and_goes_on(tmp_path: Path, in_this_p
     rows = table.to_pylist()
     assert all(row["vehicles"] == row["network.vehicles"] and row["verdict"] == "valid" for row in rows)
     assert [row["packet_delivery_ratio"] == 1 for row in rows] == [True] * 4 + [False] * 4
-    assert rows[0]["neighbours"] > rows[-1]["neighbours"] / 2 and rows[0]["last.neighbours"] == 2, (
-        "what is reported"
-    )
+    assert rows[0]["neighbours"] > rows[-1]["neighbours"] / 2 and rows[0]["last.neighbours"] == 2, "as reported"
     assert set(WALL_CLOCK) <= set(table.column_names)
     assert pq.read_table(tmp_path / "sweep.parquet").equals(table)
     page = (tmp_path / "sweep.html").read_text()

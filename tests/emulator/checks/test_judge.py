@@ -66,9 +66,7 @@ def with_names(table: pa.Table, column: str, row: int, name: str) -> pa.Table:
     """The trace with another name in one row; with another outcome, its time of arrival fits."""
     names = table[column].cast(pa.string()).to_pylist()
     names[row] = name
-    changed = table.set_column(
-        table.column_names.index(column), column, pa.array(names, pa.string()).dictionary_encode()
-    )
+    changed = table.set_column(table.column_names.index(column), column, pa.array(names).dictionary_encode())
     return timely(changed) if column == "outcome" else changed
 
 
@@ -398,10 +396,8 @@ def test_a_delivery_against_the_matrix_breaks_range_and_conservation(tmp_path: P
     recorded = four(tmp_path, radio={"links": FORK, "loss": 0.0})
     row = int(np.flatnonzero((recorded.nodes("sender") == 1) & (recorded.nodes("receiver") == 2))[0])
     found = damaged(recorded, with_names(recorded.trace, "receiver", row, "v0"))  # within range, but deaf to v1
-    assert {name: check.verdict for name, check in found.items()} == {
-        "conservation": Verdict.INVALID,
-        "range": Verdict.INVALID,
-    }
+    verdicts = {name: check.verdict for name, check in found.items()}
+    assert verdicts == {"conservation": Verdict.INVALID, "range": Verdict.INVALID}
     assert found["range"].figures["beyond"] == found["conservation"].figures["not_in_range"] == 1
 
 

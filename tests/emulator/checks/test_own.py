@@ -251,11 +251,8 @@ def test_ctrl_c_ends_the_checks_and_keeps_what_is_there(give: Give) -> None:
 
     found = give(interrupted, "single", "given", "sound")
     texts = {name: finding.text for name, finding in found.items() if isinstance(finding, CheckResult)}
-    assert texts == {
-        "own:one": "nobody knows",
-        "own:own_checks.given": "interrupted",
-        "own:own_checks.sound": "interrupted",
-    }
+    cut_short = dict.fromkeys(["own:own_checks.given", "own:own_checks.sound"], "interrupted")
+    assert texts == {"own:one": "nobody knows"} | cut_short
 
 
 def test_where_the_machine_did_not_keep_up_a_failed_own_check_is_unknown(recorded: RecordedRun) -> None:

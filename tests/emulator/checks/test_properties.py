@@ -178,11 +178,8 @@ def dead(moment: Moment, cause: Moment) -> bool:
 
 @pytest.mark.slow
 def test_a_fault_is_an_event_of_each_of_its_nodes(faulty: Run) -> None:
-    told = [
-        (m.time_s, m.node, m.event, m["kind"], m["fault"])
-        for m in moments(faulty, "event")
-        if m.event in ("fault_started", "fault_ended")
-    ]
+    of_faults = [m for m in moments(faulty, "event") if m.event in ("fault_started", "fault_ended")]
+    told = [(m.time_s, m.node, m.event, m["kind"], m["fault"]) for m in of_faults]
     loss = [(0.3, "fault_started", "loss", "loss-1"), (0.4, "fault_ended", "loss", "loss-1")]
     on_v02 = [(0.5, "v02", "fault_started", "kill", "kill-0"), (1.5, "v02", "fault_ended", "kill", "kill-0")]
     assert told == [(t, node, *rest) for t, *rest in loss for node in ("v01", "v02", "v03")] + on_v02
@@ -304,10 +301,7 @@ def test_events_of_a_run_and_moments_of_a_property_are_named_alike() -> None:
     own = Event(5, "event", "v01", {"name": "warned", "details": {"number": 3}})
     vnets = Event(6, "crashed", "v01", {"error": "tired"})
     foreign = Event(7, "event", "v01", {"details": 3})
-    assert [(each.name, each.values) for each in (own, vnets, foreign)] == [
-        ("warned", {"number": 3}),
-        ("crashed", {"error": "tired"}),
-        ("", {}),
-    ]
+    found = [(each.name, each.values) for each in (own, vnets, foreign)]
+    assert found == [("warned", {"number": 3}), ("crashed", {"error": "tired"}), ("", {})]
     run = cast(Run, SimpleNamespace(events=[own, vnets, foreign], scenario=SimpleNamespace(fault=[])))
     assert [(m.name, m.values) for m in moments(run, "event")] == [(e.name, e.values) for e in run.events]

@@ -39,11 +39,8 @@ async def mixes(node: Node) -> None:
 
 
 def run_of(folder: Path, **sections: Any) -> RecordedRun:
-    scenario = {
-        "run": {"duration_s": 1.2, "settle_s": 0.0},
-        "network": {"vehicles": 8, "layout": "dense"},
-        **sections,
-    }
+    run = {"duration_s": 1.2, "settle_s": 0.0}
+    scenario = {"run": run, "network": {"vehicles": 8, "layout": "dense"}, **sections}
     result = emulator.simulate(scenario, program=mixes, out=folder)
     found = {check.name: check.verdict for check in result.checks}
     assert not [name for name, verdict in found.items() if verdict == "invalid"], found

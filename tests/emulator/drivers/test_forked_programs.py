@@ -119,10 +119,7 @@ def test_an_interruption_is_recorded_and_leaves_no_process(tmp_path: Path, progr
 
     wall_s, interrupted = simulate(emulation, on_interrupt=on_interrupt, processes=3)
     assert (interrupted, asked) == (True, [1])
-    assert [(event.kind, event.time_ns) for event in emulation.folder.events] == [
-        ("started", 0),
-        ("interrupted", AT_NS),
-    ]
+    assert [(e.kind, e.time_ns) for e in emulation.folder.events] == [("started", 0), ("interrupted", AT_NS)]
     judgement, _ = conclude(emulation, wall_s, "simulate")
     assert judgement.exit_status == 3
     assert children() == before

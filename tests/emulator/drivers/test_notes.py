@@ -51,11 +51,8 @@ def log_of(emulation: Emulation) -> str:
 
 
 def told(emulation: Emulation) -> list[tuple[Any, ...]]:
-    return [
-        (event.time_ns, event.kind, event.node, event.details)
-        for event in emulation.folder.events
-        if event.kind in ("log", "event")
-    ]
+    noted = [event for event in emulation.folder.events if event.kind in ("log", "event")]
+    return [(event.time_ns, event.kind, event.node, event.details) for event in noted]
 
 
 @pytest.mark.slow

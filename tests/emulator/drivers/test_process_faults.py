@@ -191,11 +191,8 @@ def sent_by(emulation: Emulation, node: str) -> list[int]:
 def reports(emulation: Emulation, node: str) -> list[tuple[int, float]]:
     """(time of the period, reported incarnation) of a node, where it reported."""
     states = emulation.metrics.states_table().to_pylist()
-    return [
-        (row["time_ns"], row["incarnation"])
-        for row in states
-        if row["node"] == node and row["incarnation"] is not None
-    ]
+    rows = [row for row in states if row["node"] == node and row["incarnation"] is not None]
+    return [(row["time_ns"], row["incarnation"]) for row in rows]
 
 
 def test_who_is_killed_is_silent_deaf_and_comes_back_as_another() -> None:

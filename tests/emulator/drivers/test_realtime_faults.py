@@ -230,9 +230,8 @@ def test_healing_ends_a_fault_at_once_and_again_changes_nothing() -> None:
 
 def test_whose_program_has_ended_is_not_up_again_when_its_process_is() -> None:
     realtime, emulation = started(fault("kill", 0.5, 0.2))
-    realtime.receive(
-        100 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic((), (), [wire.Ending("v02", "finished")]))
-    )
+    ended = wire.Traffic((), (), [wire.Ending("v02", "finished")])
+    realtime.receive(100 * MS, "v02", wire.Frames(b"n", 0, 1, [], ended))
     realtime.due(900 * MS)
     assert [(a.stop, a.start) for a in realtime.take_actions()] == [({}, []), ({}, [])]
     assert not emulation.welcome("v02", b"n").runs

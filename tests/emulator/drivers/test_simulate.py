@@ -45,10 +45,7 @@ def test_an_interruption_is_recorded_and_the_run_judged(
     wall_s, interrupted = simulate(emulation)
     assert interrupted
     assert signal.getsignal(signal.SIGINT) is before
-    assert [(event.kind, event.time_ns) for event in emulation.folder.events] == [
-        ("started", 0),
-        ("interrupted", AT_NS),
-    ]
+    assert [(e.kind, e.time_ns) for e in emulation.folder.events] == [("started", 0), ("interrupted", AT_NS)]
     judgement, _ = conclude(emulation, wall_s, "simulate")
     assert judgement.exit_status == 3
     gc.collect()

@@ -375,9 +375,7 @@ def test_faults_on_processes_change_nothing_between_live_and_simulated(program: 
     elif program is forgets_a_task:
         assert (restarted, killed) == ([0.5, 2.0], [0.5, 2.0])
     else:
-        assert (restarted, killed) == ([0.5, 2.0], [2.0]), (
-            "nobody knows whether the killed one would have awaited it"
-        )
+        assert (restarted, killed) == ([0.5, 2.0], [2.0]), "the killed one might have awaited it"
 
 
 async def fails_often(node: Node) -> None:
@@ -395,9 +393,7 @@ def test_a_flood_is_cut_and_counted() -> None:
     ]
     assert left_out == [("v01", "exception", 30 - MOST_EXCEPTIONS), ("v02", "exception", 30 - MOST_EXCEPTIONS)]
     assert check.figures["count"] == 60
-    assert check.text.startswith(
-        "2 vehicles: ValueError: invalid literal for int() with base 10: 'x of v01', in a ca"
-    )
+    assert check.text.startswith("2 vehicles: ValueError: invalid literal for int() with base 10: 'x of v01', in")
 
 
 async def exits(node: Node) -> None:
@@ -413,11 +409,8 @@ async def exits(node: Node) -> None:
 def test_sys_exit_in_a_task_ends_the_node_alone(run: Run) -> None:
     emulation = run(scenario_of([], entry(exits), vehicles=3))
     ended = [(event.kind, event.node, event.time_ns) for event in emulation.folder.events if event.node]
-    assert ended == [
-        ("crashed", "v01", 500_000_000),
-        ("finished", "v02", 500_000_000),
-        ("finished", "v03", 500_000_000),
-    ]
+    kinds = {"v01": "crashed", "v02": "finished", "v03": "finished"}
+    assert ended == [(kind, node, 500_000_000) for node, kind in kinds.items()]
 
 
 async def interrupts(node: Node) -> None:
@@ -466,10 +459,8 @@ def test_who_leaves_by_another_way_has_crashed(program: Callable[..., Any], run:
 
 def test_sys_exit_while_programs_are_ended_is_an_exception() -> None:
     emulation = run_together(scenario_of([], entry(exits_at_the_end), vehicles=2))
-    assert [(event.node, event.details["error"]) for event in exceptions(emulation)] == [
-        ("v01", "SystemExit: 3"),
-        ("v02", "SystemExit: 3"),
-    ]
+    told = [(event.node, event.details["error"]) for event in exceptions(emulation)]
+    assert told == [("v01", "SystemExit: 3"), ("v02", "SystemExit: 3")]
 
 
 def test_kinds_are_told_in_one_line_each() -> None:

@@ -140,16 +140,10 @@ async def varies(node: Node) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("mac", [True, False], ids=["medium", "queues"])
 def test_the_checks_know_of_powers_and_rates(mac: bool, tmp_path: Path) -> None:
-    radio = {
-        "path_loss": {"kind": "log_distance", "tx_power_dbm": 45.0},
-        "max_peers": 1000,
-        **({"mac": {}} if mac else {}),
-    }
-    scenario = {
-        "run": {"duration_s": 2.0, "settle_s": 0.0},
-        "network": {"vehicles": 8, "layout": "dense"},
-        "radio": {**radio, "fading": {}},
-    }
+    path_loss = {"kind": "log_distance", "tx_power_dbm": 45.0}
+    radio = {"path_loss": path_loss, "max_peers": 1000, **({"mac": {}} if mac else {})}
+    run, network = {"duration_s": 2.0, "settle_s": 0.0}, {"vehicles": 8, "layout": "dense"}
+    scenario = {"run": run, "network": network, "radio": {**radio, "fading": {}}}
     result = emulator.simulate(scenario, program=varies, out=tmp_path / "run")
     found = {check.name: check.verdict for check in result.checks}
     for name in ("fading", "latency", "conservation", *(["medium"] if mac else [])):

@@ -93,9 +93,7 @@ def test_winner_b1_is_the_published_formula() -> None:
     expected = np.maximum(np.where(far_m < 177.4, near, beyond), free)
     assert loss_db(model, far_m) == pytest.approx(expected)
     high = loss_db(model, np.array([300.0]), (np.array([6.0]), np.array([1.5])))
-    assert high == pytest.approx(22.7 * np.log10(300) + 27 + 20 * np.log10(5.91)), (
-        "the breakpoint is four times as far"
-    )
+    assert high == pytest.approx(22.7 * np.log10(300) + 27 + 20 * np.log10(5.91)), "beyond the breakpoint"
 
 
 # Time.
@@ -264,9 +262,7 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
     rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True)), 1, 60.0)
     phase = [row["on_air_ns"] % (100 * MS) for row in rows]
     is_shot = [at not in (before, after) for before, at, after in zip(phase, phase[1:], phase[2:], strict=False)]
-    assert max(len(list(run)) for is_one, run in groupby(is_shot) if not is_one) == 5, (
-        "the sixth is one at the latest"
-    )
+    assert max(len(list(run)) for is_one, run in groupby(is_shot) if not is_one) == 5, "the sixth is one"
     kept = [(n, at) for n, (at, is_one) in enumerate(zip(phase[1:], is_shot, strict=False)) if not is_one]
     first = [n for n, at in (next(run) for _, run in groupby(kept, lambda each: each[1]))]
     assert 9 < np.mean(np.diff(first)) < 11.5, "the counter of 5 to 15 frames counts them"

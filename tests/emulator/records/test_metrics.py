@@ -152,9 +152,7 @@ def _random_report(rng: np.random.Generator, node: str, missing: float) -> Repor
     matrix = rng.normal(0, 1, (2, 2))
     covariance = (matrix @ matrix.T).ravel().tolist() if rng.random() < 0.9 else [0.0] * 4
     sizes = {"common_error_m": 2, "stacked_common_error_m": 2, "mean_m": 2}
-    values: Values = {
-        name: rng.normal(0, 1, size).tolist() for name, size in sizes.items() if rng.random() >= missing
-    }
+    values: Values = {name: rng.normal(0, 1, n).tolist() for name, n in sizes.items() if rng.random() >= missing}
     if rng.random() >= missing:
         values["common_error_covariance_m2"] = covariance
     x_m, y_m = rng.normal(0, 1, 2).tolist()

@@ -251,11 +251,8 @@ def test_how_busy_a_vehicle_finds_the_medium_is_of_the_time_in_which_it_is_there
 
 def test_frames_that_are_lost_on_their_way_to_who_is_down_are_no_attempts(tmp_path: Path) -> None:
     fault = {"kind": "kill", "nodes": ["v03"], "at_s": 1.0, "duration_s": 2.0}
-    sections = {
-        "run": {"duration_s": 5.0, "settle_s": 1.0},
-        "network": {"vehicles": 3},
-        "radio": {"loss": 0.3, "range_m": 1e5},
-    }
+    run, radio = {"duration_s": 5.0, "settle_s": 1.0}, {"loss": 0.3, "range_m": 1e5}
+    sections = {"run": run, "network": {"vehicles": 3}, "radio": radio}
     program = {"entry": "agents.beacon:main"}
     recorded = run_scenario(tmp_path, Scenario.model_validate(sections | {"program": program, "fault": [fault]}))
     links = [link for link in radio_metrics(recorded).links.to_pylist() if link["receiver"] == "v03"]

@@ -131,9 +131,7 @@ def test_on_an_executor_a_campaign_finds_the_same(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
         there = run_campaign(plan, tmp_path / "there", quiet, executor)
     assert here == there == 1
-    told = [
-        [{**row, "wall_s": 0, "folder": ""} for row in results_of(tmp_path / name)] for name in ("here", "there")
-    ]
+    told = [[{**row, "wall_s": 0, "folder": ""} for row in results_of(tmp_path / n)] for n in ("here", "there")]
     assert told[0] == told[1]
     kept = next(row for row in results_of(tmp_path / "there") if "failed" in row)
     assert (Path(kept["folder"]) / "verdict.json").exists(), "what has failed is kept on this machine"
@@ -192,9 +190,7 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
     )
     checks = [f"{tmp_path}/own_campaign_checks.py:{function}" for function in ("paused", "broken")]
     scenario = make_scenario(planted("proud"), {"program": "agents.beacon:main"})
-    status, said = run(
-        Plan.of(make_scenario(scenario, {"checks": checks}), "pause", 1, seed=1), tmp_path / "paused"
-    )
+    status, said = run(Plan.of(make_scenario(scenario, {"checks": checks}), "pause", 1, 1), tmp_path / "paused")
     assert status == 1
     (row,) = results_of(tmp_path / "paused")
     assert row["failed"] == {"own:unpaused": "1 pauses"}

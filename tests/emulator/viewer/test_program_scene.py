@@ -29,11 +29,8 @@ async def program(node: Node) -> None:
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recording of a run of one second."""
     folder = tmp_path_factory.mktemp("run")
-    scenario = {
-        "run": {"duration_s": 1.0, "settle_s": 0.1},
-        "network": {"vehicles": 4, "layout": "dense"},
-        "program": {"entry": f"{__name__}:program"},
-    }
+    run, network = {"duration_s": 1.0, "settle_s": 0.1}, {"vehicles": 4, "layout": "dense"}
+    scenario = {"run": run, "network": network, "program": {"entry": f"{__name__}:program"}}
     write(watch(scenario, folder / "run").told, folder / "recording.rrd", "v02")
     return folder / "recording.rrd"
 

@@ -188,9 +188,7 @@ def test_modules_that_vehicles_share_find_the_variables_of_each(drive: Drive) ->
         ({"1A": "b"}, "1A"),
     ],
 )
-def test_variables_that_cannot_be_are_refused_when_the_scenario_is_read(
-    environment: dict[str, str], text: str
-) -> None:
+def test_variables_that_cannot_be_are_refused_when_scenario_is_read(environment: dict[str, str], text: str) -> None:
     command = ["python", "talker.py"]
     with pytest.raises(ValueError, match=text):
         Scenario.model_validate({"program": {"kind": "zenoh", "command": command, "environment": environment}})
@@ -1007,11 +1005,8 @@ def test_a_session_in_a_cycle_ends_as_it_is_collected_and_leaves_others_alone(dr
         later = session.liveliness().declare_token("agent/later")
         time.sleep(0.1)
         """)
-    assert printed(run) == [
-        "agent/first SampleKind.PUT",
-        "agent/first SampleKind.DELETE",
-        "agent/later SampleKind.PUT",
-    ]
+    told = ["first SampleKind.PUT", "first SampleKind.DELETE", "later SampleKind.PUT"]
+    assert printed(run) == [f"agent/{each}" for each in told]
 
 
 SLOW = """

@@ -216,10 +216,8 @@ def test_a_program_that_raises_ends_its_node_and_no_other() -> None:
         await node.radio.broadcast(b"still here")
 
     world = World("v1", "v2").run(program)
-    assert [(e.node, e.kind, e.error) for e in world.endings] == [
-        ("v1", "crashed", "ValueError: no idea"),
-        ("v2", "finished", ""),
-    ]
+    endings = [(e.node, e.kind, e.error) for e in world.endings]
+    assert endings == [("v1", "crashed", "ValueError: no idea"), ("v2", "finished", "")]
     first = world.endings[0].details.splitlines()[1]
     assert __file__ in first, "a traceback begins in the program"
     assert "raise ValueError" in world.endings[0].details

@@ -51,10 +51,8 @@ def test_a_fork_that_comes_back_to_the_loop_ends(loop: VirtualTimeLoop, capfd: p
 
     _, status = os.waitpid(run(loop, program), 0)
     assert os.waitstatus_to_exitcode(status) == 70
-    assert (
-        capfd.readouterr().err
-        == "vnet: a process that a program forked came back to the event loop; it ends here\n"
-    )
+    said = "vnet: a process that a program forked came back to the event loop; it ends here\n"
+    assert capfd.readouterr().err == said
 
 
 def test_sleep_takes_exactly_the_time_asked_for(loop: VirtualTimeLoop) -> None:

@@ -246,9 +246,7 @@ def test_routes_in_a_network_of_sumo_need_not_name_the_inside_of_intersections(t
     keys = {"routes": [["lane in_0", "lane out_0"], ["lane in_0", "lane south_0"]], "gap_m": 5.0}
     world = world_on(path, 2, keys)
     assert_allclose(world.vehicles.road.end_m, [200, 198], atol=1.0)
-    assert world.vehicles.gaps(100.0)[0][1] == pytest.approx(5.0), (
-        "both begin on the same road, one behind the other"
-    )
+    assert world.vehicles.gaps(100.0)[0][1] == pytest.approx(5.0), "both begin on the same road"
     drive(world, 70)
     assert_allclose(world.vehicles.place()[0], [[151.75, 0], [100, -43.5]], atol=1.0)
 

@@ -43,11 +43,8 @@ def read(path: Path, origin_deg: tuple[float, float] | None = None, **options: A
 
 
 def world_of(path: Path, duration_s: float = 2.0, rate_hz: float = 10.0, **network: Any) -> World:
-    data = {
-        "run": {"duration_s": duration_s},
-        "network": {"kind": "trips", "path": str(path), **network},
-        "world": {"gnss": {"rate_hz": rate_hz}},
-    }
+    trips = {"kind": "trips", "path": str(path), **network}
+    data = {"run": {"duration_s": duration_s}, "network": trips, "world": {"gnss": {"rate_hz": rate_hz}}}
     return build_world(Scenario.model_validate(data))
 
 
