@@ -130,7 +130,7 @@ def endpoints_listen() -> Figures:
 
 async def _listen(count: int) -> float:
     settings = ZenohSessions()
-    gateways = [Gateway(f"v{number}", RADIO_KEYS, settings, lambda *_: None) for number in range(count)]
+    gateways = [Gateway(f"v{number}", 0, RADIO_KEYS, settings, lambda *_: None) for number in range(count)]
     started = time.monotonic()
     await asyncio.gather(*(asyncio.to_thread(each.open, settings.listen) for each in gateways))
     taken_s = time.monotonic() - started

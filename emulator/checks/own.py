@@ -47,6 +47,8 @@ VERDICTS = (*(verdict.value for verdict in Verdict), NOT_APPLICABLE)
 MOST_RESULTS = 1000
 """Results of one function; a generator that yields without end is stopped."""
 LONGEST_TEXT = 2000
+INTEGERS = 2**63
+"""Bound of integers, which are columns of tables in sweeps."""
 LARGEST_FIGURES_BYTES = 1_000_000
 """Size of one result's figures in verdict.json."""
 _NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
@@ -197,6 +199,8 @@ def _plain(what: str, value: Any) -> Any:
         return [_plain(what, each) for each in value]
     if isinstance(value, float) and not np.isfinite(value):
         raise _NonsenseError(f"{what} = {value}: must be finite, or None")
+    if isinstance(value, int) and not -INTEGERS <= value < INTEGERS:
+        raise _NonsenseError(f"{what} = {shown(value)}: an integer must be below 2**63; float(…) may be larger")
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise _NonsenseError(f"{what} = {shown(value)}: must be a number, a boolean, a text, None, or a list or table")

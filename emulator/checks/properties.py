@@ -134,8 +134,11 @@ def eventually(
 
     `nodes` are the vehicles of which it is asked, by default all; one without any moment fails as well. One that is
     in the network for less than `within_s` before the end of the run counts only if the predicate has come true.
+    Unknown if the run has no vehicle of such a name.
     """
     _check_within(name, within_s)
+    if missing := sorted({*(nodes or ())} - {*run.nodes}):
+        return Result(name, "unknown", f"there is no vehicle {', '.join(missing)}")
     present = moments(run)
     entered_s = {m.node: m.time_s for m in reversed(present) if nodes is None or m.node in nodes}
     reached: dict[str, float] = {}
@@ -155,7 +158,7 @@ def eventually(
         limit = "" if math.isinf(within_s) else f" within {within_s:g} s"
         return _failed(run, name, late, f"never came true{limit}")
     if not reached:
-        why = f"no vehicle is there for {within_s:g} s" if entered_s else "there is no such vehicle"
+        why = f"no vehicle is there for {within_s:g} s" if entered_s else "no such vehicle enters the network"
         return Result(name, "unknown", why)
     slowest_s = max(reached.values())
     return Result(

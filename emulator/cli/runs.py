@@ -69,6 +69,7 @@ def run(
         if router is not RouterKind.SEPARATE and not loaded.has_gateways:
             refuse_router_restart(loaded.fault)
         sinks = choose_sinks(asked.rerun or (), asked.rerun_bind, asked.rerun_port, asked.rerun_vehicle)
+        _refuse_hosts_of_gateways(loaded, hosts)
         if debug is not None and hosts is not None:
             raise VnetError("--debug and --hosts exclude each other")
         if agent is not None and (debug is not None or hosts is not None or check_determinism is not None):
@@ -136,6 +137,7 @@ def emulator(
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
         loaded = asked.load(asked.pacing)
+        _refuse_hosts_of_gateways(loaded, hosts)
         if not loaded.has_gateways:
             refuse_router_restart(loaded.fault)
         sinks = choose_sinks(asked.rerun or (), asked.rerun_bind, asked.rerun_port, asked.rerun_vehicle)
@@ -145,6 +147,11 @@ def emulator(
 
         request = Request(loaded, asked, sinks, stdout)
         run_for_agents(request, listen, connect, access, host_names(hosts))
+
+
+def _refuse_hosts_of_gateways(scenario: Scenario, hosts: object) -> None:
+    if hosts and scenario.has_gateways:
+        raise VnetError("--hosts: Zenoh programs run beside the emulator in real time; on hosts in lockstep alone")
 
 
 def _announce(scenario: Scenario, asked: RunOptions) -> None:

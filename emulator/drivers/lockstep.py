@@ -120,6 +120,8 @@ class Lockstep:
         """Emulated time: the beginning of the window, or the last change."""
         self.horizon_ns: int | None = None
         self.held = False
+        self.is_to_hold = False
+        """True to have the run held where it stands, before its horizon; another thread may say so."""
         for nodes in processes:
             if permanent or any(emulation.up[node] for node in nodes):
                 self._add(nodes[0])
@@ -218,6 +220,9 @@ class Lockstep:
             next_ns = self._next_instant_ns()
             change_ns = emulation.next_change_ns()
             first_ns = next_ns if change_ns is None else min(next_ns, change_ns)
+            if self.is_to_hold:
+                here_ns = max(min(first_ns, emulation.next_control_ns() or first_ns), self.decided_ns + 1)
+                self.horizon_ns = min(here_ns, self.horizon_ns or here_ns)
             if self._drive(first_ns):
                 continue
             if self._hold(first_ns):

@@ -124,6 +124,7 @@ class Session:
         self._horizons: SimpleQueue[int | None] = SimpleQueue()
         self._give: Callable[[int | None], Any] = self._horizons.put
         self._went_at: float | None = None
+        self._lockstep: Lockstep | None = None
 
     @property
     def folder(self) -> RunFolder:
@@ -190,10 +191,20 @@ class Session:
     def go(self, horizon_ns: int | None) -> Future[None]:
         """Do all that happens before `horizon_ns`, or all to the end."""
         assert self.stands.done() and not self.over
-        self.stands = Future()
+        assert self._lockstep is not None
+        self.stands, self._lockstep.is_to_hold = Future(), False
         self._went_at = time.monotonic()
         self._give(horizon_ns)
         return self.stands
+
+    def hold(self) -> int:
+        """Have a run that is on its way held where it stands; returns that emulated time (ns)."""
+        if self._lockstep is not None:
+            self._lockstep.is_to_hold = True
+        self.stands.result()
+        if self.over or self._lockstep is None:
+            return self.emulation.ended_ns or 0
+        return self._lockstep.horizon_ns or 0
 
     def _run_held(self) -> None:
         try:
@@ -211,10 +222,12 @@ class Session:
             self._stand()
 
     async def _hold(self, lockstep: Lockstep) -> None:
+        self._lockstep = lockstep
         self._stand()
         lockstep.horizon_ns = self._horizons.get()
 
     async def _hold_live(self, lockstep: Lockstep) -> None:
+        self._lockstep = lockstep
         loop = asyncio.get_running_loop()
         horizon: asyncio.Future[int | None] = loop.create_future()
         self._give = lambda horizon_ns: loop.call_soon_threadsafe(horizon.set_result, horizon_ns)

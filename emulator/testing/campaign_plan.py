@@ -20,7 +20,7 @@ from emulator.checks.own import load_checks
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.session import with_order_steps
 from emulator.radio.own_rules import load_rules
-from emulator.scenario.faults import KINDS, Chooser, Drawn, Fault, OwnRule, parse_fault
+from emulator.scenario.faults import KINDS, Chooser, Drawn, Fault, parse_fault
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
 from emulator.world.world import build_world
@@ -166,8 +166,8 @@ class Plan:
             raise ScenarioError(
                 f"run.duration_s = {run.duration_s:g}: a campaign's runs take {LONGEST_S:g} s at most"
             )
-        own = [fault for fault in scenario.fault if isinstance(fault, OwnRule)]
-        plain, note = make_scenario(scenario, {"run.pacing": "lockstep", "faults": own}), ""
+        kept = [fault for fault in scenario.fault if not fault.live_only]
+        plain, note = make_scenario(scenario, {"run.pacing": "lockstep", "faults": kept}), ""
         kinds = () if faults == NONE else known_kinds(None if faults == RANDOM else faults.split(","))
         constraints = None
         if kinds:
@@ -181,7 +181,7 @@ class Plan:
         return cls(plain, runs, seed, kinds, note=note, constraints=constraints, **options)
 
     def draw(self, number: int) -> Scenario:
-        """Run `number`: a network, a seed and one to four faults, if there are to be any."""
+        """Run `number`: a network, a seed, and beside the scenario's faults one to four, if any are to be drawn."""
         seed = (self.seed + number) % SEEDS
         scenario = with_seed(self.scenario, seed)
         if self.constraints is None:

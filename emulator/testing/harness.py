@@ -314,8 +314,14 @@ class RunHarness:
     def close(self) -> None:
         """End the run, if it is on, whatever state it is in, and keep what can be kept of it."""
         broken = self._run.stands.done() and self._run.stands.exception() is not None
-        if self._run.started and not broken:
-            self._judge()
+        if not self._run.started or broken:
+            return
+        if self._judgement is None:
+            self._now_ns = self._run.hold()
+            for planned in list(self._emulation.faults.faults):
+                if planned.acts_at(self._now_ns) and not self._run.over:
+                    self._emulation.heal(planned.label, max(self._now_ns - 1, planned.start_ns))
+        self._judge()
 
     def _finish(self) -> None:
         if not self._run.started:

@@ -13,6 +13,7 @@ import msgspec
 import zenoh
 
 from vnet.gateway.frames import (
+    MOST_MESSAGES,
     CrossingQuery,
     CrossingReply,
     CrossingSample,
@@ -40,7 +41,13 @@ class RadioSide(ABC, Generic[Q]):
     """
 
     def __init__(
-        self, node_id: str, keys: Sequence[str] | None, query_s: float, liveliness_s: float, ros2: Ros2 | None
+        self,
+        node_id: str,
+        incarnation: int,
+        keys: Sequence[str] | None,
+        query_s: float,
+        liveliness_s: float,
+        ros2: Ros2 | None,
     ) -> None:
         self.node_id, self._query_s, self._ros2 = node_id, query_s, ros2
         self._keys = keys if keys is not None else RADIO_KEYS if ros2 is None else ROS2_KEYS
@@ -50,7 +57,8 @@ class RadioSide(ABC, Generic[Q]):
         """Queries of this vehicle to which replies are awaited."""
         self._histories: list[tuple[zenoh.KeyExpr, list[int]]] = []
         """Keys for which all caches are asked now, and the numbers of the queries that end together with that."""
-        self._query_numbers = count()
+        # Replies to queries of the last incarnation may still come, and answer none of this one.
+        self._query_numbers = count(incarnation * MOST_MESSAGES)
         self._tokens_ns = round(TOKEN_PERIODS * liveliness_s * NS_PER_S)
         self._told: dict[str, tuple[int, tuple[str, ...]]] = {}
         """Instant of the last frame with tokens, and their keys, by vehicle."""

@@ -7,6 +7,7 @@ The gateway is in the emulator's process, in real time (docs/how-to/zenoh.md).
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import os
 import re
@@ -41,8 +42,8 @@ from vnet.transport.session import open_local_router, router_endpoint
 
 MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
-ECHO_S = 2.0
-"""Seconds after a token was taken back in which Zenoh's echoes of it are not taken for a program's own."""
+MOST_TOKENS = 2**16
+"""Tokens that are read at once: Zenoh gives them within the call, which would wait for itself."""
 ANY_HOST = ("0.0.0.0", "::")
 """Hosts of endpoints that listen at each address: the system says at which one commands connect."""
 OTHER_HOST = (62, 64)
@@ -66,16 +67,24 @@ class Gateway(RadioSide[zenoh.Query]):
     """
 
     def __init__(
-        self, node: str, keys: Sequence[str] | None, settings: ZenohSessions, hear: Hear, ros2: Ros2 | None = None
+        self,
+        node: str,
+        incarnation: int,
+        keys: Sequence[str] | None,
+        settings: ZenohSessions,
+        hear: Hear,
+        ros2: Ros2 | None = None,
     ) -> None:
-        super().__init__(node, keys, settings.query_s, settings.liveliness_s, ros2)
+        super().__init__(node, incarnation, keys, settings.query_s, settings.liveliness_s, ros2)
         self._settings, self._tell_run = settings, hear
+        self.is_paused = False
         self._session: zenoh.Session | None = None
         self._watches: list[Any] = []
-        self._declared: dict[str, zenoh.LivelinessToken | None] = {}
-        """Tokens of other vehicles, which are declared at this one's programs; None while that is under way."""
-        self._taken_back: dict[str, float] = {}
-        """Tokens of other vehicles that were taken back lately, and until when (s of the loop) echoes may come."""
+        self._declared: dict[str, zenoh.LivelinessToken] = {}
+        """Tokens of other vehicles, which are declared at this one's programs.
+
+        One that a program of this vehicle has as well stays until that is gone: its owner would be told that it is.
+        """
         self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
         self.sessions: set[str] = set()
@@ -182,20 +191,46 @@ class Gateway(RadioSide[zenoh.Query]):
                 (self.sessions.add if is_there else self.sessions.discard)(who)
         return None
 
+    def _end(self, numbers: list[int]) -> None:
+        """As `RadioSide._end`, but not in a pause: what was heard meanwhile follows."""
+        if self.is_paused:
+            asyncio.get_running_loop().call_later(self._query_s, self._end, numbers)
+        else:
+            super()._end(numbers)
+
     def _conclude(self, query: zenoh.Query) -> None:
         query.drop()  # type: ignore[no-untyped-call]
 
     def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
-        """Take a token that has appeared or is gone; those that other vehicles have told of are echoes."""
-        if key in self._declared or not self.crosses(key) or (key in self._tokens) == is_there:
+        """Take a token that has appeared or is gone.
+
+        What comes of those that are declared here, or were, is echoes, but that it is gone where it is declared.
+        """
+        if self._session is None or not self.crosses(key) or (key in self._declared and is_there):
             return None
-        if self._taken_back.get(key, 0.0) > asyncio.get_running_loop().time():
+        if key not in self._declared:
+            found = self._session.liveliness().get(key, zenoh.handlers.FifoChannel(MOST_TOKENS))
+            is_there = any(reply.ok is not None for reply in found)
+        if (key in self._tokens) == is_there:
             return None
         (self._tokens.add if is_there else self._tokens.discard)(key)
+        if key not in self.heard_tokens:
+            self._release(key)
         return CrossingTokens(tuple(sorted(self._tokens)))
 
     def tokens(self) -> CrossingTokens | None:
-        """Return the tokens of the vehicle's programs, to be told again, if there are any."""
+        """Return the tokens of the vehicle's programs, to be told again, if there are any.
+
+        Zenoh tells of none whose key is declared here, but that both are there.
+        """
+        if self._session is not None and self._declared:
+            me = str(self._session.zid())
+            for reply in self._session.get(f"@/{me}/router/token/**", zenoh.handlers.FifoChannel(MOST_TOKENS)):
+                if reply.ok is not None:
+                    key = str(reply.ok.key_expr).partition("/token/")[2]
+                    owners = itertools.chain(*json.loads(reply.ok.payload.to_string()).values())
+                    if key in self._declared and {*owners} != {me}:
+                        self._tokens.add(key)
         return CrossingTokens(tuple(sorted(self._tokens))) if self._tokens else None
 
     # To the programs.
@@ -258,16 +293,15 @@ class Gateway(RadioSide[zenoh.Query]):
 
     def _show_token(self, key: str, is_there: bool) -> None:
         """Declare a token of another vehicle at the programs, or take it back."""
-        now_s = asyncio.get_running_loop().time()
-        self._taken_back = {each: until_s for each, until_s in self._taken_back.items() if until_s > now_s}
         if not is_there:
-            if (token := self._declared.pop(key, None)) is not None:
-                token.undeclare()  # type: ignore[no-untyped-call]
-            self._taken_back[key] = now_s + ECHO_S
-        elif key not in self._tokens and self._session is not None:
-            # Before the declaration, whose echo must not count as a token of this vehicle's own.
-            self._declared[key] = None
+            self._release(key)
+        elif key not in self._declared and self._session is not None:
             self._declared[key] = self._session.liveliness().declare_token(key)
+
+    def _release(self, key: str) -> None:
+        """Take a token of another vehicle back, unless a program of this one has it, too."""
+        if key not in self._tokens and (token := self._declared.pop(key, None)) is not None:
+            token.undeclare()  # type: ignore[no-untyped-call]
 
 
 def session_name(session: zenoh.Transport | zenoh.Hello) -> str:

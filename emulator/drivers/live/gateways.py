@@ -77,7 +77,6 @@ class _Vehicle:
     fragments: Fragments | None = None
     acknowledges: bool = False
     is_ready: bool = False
-    is_paused: bool = False
     on_air: bool = False
     """True from time 0, or from its return, on."""
     early: dict[object, tuple[str, Any]] = field(default_factory=dict)
@@ -173,7 +172,8 @@ class Gateways:
         """Open the gateways of these vehicles, and start their commands."""
         for (node,) in groups:
             rules = None if self._ros2 is None else Ros2(node, self._ros2.inside, self._ros2.domain)
-            gateway = Gateway(node, self._emulation.scenario.radio.keys, self._settings, self._hear, rules)
+            keys, incarnation = self._emulation.scenario.radio.keys, self._emulation.incarnation[node]
+            gateway = Gateway(node, incarnation, keys, self._settings, self._hear, rules)
             vehicle = self._vehicles[node] = _Vehicle(next(self._numbers), gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 
@@ -225,9 +225,9 @@ class Gateways:
         if (vehicle := self._vehicles.get(name)) is not None:
             for process in vehicle.commands:
                 self._launcher.signal_group(process, number)
-            if vehicle.is_paused:
+            if vehicle.gateway.is_paused:
                 vehicle.gateway.wait_anew(self._now_ns())
-            vehicle.is_paused = number == signal.SIGSTOP
+            vehicle.gateway.is_paused = number == signal.SIGSTOP
             self._flush_soon(vehicle)
 
     def kill(self, name: str) -> None:
@@ -426,7 +426,7 @@ class Gateways:
         vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end
 
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
-        if vehicle.is_paused:
+        if vehicle.gateway.is_paused:
             return
         vehicle.gateway.forget_tokens(self._now_ns())
         if (tokens := vehicle.gateway.tokens()) is not None:
@@ -527,7 +527,7 @@ class Gateways:
         if not self._is_there(vehicle):
             return
         self._enqueue_early(vehicle)
-        if vehicle.is_paused and not final:
+        if vehicle.gateway.is_paused and not final:
             return
         if vehicle.outbox.frames and not self._emulation.up[vehicle.gateway.node_id]:
             lost, vehicle.outbox.frames = counted(len(vehicle.outbox.frames), "frame"), []

@@ -218,14 +218,15 @@ def test_a_function_that_no_module_has_is_no_rule(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
-def test_campaigns_draw_no_rule_and_keep_those_of_their_scenario() -> None:
+def test_campaigns_draw_no_rule_and_keep_the_faults_of_their_scenario() -> None:
     scenario = ruled("drops")
-    scenario = make_scenario(scenario, {"faults": [*scenario.fault, {"kind": "kill", "duration_s": 0.5}]})
+    more = [{"kind": "kill", "duration_s": 0.5}, {"kind": "emulator_restart"}]
+    scenario = make_scenario(scenario, {"faults": [*scenario.fault, *more]})
     for faults in ("random", "none"):
         plan = Plan.of(scenario, faults, 5, seed=1)
         for number in range(5):
             drawn = [fault.kind for fault in plan.draw(number).fault]
-            assert drawn[0] == "custom" and "custom" not in drawn[1:]
-            assert (len(drawn) > 1) == (faults == "random")
+            assert drawn[:2] == ["custom", "kill"] and not {"custom", "emulator_restart"} & {*drawn[1:]}
+            assert (len(drawn) > 2) == (faults == "random")
     with pytest.raises(ScenarioError, match="fault 'custom'"):
         Plan.of(scenario, "custom", 5, seed=1)

@@ -96,7 +96,8 @@ def test_a_vehicle_without_any_event_is_asked_as_well(run: Run) -> None:
     assert eventually(run, "warned", warned, 0.8, "event", ["v02", "v03"]).text.startswith(
         "never came true within 0.8 s: first of v03"
     )
-    assert eventually(run, "warned", warned, nodes=["v99"]).text == "there is no such vehicle"
+    assert eventually(run, "warned", warned, nodes=["v99"]).text == "there is no vehicle v99"
+    assert eventually(run, "all", lambda m: True, nodes=["v01", "v99"]).verdict == "unknown"
 
 
 def test_a_run_that_is_too_short_for_a_property_leaves_it_unknown(run: Run) -> None:

@@ -47,7 +47,7 @@ def test_without_faults_the_runs_differ_by_their_seeds() -> None:
     assert [drawn.run.seed for drawn in (first, second)] == [7, 8]
     assert [drawn.network.seed for drawn in (first, second)] == [7, 8]
     assert first.run.settle_s == 2.0
-    assert Plan.of(scenario(2.0, 0.5), "none", 1, seed=1).draw(0).fault == ()
+    assert [fault.kind for fault in Plan.of(scenario(2.0, 0.5), "none", 1, seed=1).draw(0).fault] == ["loss"]
 
 
 def test_a_plan_leaves_the_networks_of_its_runs_to_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -244,6 +244,24 @@ async def test_left_on_its_way(vnet_emulation):
 """).assert_outcomes(passed=2)
 
 
+def test_a_block_that_an_error_leaves_ends_its_run_where_it_stands(run_tests: RunTests) -> None:
+    run_tests("""
+import asyncio
+
+@pytest.mark.parametrize("live", [False, True])
+async def test_left(vnet_emulation, live):
+    with pytest.raises(KeyError):
+        async with vnet_emulation(TWELVE, vehicles=3, duration=900, live=live) as emu:
+            with emu.fault("pause", nodes=["v02"]):
+                step = asyncio.ensure_future(emu.run_until(800))
+                await asyncio.sleep(0)
+                step.cancel()
+                raise KeyError
+    assert 0 < emu.now_s < 800
+    assert emu.end().verdict != "invalid"
+""").assert_outcomes(passed=2)
+
+
 def test_hypothesis_calls_a_coroutine_test_again_and_again(run_tests: RunTests) -> None:
     result = run_tests("""
 from hypothesis import HealthCheck, given, settings, strategies

@@ -151,8 +151,7 @@ def test_replies_go_to_the_asker_alone(drive: Drive) -> None:
 
 
 def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         session = zenoh.open(zenoh.Config())
         session.declare_subscriber("**", lambda s: print("heard", s.key_expr))
@@ -161,7 +160,9 @@ def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(
             for key in ("pose/a", "lidar/a", "vnet/own"):
                 session.put(key, b"x")
         time.sleep(0.5)
-        """,
+        """
+    run = drive(
+        text,
         """
         import time, zenoh
         with zenoh.open(zenoh.Config()) as session, session.declare_subscriber("*/*") as subscriber:
@@ -214,6 +215,72 @@ def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
     assert sorted(lines[:3]) == ["error v03: x=1", *samples]
     assert lines[3].startswith("over 0.5")
     assert lines[4].startswith("v0") or lines[4] == "Timeout"
+
+
+def test_a_reply_to_a_query_of_a_killed_program_is_none_to_one_of_its_next_life(drive: Drive) -> None:
+    text = """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        if sys.argv[1] == "v02":
+            def answer(query):
+                time.sleep(0.7)
+                query.reply("k", query.payload)
+            session.declare_queryable("k", answer)
+        else:
+            asked = f"{time.monotonic():.1f}"
+            every = zenoh.ConsolidationMode.NONE
+            for reply in session.get("k", payload=asked, timeout=1.9, consolidation=every):
+                print(asked, reply.ok.payload.to_string())
+        time.sleep(9)
+        """
+    run = drive(
+        text,
+        vehicles=2,
+        duration_s=4.0,
+        fault=[{"kind": "kill", "at_s": 0.4, "duration_s": 0.2, "nodes": ["v01"]}],
+    )
+    assert log(run)[:1] == ["0.6 0.6"]
+
+
+def test_a_query_crosses_beside_complete_queryables_of_the_own_vehicle(drive: Drive) -> None:
+    """Zenoh's router asks the nearest complete queryable, and one of its own, as a gateway has."""
+    serve = """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        session.declare_queryable("c/**", lambda query: query.reply("c", sys.argv[1]), complete=True)
+        time.sleep(9)
+        """
+    ask = """
+        import time, zenoh
+        session = zenoh.open(zenoh.Config())
+        time.sleep(0.1)
+        replies = session.get("c/**", consolidation=zenoh.ConsolidationMode.NONE)
+        print(sorted(reply.ok.payload.to_string() for reply in replies))
+        """
+    run = drive(serve, ask, vehicles=2)
+    assert log(run)[:1] == ["['v01', 'v02']"]
+
+
+@pytest.mark.parametrize("offset_ms", [2500.0, -60000.0])
+def test_a_clock_fault_changes_no_token(drive: Drive, offset_ms: float) -> None:
+    text = """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        token = session.liveliness().declare_token(f"alive/{sys.argv[1]}")
+        tell = lambda token: print(token.key_expr, token.kind)
+        session.liveliness().declare_subscriber("alive/v03", tell, history=True)
+        time.sleep(99)
+        """
+    run = drive(
+        text,
+        vehicles=3,
+        duration_s=9.0,
+        fault=[
+            {"kind": "skew", "at_s": 2.5, "duration_s": 6.4, "nodes": ["v02"], "offset_ms": offset_ms},
+            {"kind": "kill", "at_s": 4.0, "duration_s": 5.0, "nodes": ["v03"]},
+        ],
+    )
+    assert log(run, "v02")[:3] == log(run, "v01")[:3] == ["alive/v03 SampleKind.PUT", "alive/v03 SampleKind.DELETE"]
 
 
 def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Drive) -> None:

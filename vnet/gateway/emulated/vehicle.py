@@ -53,6 +53,7 @@ from vnet.gateway.ros2 import MOST_KEYS, Ros2
 from vnet.node import Node
 from vnet.radio import Packet
 from vnet.runtime.own_asyncio import Task
+from vnet.runtime.virtual_time import VirtualTimeLoop
 
 
 class Vehicle(RadioSide[Asking]):
@@ -61,7 +62,7 @@ class Vehicle(RadioSide[Asking]):
     def __init__(
         self, node: Node, keys: Sequence[str] | None, query_s: float, liveliness_s: float, ros2: Ros2 | None = None
     ) -> None:
-        super().__init__(node.id, keys, query_s, liveliness_s, ros2)
+        super().__init__(node.id, node.incarnation, keys, query_s, liveliness_s, ros2)
         self.node = node
         self.zid = ZenohId.of(node.id, node.incarnation, "router")
         self._liveliness_s = liveliness_s
@@ -93,6 +94,12 @@ class Vehicle(RadioSide[Asking]):
     def new_zid(self) -> ZenohId:
         """Return the id of a further session."""
         return ZenohId.of(self.node.id, self.node.incarnation, next(self._session_numbers))
+
+    @property
+    def _true_ns(self) -> int:
+        """Emulated time, whatever a fault makes of the vehicle's clock."""
+        assert isinstance(self._loop, VirtualTimeLoop)
+        return self._loop.now_ns
 
     def new_timestamp(self, zid: ZenohId) -> zenoh.Timestamp:
         """Return the present time by the vehicle's clock; later than all before it, as Zenoh's clock promises."""
@@ -193,8 +200,9 @@ class Vehicle(RadioSide[Asking]):
             if all_complete:
                 others = complete
             elif complete and asking.target == zenoh.QueryTarget.BEST_MATCHING:
+                # Zenoh asks of others the nearest alone; and the router's own, as a gateway has for the radio.
                 nearest = complete[0].session
-                others, crosses = [each for each in others if each.session is nearest], False
+                others = [each for each in others if each.session is nearest]
             if crosses:
                 self._ask_by_radio(asking)
             for entity in others:
@@ -268,7 +276,7 @@ class Vehicle(RadioSide[Asking]):
         while True:
             await self._has_tokens.wait()
             await asyncio.sleep(self._liveliness_s)
-            self.forget_tokens(self.node.now_ns)
+            self.forget_tokens(self._true_ns)
             if any(self.crosses(str(each.key)) for each in self._entities["token"]):
                 self._send_tokens()
             elif not self.heard_tokens:
@@ -326,7 +334,7 @@ class Vehicle(RadioSide[Asking]):
 
     def _take(self, packet: Packet) -> None:
         try:
-            self.hear(packet.sender, packet.payload, packet.received_ns)
+            self.hear(packet.sender, packet.payload, self._true_ns)
         except ValueError as error:  # bytes that a fault has changed
             self.node.log(f"a frame of {packet.sender} is no sample: {error}", "debug")
 

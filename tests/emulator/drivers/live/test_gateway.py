@@ -47,7 +47,7 @@ class Vehicle:
     """A gateway and its radio: frames reach all of `others`, unless `is_lost` says so of their number."""
 
     def __init__(self, name: str, keys: tuple[str, ...], max_payload: int, ros2: Ros2 | None) -> None:
-        self.gateway = Gateway(name, keys, QUIET, self._hear, ros2)
+        self.gateway = Gateway(name, 0, keys, QUIET, self._hear, ros2)
         self.others: list[Vehicle] = []
         self.is_lost: Callable[[int], bool] = lambda number: False
         self.frames: list[bytes] = []
@@ -302,6 +302,32 @@ async def test_tokens_of_a_vehicle_are_seen_by_those_in_range_late_ones_too_and_
 
 
 @two_vehicles()
+async def test_a_token_that_two_vehicles_have_is_there_until_both_are_gone(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    first, second = vehicles
+    tokens = [sessions[0].liveliness().declare_token("leader")]
+    seen = [watch(session, "leader") for session in sessions]
+    assert [await each.get() for each in seen] == [("leader", True)] * 2
+    tokens.append(sessions[1].liveliness().declare_token("leader"))
+    settle(sessions[1])
+    told = second.gateway.tokens()
+    assert told == CrossingTokens(("leader",)), "Zenoh has told of the other's alone"
+    for payload in Fragments(2000).of(told):
+        second.broadcast(payload)
+    tokens[0].undeclare()  # type: ignore[no-untyped-call]
+    while first.gateway.tokens():
+        await first.told.get()
+    for session in sessions:
+        settle(session)
+    tokens[1].undeclare()  # type: ignore[no-untyped-call]
+    assert [await each.get() for each in seen] == [("leader", False)] * 2
+    assert second.gateway.tokens() is None
+    tokens[1] = sessions[1].liveliness().declare_token("leader")  # as soon as the other's is gone
+    assert [await each.get() for each in seen] == [("leader", True)] * 2
+
+
+@two_vehicles()
 async def test_bytes_that_a_fault_has_changed_harm_nobody(
     vehicles: list[Vehicle], sessions: list[zenoh.Session]
 ) -> None:
@@ -426,7 +452,7 @@ def test_an_exception_on_a_thread_of_zenohs_is_told(monkeypatch: pytest.MonkeyPa
         def hear(kind: str, what: str, item: tuple[Gateway, Any]) -> None:
             loop.call_soon_threadsafe(told.put_nowait, (what, item[1]))
 
-        gateway = Gateway("v01", RADIO_KEYS, QUIET, hear)
+        gateway = Gateway("v01", 0, RADIO_KEYS, QUIET, hear)
         with connected(await asyncio.to_thread(gateway.open, QUIET.listen)) as session:
             session.put("car/v01/pose", b"")
             while (heard := await asyncio.wait_for(told.get(), PATIENCE_S))[0] != "bug":
