@@ -20,8 +20,9 @@ from vnet.runtime.environment import use_same_arithmetic
 use_same_arithmetic()  # as in the commands, whose results some tests compare with those of this process
 
 # The same examples in each run, so that it fails for what was changed, and however slow the machine.
-# Others: --hypothesis-profile=default. Where time matters less, twice as many.
+# Others: --hypothesis-profile=others. Where time matters less, twice as many.
 settings.register_profile("same", derandomize=True, deadline=None, max_examples=100 if os.environ.get("CI") else 50)
+settings.register_profile("others", deadline=None)
 settings.load_profile("same")
 # For mutants: the first example that fails is enough, and looking for a smaller one takes minutes.
 settings.register_profile("first", settings.get_profile("same"), phases=[Phase.explicit, Phase.generate])

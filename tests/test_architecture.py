@@ -165,10 +165,7 @@ def test_circles_and_upward_imports_would_be_seen() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set(), "e": {"a"}}) == [["a", "b", "c"]]
     assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
     graph = {"vnet.errors": {"emulator.cli"}, "emulator.checks.run": {"emulator.stream", "vnet.errors"}}
-    assert violations(graph, LAYERS) == [
-        "vnet.errors -> emulator.cli",
-        "emulator.checks.run -> emulator.stream",
-    ]
+    assert violations(graph, LAYERS) == ["vnet.errors -> emulator.cli", "emulator.checks.run -> emulator.stream"]
 
 
 def test_imports_only_go_down() -> None:
@@ -279,27 +276,27 @@ def test_tests_mirror_the_packages() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("modules", ["agents.cooperative, agents.host", "agents.cli, agents.beacon"])
-def test_an_agent_imports_nothing_heavy(modules: str) -> None:
-    """Import cost counts once a vehicle."""
-    code = f"import sys, {modules}; print([m for m in {HEAVY} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("module", "slow_to_import"),
+    ("statement", "heavy"),
     [
-        ("emulator.cli.runs", ["pyarrow", "zenoh", "scipy", "matplotlib", "jinja2", "rerun", "asyncio"]),
-        ("emulator.drivers.hosts.host", ["pydantic", "scipy", "pyarrow", "matplotlib", "jinja2", "rerun"]),
-        ("emulator.cli.execution", ["scipy", "matplotlib", "jinja2", "rerun"]),
+        ("import agents.cooperative, agents.host", HEAVY),
+        ("import agents.cli, agents.beacon", HEAVY),
+        ("from agents.cooperative.cmm import *", ["emulator", "zenoh", "msgpack"]),
+        ("import emulator", ["numpy", "pydantic", "zenoh"]),
+        ("import emulator.testing.plugin", ["numpy", "zenoh", "pyarrow"]),
+        ("import emulator.cli.runs", ["pyarrow", "zenoh", "scipy", "matplotlib", "jinja2", "rerun", "asyncio"]),
+        ("import emulator.drivers.hosts.host", ["pydantic", "scipy", "pyarrow", "matplotlib", "jinja2", "rerun"]),
+        ("import emulator.cli.execution", ["scipy", "matplotlib", "jinja2", "rerun"]),
     ],
-    ids=["until a run is announced", "until a host has started its agents", "until it is judged"],
+    ids=[
+        *("an agent, which costs once a vehicle", "its command", "the estimators", "a user's script"),
+        *("each session of pytest", "until a run is announced", "until a host has started its agents"),
+        "until a run on the disc radio is judged",
+    ],
 )
-def test_a_run_on_the_disc_radio_imports_little(module: str, slow_to_import: list[str]) -> None:
+def test_nothing_is_imported_that_takes_long_and_is_not_needed(statement: str, heavy: list[str]) -> None:
     """scipy, for one, serves maps, fading and tests of significance."""
-    code = f"import sys, {module}; print([m for m in {slow_to_import} if m in sys.modules])"
+    code = f"{statement}; import sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -80,9 +80,7 @@ def test_the_supported_versions_of_python_are_the_same_everywhere() -> None:
 
 
 def test_the_hooks_before_a_commit_are_the_linters_of_make() -> None:
-    hooks: list[dict[str, Any]] = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0][
-        "hooks"
-    ]
+    hooks: list[Any] = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
     entries = [hook["entry"].removesuffix(" --force-exclude") for hook in hooks]
     linters = [line.replace("$(BIN)", ".venv/bin").removesuffix(" .") for line in recipe("lint")]
     assert entries == linters

@@ -17,6 +17,7 @@ from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
 
 MS = 1_000_000
+Run = Callable[[Program, Swap], wire.Traffic]
 
 
 class Over(Exception):
@@ -24,7 +25,7 @@ class Over(Exception):
 
 
 @pytest.fixture
-def run() -> Iterator[Callable[[Program, Swap], wire.Traffic]]:
+def run() -> Iterator[Run]:
     """Run a program from a window that ends at 2 ms, with quiet instants up to 100 ms; returns its last traffic."""
     loop = VirtualTimeLoop(lambda timer_ns: parts.ahead.exchange(timer_ns))
     parts = SimpleNamespace()
@@ -53,9 +54,7 @@ def granted(time_ns: int) -> wire.Grant:
     return wire.Grant(0, time_ns, time_ns + 2 * MS, quiet_ns=100 * MS)
 
 
-def test_the_end_of_the_run_does_not_pass_through_the_program(
-    run: Callable[[Program, Swap], wire.Traffic],
-) -> None:
+def test_the_end_of_the_run_does_not_pass_through_the_program(run: Run) -> None:
     asked: list[int | None] = []
     seen: list[str] = []
 
@@ -121,19 +120,17 @@ async def computes(node: Node) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("does", [listens, works, reports, logs, notes])
-def test_what_the_emulator_must_know_first_is_asked_for_at_once(
-    run: Callable[[Program, Swap], wire.Traffic], does: Program
-) -> None:
+def test_what_the_emulator_must_know_first_is_asked_for_at_once(run: Run, does: Program) -> None:
     assert asked_by(run, does) == [20 * MS]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("does", [computes, forks, starts_a_thread, sends])
-def test_what_needs_no_answer_is_not_asked_for(run: Callable[[Program, Swap], wire.Traffic], does: Program) -> None:
+def test_what_needs_no_answer_is_not_asked_for(run: Run, does: Program) -> None:
     assert asked_by(run, does) == []
 
 
-def asked_by(run: Callable[[Program, Swap], wire.Traffic], does: Program) -> list[int | None]:
+def asked_by(run: Run, does: Program) -> list[int | None]:
     """Return the instants for which a program has asked by the time that it has done this, at 20 ms."""
     asked: list[int | None] = []
     by_then: list[int | None] = []

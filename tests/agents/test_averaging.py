@@ -12,7 +12,6 @@ from agents.cooperative.cmm.consensus import Share
 from agents.cooperative.frame import short_name
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.scenario.scenario import Scenario
 from tests.support.recorded import prepared
 from vnet import Packet
 
@@ -88,14 +87,12 @@ def test_what_cannot_be_read_is_counted() -> None:
 
 
 def emulate(folder: Path, options: dict[str, object], duration_s: float = 3.0) -> Emulation:
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": duration_s},
-            "network": {"vehicles": 4},
-            "radio": {"range_m": 1e6},
-            "program": {"entry": "agents.averaging:main", "options": options},
-        }
-    )
+    scenario = {
+        "run": {"duration_s": duration_s},
+        "network": {"vehicles": 4},
+        "radio": {"range_m": 1e6},
+        "program": {"entry": "agents.averaging:main", "options": options},
+    }
     emulation = prepared(scenario, folder)
     simulate(emulation)
     assert [e.kind for e in emulation.folder.events if e.node] == []

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Meta
 
@@ -77,7 +77,6 @@ values = st.recursive(
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(st.sampled_from([field.name for field in msgspec.structs.fields(Example)]), values)
 def test_any_value_is_converted_or_refused_by_its_name(key: str, value: object) -> None:
     try:

@@ -25,19 +25,9 @@ from tests.support.paths import ROOT
 
 APPS = {"vnet": app, "vnet-agent": agents.cli.app}
 HERE = (
-    "simulate",
-    "check",
-    "analyze",
-    "access",
-    "radio",
-    "export",
-    "report",
-    "compare",
-    "map",
-    "trace",
-    "docs",
+    "simulate", "check", "analyze", "access", "radio", "export", "report", "compare", "map", "trace", "docs",
     "new",
-)
+)  # fmt: skip
 """Commands of vnet that are run in this process."""
 APART = (
     *("run", "emulator", "host", "campaign", "sweep"),  # they start processes

@@ -49,11 +49,8 @@ def anchors(text: str) -> set[str]:
     """The names that GitHub gives the headings of a page."""
     tokens = _parser.parse(text)
     headings = [after.content for token, after in pairwise(tokens) if token.type == "heading_open"]
-    return {re.sub(r"[^\w\- ]", "", _plain(heading).lower()).replace(" ", "-") for heading in headings}
-
-
-def _plain(heading: str) -> str:
-    return re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
+    plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings)
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in plain}
 
 
 def _inline(text: str) -> Iterator[Token]:

@@ -21,8 +21,5 @@ def test_an_uncertain_estimate_weighs_little() -> None:
 
 def test_the_example_prints_its_results(capsys: pytest.CaptureFixture[str]) -> None:
     estimators.main()
-    assert [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()] == [
-        "common error",
-        "mean of the ring",
-        "fusion weights",
-    ]
+    names = [line.partition(":")[0] for line in capsys.readouterr().out.splitlines()]
+    assert names == ["common error", "mean of the ring", "fusion weights"]

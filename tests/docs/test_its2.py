@@ -139,10 +139,8 @@ def test_the_examples_schema_has_the_bytes_of_etsi_s_own(message: Message) -> No
 def test_a_bsm_comes_through(path: Any, message: Message) -> None:
     types = schema(path)
     payload = encode_bsm(message, 130, types)
-    assert (
-        types.decode("BasicSafetyMessage", types.decode("MessageFrame", payload)["value"])["coreData"]["msgCnt"]
-        == 2
-    )
+    bsm = types.decode("BasicSafetyMessage", types.decode("MessageFrame", payload)["value"])
+    assert bsm["coreData"]["msgCnt"] == 2
     decoded = decode_bsm(payload, types)
     assert_close(Message(message.station, 0, message.position_m, message.heading_rad), decoded)
     assert decoded is not None and decoded.time_ns == message.time_ns % 60_000_000_000

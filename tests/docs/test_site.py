@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from tests.docs.markdown import PAGES
+from tests.docs.markdown import PAGES, anchors, links
 from tests.docs.once import unless_passed
 from tests.support.paths import ROOT
 
@@ -31,9 +31,7 @@ def test_the_contents_follow_the_index(configuration: ModuleType) -> None:
 
 
 @pytest.mark.slow
-def test_the_site_has_every_page_and_loads_nothing_from_elsewhere(
-    tmp_path: Path, pytestconfig: pytest.Config
-) -> None:
+def test_site_has_every_page_and_loads_nothing_from_elsewhere(tmp_path: Path, pytestconfig: pytest.Config) -> None:
     """All pages are read and their links resolved; two are written, with the theme that all have."""
     sources = [file for name in ("vnet", "agents", "emulator", "docs") for file in (ROOT / name).rglob("*.*")]
     with unless_passed(pytestconfig, "site", [*PAGES, *sources]):
@@ -50,3 +48,38 @@ def test_the_site_has_every_page_and_loads_nothing_from_elsewhere(
         texts = {str(page): page.read_text(encoding="utf-8") for page in PAGES}
         assert [path for path, text in {**html, **texts}.items() if loaded.search(text)] == []
         assert "broadcast" in html["docs/python.md"]
+
+
+def broken(path: Path, text: str) -> list[str]:
+    """The links of a page, within the repository, that lead nowhere."""
+    found = []
+    for link in links(text):
+        file, _, anchor = link.partition("#")
+        if "://" in link or file.startswith("mailto:"):
+            continue
+        target = (path.parent / file).resolve() if file else path
+        page = text if target == path else target.read_text() if target.suffix == ".md" and target.exists() else ""
+        if not (target == path or target.exists()) or (anchor and anchor not in anchors(page)):
+            found.append(link)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_link_leads_nowhere(path: Path) -> None:
+    assert broken(path, path.read_text(encoding="utf-8")) == []
+
+
+def test_a_link_that_leads_nowhere_is_found() -> None:
+    text = "# One thing\n\n[a](README.md) [b](nowhere.md) [c](#one-thing) [d](#another) ![e](docs/no.png) [f](https://x.y)"
+    assert broken(ROOT / "page.md", text) == ["nowhere.md", "#another", "docs/no.png"]
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = ROOT / "docs" / "index.md"
+    linked = {(index.parent / link.partition("#")[0]).resolve() for link in links(index.read_text())}
+    assert set(PAGES) - linked == {index}
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) < 150

@@ -129,11 +129,8 @@ def test_a_disconnected_graph_is_the_sum_of_its_parts() -> None:
         figures = found["rules"][rule]
         assert (figures["convergence_factor"], figures["deviation_variance"]) == (1.0, None)
         parts = zip(figures["component_convergence_factor"], figures["component_deviation_variance"], strict=True)
-        expected = [
-            (alone[rule]["convergence_factor"], alone[rule]["deviation_variance"]),
-            (0.0, 2 / 3),
-            (0.0, 0.0),
-        ]
+        ring_alone = alone[rule]["convergence_factor"], alone[rule]["deviation_variance"]
+        expected = [ring_alone, (0.0, 2 / 3), (0.0, 0.0)]
         assert list(map(list, parts)) == pytest.approx(np.array(expected), abs=1e-7)
 
 

@@ -55,7 +55,7 @@ def crossed(message: dict[str, Any]) -> dict[str, Any]:
     return wire.decode_observation(wire.encode_observation(message))
 
 
-def watch(scenario: Scenario, folder: Path) -> Watched:
+def watch(scenario: Scenario | dict[str, Any], folder: Path) -> Watched:
     emulation = prepared(scenario, folder)
     live = Messages(emulation)
     told = [("scene", crossed(live.scene()))]
@@ -69,15 +69,13 @@ def watch(scenario: Scenario, folder: Path) -> Watched:
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     """A simulated cooperative run, with faults at the edges of periods and within them."""
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": PERIODS / 10 + 0.05, "settle_s": 0.5, "name": "watched"},
-            "network": {"vehicles": NODES},
-            "radio": {"loss": 0.1, "max_peers": 4},
-            "program": {"entry": "agents.cooperative:main", "options": OPTIONS},
-            "fault": FAULTS,
-        }
-    )
+    scenario = {
+        "run": {"duration_s": PERIODS / 10 + 0.05, "settle_s": 0.5, "name": "watched"},
+        "network": {"vehicles": NODES},
+        "radio": {"loss": 0.1, "max_peers": 4},
+        "program": {"entry": "agents.cooperative:main", "options": OPTIONS},
+        "fault": FAULTS,
+    }
     return watch(scenario, tmp_path_factory.mktemp("playback") / "run")
 
 
@@ -86,14 +84,12 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     """A simulated run of beacons that share a medium, which fades and is congested by rule."""
     pauses = {"kind": "etsi", "pause_ms": (150,) * 5}
     physical = {"path_loss": {"kind": "log_distance"}, "fading": {}, "mac": {}, "congestion": pauses}
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": 1.55, "settle_s": 0.5, "name": "shared"},
-            "network": {"vehicles": NODES, "layout": "dense"},
-            "radio": physical,
-            "program": {"entry": "agents.beacon:main"},
-        }
-    )
+    scenario = {
+        "run": {"duration_s": 1.55, "settle_s": 0.5, "name": "shared"},
+        "network": {"vehicles": NODES, "layout": "dense"},
+        "radio": physical,
+        "program": {"entry": "agents.beacon:main"},
+    }
     return watch(scenario, tmp_path_factory.mktemp("shared") / "run")
 
 
@@ -201,9 +197,8 @@ def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
 
 @pytest.mark.slow
 def test_who_comes_late_is_told_of_whole_periods(watched: Watched, tmp_path: Path) -> None:
-    scenario = Scenario.model_validate(
-        {"run": {"duration_s": 1.0}, "network": {"vehicles": NODES}, "program": {"entry": "agents.beacon:main"}}
-    )
+    network, program = {"vehicles": NODES}, {"entry": "agents.beacon:main"}
+    scenario = {"run": {"duration_s": 1.0}, "network": network, "program": program}
     emulation = prepared(scenario, tmp_path / "run")
     always, late = Messages(emulation), Messages(emulation)
     told: list[tuple[dict[str, Any], dict[str, Any]]] = []
@@ -299,13 +294,8 @@ def test_tables_that_do_not_fit_together(copied: Path, watched: Watched) -> None
 
 @pytest.mark.slow
 def test_a_run_without_a_period_has_a_scene_and_an_end(tmp_path: Path) -> None:
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": 0.05, "settle_s": 0.0},
-            "network": {"vehicles": 2},
-            "program": {"entry": "agents.beacon:main"},
-        }
-    )
+    run, program = {"duration_s": 0.05, "settle_s": 0.0}, {"entry": "agents.beacon:main"}
+    scenario = {"run": run, "network": {"vehicles": 2}, "program": program}
     emptied = watch(scenario, tmp_path / "run")
     assert [stream for stream, _ in messages(emptied.folder)] == ["scene", "end"]
 

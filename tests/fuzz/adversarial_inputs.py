@@ -62,14 +62,8 @@ def _toml() -> dict[str, bytes]:
         "a table": b"{}",
     }
     keys: tuple[bytes, ...] = (
-        b"radio.links",
-        b"radio.max_peers",
-        b"radio.loss",
-        b"run.seed",
-        b"run.name",
-        b"network.path",
-        b"inputs",
-    )
+        b"radio.links", b"radio.max_peers", b"radio.loss", b"run.seed", b"run.name", b"network.path", b"inputs",
+    )  # fmt: skip
     keys += (b"program.options.a", b"program.entry")
     nasty = {
         f"{key.decode()} = {name}": key + b" = " + value
@@ -154,9 +148,7 @@ def _json() -> dict[str, bytes]:
 def _xml() -> dict[str, bytes]:
     declared = b'<?xml version="1.0" encoding="%s"?>\n%s'
     roots = (b"net", b"osm", b"fcd-export", b"configuration")
-    nasty = {
-        f"XML in {name.decode()}": declared % (name, b"<net/>") for name in (b"klingon", b"shift_jis", b"base64")
-    }
+    nasty = {f"XML in {of.decode()}": declared % (of, b"<net/>") for of in (b"klingon", b"shift_jis", b"base64")}
     entities = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa">' + b"".join(
         b'<!ENTITY %c "%s">' % (98 + i, b"&%c;" % (97 + i) * 10) for i in range(9)
     )

@@ -214,17 +214,9 @@ TOML_WORDS = (
     *(b"\\u0000", b"\\U0010ffff", OVERRIDE, b"radio.loss=", b"network.path='network.csv'", b"network.kind='file'"),
 )
 CSV_WORDS = (
-    b"id,x_m,y_m,heading_rad\n",
-    b"nan",
-    b"inf",
-    b"1e308",
-    b'"',
-    b"\r",
-    b"\0",
-    b"\xef\xbb\xbf",
-    b"1_0",
+    b"id,x_m,y_m,heading_rad\n", b"nan", b"inf", b"1e308", b'"', b"\r", b"\0", b"\xef\xbb\xbf", b"1_0",
     b"0,1\n",
-)
+)  # fmt: skip
 TRIPS = (
     b"id,time_s,x_m,y_m\na,0,0,0\na,1,10,0\na,2,20,0\nb,0.5,5,5\nb,2.5,5,5\n",
     b"id,time_s,lat_deg,lon_deg,speed_mps\na,0,42.0,-83.0,1\na,2,42.0001,-83.0,1\n",
@@ -238,17 +230,9 @@ SUMO = b"""<configuration><input><net-file value="a.net.xml"/></input><time><beg
 </configuration>
 """
 XML_WORDS = (
-    b"<!DOCTYPE",
-    b"<!ENTITY",
-    b"&",
-    b"<![CDATA[",
-    b"]]>",
-    b"-->",
-    b"<?xml",
-    b'encoding="UTF-16"',
-    b"nan",
+    b"<!DOCTYPE", b"<!ENTITY", b"&", b"<![CDATA[", b"]]>", b"-->", b"<?xml", b'encoding="UTF-16"', b"nan",
     b"/>",
-)
+)  # fmt: skip
 NET = b"""<net version="1.20"><location netOffset="0,0" projParameter="+proj=utm +zone=17 +datum=WGS84"/>
 <edge id="a" from="1" to="2" type="highway.primary"><lane id="a_0" shape="0,0 9,0 9,5" width="3.5"/></edge></net>
 """
@@ -272,21 +256,9 @@ GEOJSON = (
     b'"geometry": {"type": "LineString", "coordinates": [[-83.74, 42.28], [-83.73, 42.28]]}}]}'
 )
 JSON_WORDS = (
-    b'"user"',
-    b'"password"',
-    b'"run"',
-    b'"processes"',
-    b'"passwords"',
-    b'"tls"',
-    b"null",
-    b"[[",
-    b"{}",
+    b'"user"', b'"password"', b'"run"', b'"processes"', b'"passwords"', b'"tls"', b"null", b"[[", b"{}",
     b"\\u000a",
-)
+)  # fmt: skip
 
 
-QUERIES = (
-    b"status\n",
-    *(b"inject\n" + seed for seed in FAULT_SEEDS),
-    b'heal\n"all"',
-)
+QUERIES = (b"status\n", *(b"inject\n" + seed for seed in FAULT_SEEDS), b'heal\n"all"')

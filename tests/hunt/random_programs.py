@@ -64,9 +64,7 @@ class Vehicle:
 
     def tasks(self, **options: Any) -> list[asyncio.Task[str]]:
         """Start some tasks that speak."""
-        return [
-            asyncio.create_task(self.speak(each, self.delay_s()), name=each, **options) for each in self.names()
-        ]
+        return [asyncio.create_task(self.speak(one, self.delay_s()), name=one, **options) for one in self.names()]
 
 
 class Discarded:
@@ -313,22 +311,10 @@ async def hears(v: Vehicle) -> None:
 
 
 STEPS = [
-    waits_for_some,
-    takes_as_completed,
-    aborts_a_group,
-    asks_for_all_tasks,
-    keeps_sets,
-    runs_in_empty_contexts,
-    goes_on_for_ever,
-    shares,
-    passes_through_queues,
-    times_out,
-    works_in_threads,
-    leaves_garbage,
-    has_a_task_factory,
-    asks_for_what_is_not_its_own,
-    hears,
-]
+    waits_for_some, takes_as_completed, aborts_a_group, asks_for_all_tasks, keeps_sets, runs_in_empty_contexts,
+    goes_on_for_ever, shares, passes_through_queues, times_out, works_in_threads, leaves_garbage,
+    has_a_task_factory, asks_for_what_is_not_its_own, hears,
+]  # fmt: skip
 
 
 async def main(node: Node) -> None:

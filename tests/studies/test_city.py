@@ -33,17 +33,8 @@ def run_small(monkeypatch: pytest.MonkeyPatch, folder: Path, *options: str) -> s
 def files(tmp_path: Path) -> Path:
     """Trips and a map, both in metres."""
     driving(tmp_path)
-    result = CliRunner().invoke(
-        app,
-        [
-            "map",
-            "convert",
-            str(tmp_path / "cross.geojson"),
-            str(tmp_path / "cross.npz"),
-            "--origin",
-            "42.28,-83.74",
-        ],
-    )
+    both = [str(tmp_path / f"cross.{kind}") for kind in ("geojson", "npz")]
+    result = CliRunner().invoke(app, ["map", "convert", *both, "--origin", "42.28,-83.74"])
     assert result.exit_code == 0, result.output
     return tmp_path
 

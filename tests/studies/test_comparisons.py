@@ -7,13 +7,7 @@ from typing import Any
 
 import pytest
 
-from studies.comparisons import (
-    STUDIES,
-    comparison_cells,
-    full_ablation,
-    recorded_common,
-    report,
-)
+from studies.comparisons import STUDIES, comparison_cells, full_ablation, recorded_common, report
 from vnet.errors import VnetError
 
 TINY = {"n1": {"kind": "generated", "vehicles": 5}}

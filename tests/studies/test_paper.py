@@ -1,8 +1,12 @@
 """The cells of the paper's tables, the report of the default profile, and cells selected by label."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from emulator.cells.cells import run_cells
 from emulator.world.world import build_world
 from studies import paper, reports
 from studies.paper import PAPER_RANGE_M
@@ -87,10 +91,18 @@ def test_the_default_experiment_has_one_row_of_one_hop() -> None:
         "reference_common_error_anees": 1.0,
     }
     added = paper.with_bound([{**row, **bound}, {**row, "seed": 3}])
-    assert [(each["mechanism"], each["seed"], each["rmse_m"]) for each in added] == [
-        ("bound", 2, 0.2),
-        ("none", 2, 0.3),
-        ("none", 3, 0.3),
-    ]
+    found = [(each["mechanism"], each["seed"], each["rmse_m"]) for each in added]
+    assert found == [("bound", 2, 0.2), ("none", 2, 0.3), ("none", 3, 0.3)]
     options = next(c for c in cells if c.labels["mechanism"] == "optimized, one hop").scenario.program.options
     assert options["relay"] is False and options["exchange"] == "particles"
+
+
+def test_a_cell_run_over_zenoh_has_the_numbers_of_its_simulation(tmp_path: Path) -> None:
+    paper.write_crossing(tmp_path / "crossing.csv")
+    whole = paper.table1_cells([1], tmp_path / "crossing.csv")[0]
+    run = whole.scenario.run.model_copy(update={"duration_s": 3.0})
+    cell = replace(whole, scenario=whole.scenario.model_copy(update={"run": run}), from_s=1.0)
+    simulated = run_cells([cell], tmp_path)[0]
+    live = run_cells([cell], tmp_path, live=True)[0]
+    assert live == simulated
+    assert live["metrics_sha256"]

@@ -62,6 +62,12 @@ def scenario_of(faults: Sequence[dict[str, Any]], program: str, /, vehicles: int
     return Scenario.model_validate(data)
 
 
+def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
+    """A fault of these nodes, or of all."""
+    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
+    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
+
+
 def emulation_of(scenario: Scenario) -> Emulation:
     """The state of a run of `scenario`, in a new folder."""
     folder = RunFolder.create(Path(_folders.name) / str(next(_numbers)), scenario)

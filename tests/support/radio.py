@@ -20,6 +20,12 @@ def line(*east_m: float) -> np.ndarray:
     return np.column_stack([east_m, np.zeros(len(east_m))])
 
 
+def drained(of: Engine) -> list[dict[str, Any]]:
+    """Return the rows of the trace once all has been decided."""
+    of.drain()
+    return of.trace.to_table().to_pylist()
+
+
 def nist_qpsk_half(snr: float, bits: int) -> float:
     """Return the arrival probability of `bits` at 6 Mbit/s by Pei and Henderson's formula, term by term."""
     raw = 0.5 * math.erfc(math.sqrt(snr / 2))

@@ -1,9 +1,12 @@
 """Whole runs: real routers on ports that the system chooses, real processes, through the commands users type."""
 
 import contextlib
+import errno
 import io
 import json
+import os
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -165,6 +168,16 @@ def running_agents(of: Path) -> list[int]:
         if b"agents.cli" in command and log.startswith(str(of)):
             found.append(int(process.name))
     return found
+
+
+def read_terminal(master: int, written: object) -> bytes:
+    """Bytes that come next on a pseudo-terminal to which this was written; none once its other end is closed."""
+    assert select.select([master], [], [], TIMEOUT_S)[0], f"nothing comes after {written!r}"
+    try:
+        return os.read(master, 65_536)
+    except OSError as error:  # nobody has the other end open any more
+        assert error.errno == errno.EIO
+        return b""
 
 
 def zygote_of(emulator: int) -> int:

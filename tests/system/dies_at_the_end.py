@@ -5,50 +5,36 @@ import atexit
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from vnet import Node
 
 
-async def _runs(node: Node, at_the_end: Callable[[], object]) -> None:
-    failed = asyncio.create_task(_fails())
-    try:
-        async for _ in node.gnss:
-            pass
-    finally:
-        assert failed.done()
-        if node.id == "v02":
-            at_the_end()
+def _ends_by(at_the_end: Callable[[], object]) -> Callable[[Node], Awaitable[None]]:
+    """Return a program that ends the process of v02, once the run is over."""
+
+    async def program(node: Node) -> None:
+        failed = asyncio.create_task(_fails())
+        try:
+            async for _ in node.gnss:
+                pass
+        finally:
+            assert failed.done()
+            if node.id == "v02":
+                at_the_end()
+
+    return program
 
 
 async def _fails() -> None:
     raise LookupError("nobody looks at this")
 
 
-async def segfaults(node: Node) -> None:
-    """Ends its process by SIGSEGV, in v02."""
-    await _runs(node, lambda: os.kill(os.getpid(), signal.SIGSEGV))
-
-
-async def exits_3(node: Node) -> None:
-    """Ends its process with status 3, in v02."""
-    await _runs(node, lambda: os._exit(3))
-
-
-async def exits_0(node: Node) -> None:
-    """Ends its process with status 0, in v02."""
-    await _runs(node, lambda: os._exit(0))
-
-
-async def exits_at_exit(node: Node) -> None:
-    """Ends its process as the interpreter ends, in v02."""
-    await _runs(node, lambda: atexit.register(os._exit, 1))
-
-
-async def never_ends(node: Node) -> None:
-    """Sleeps for ever, in v02."""
-
-    await _runs(node, lambda: time.sleep(3600))
+segfaults = _ends_by(lambda: os.kill(os.getpid(), signal.SIGSEGV))
+exits_3 = _ends_by(lambda: os._exit(3))
+exits_0 = _ends_by(lambda: os._exit(0))
+exits_at_exit = _ends_by(lambda: atexit.register(os._exit, 1))
+never_ends = _ends_by(lambda: time.sleep(3600))
 
 
 async def handles_at_the_end(node: Node) -> None:

@@ -161,20 +161,15 @@ async def describes_process(node: Node) -> None:
     await node.radio.broadcast(b"x")
 
 
-async def kills_its_host(node: Node) -> None:
-    """Speaks in each period; at one second the vehicle of the options kills the process that has started it."""
+async def ends_its_host(node: Node) -> None:
+    """Speaks in each period; at one second the vehicle of the options kills its host, or cuts its link."""
     async for fix in node.gnss:
         await node.radio.broadcast(b"here")
         if node.id == node.options["vehicle"] and fix.time_ns == 1_000_000_000:
-            os.kill(os.getppid(), signal.SIGKILL)
-
-
-async def cuts_its_host(node: Node) -> None:
-    """Speaks in each period; at one second the vehicle of the options takes down the link of its host."""
-    async for fix in node.gnss:
-        await node.radio.broadcast(b"here")
-        if node.id == node.options["vehicle"] and fix.time_ns == 1_000_000_000:
-            os.system("ip link set eth0 down")
+            if node.options["how"] == "kills":
+                os.kill(os.getppid(), signal.SIGKILL)
+            else:
+                os.system("ip link set eth0 down")
 
 
 async def computes_for_ever(node: Node) -> None:

@@ -1,9 +1,7 @@
 """`--debug` at a terminal: the user's commands reach the vehicle's process, and nothing times out meanwhile."""
 
-import errno
 import json
 import os
-import select
 import shlex
 import signal
 from collections.abc import Sequence
@@ -15,7 +13,7 @@ from tests.docs.markdown import blocks
 from tests.docs.pages import shows
 from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
-from tests.system.conftest import TIMEOUT_S
+from tests.system.conftest import TIMEOUT_S, read_terminal
 
 PROGRAM = """
 async def main(node):
@@ -44,7 +42,7 @@ def converse(folder: Path, steps: Sequence[tuple[str, str | signal.Signals]], *a
     words = [*VNET, *arguments]
     with Command(words, cwd=folder, stdin=slave, stdout=slave, stderr=slave, env=environment) as process:
         os.close(slave)
-        while part := _read(master, written):
+        while part := read_terminal(master, written):
             written += part.decode().replace("\r\n", "\n")
             while waiting and (found := written.find(waiting[0][0], seen)) >= 0:
                 awaited, answer = waiting.pop(0)
@@ -57,15 +55,6 @@ def converse(folder: Path, steps: Sequence[tuple[str, str | signal.Signals]], *a
         os.close(master)
     assert not waiting, written
     return process.wait(TIMEOUT_S), written
-
-
-def _read(master: int, written: str) -> bytes:
-    assert select.select([master], [], [], TIMEOUT_S)[0], f"nothing comes after {written}"
-    try:
-        return os.read(master, 65_536)
-    except OSError as error:  # nobody has the other end open any more
-        assert error.errno == errno.EIO
-        return b""
 
 
 @pytest.fixture
@@ -107,9 +96,7 @@ def test_quitting_ends_a_run_of_processes_that_host_several(folder: Path) -> Non
         "--set",
         "run.start=spawn",
     ]
-    status, written = converse(
-        folder, [("(Pdb) ", "q")], "run", *options, "--debug", "v02:prog.py:5", "--out", "run"
-    )
+    status, written = converse(folder, [("(Pdb) ", "q")], "run", *options, "--debug", "v02:prog.py:5", "--out=run")
     assert status == 130, written
     assert written.count("of emulated time\n") == 2, "the first line of the command, and one stop"
     events = [json.loads(line) for line in (folder / "run" / "events.jsonl").read_text().splitlines()]

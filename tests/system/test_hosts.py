@@ -100,6 +100,11 @@ def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str,
     return Finished(emulator.returncode, stdout, stderr, folder)
 
 
+def lose_the_third(hosts: list[NetworkHost], tmp_path: Path, how: str) -> Finished:
+    program = {"entry": "tests.system.programs:ends_its_host", "options": {"vehicle": "v06", "how": how}}
+    return run_on(hosts, write(tmp_path / "lost.toml", program=program, **LOST), tmp_path, "tcp")
+
+
 def test_on_three_hosts_over_tls_the_run_is_that_of_one_process(
     vnet: Vnet, three_hosts: list[NetworkHost], tmp_path: Path
 ) -> None:
@@ -110,8 +115,7 @@ def test_on_three_hosts_over_tls_the_run_is_that_of_one_process(
 
 
 def test_a_host_that_is_killed_is_missed_at_that_barrier(three_hosts: list[NetworkHost], tmp_path: Path) -> None:
-    program = {"entry": "tests.system.programs:kills_its_host", "options": {"vehicle": "v06"}}
-    done = run_on(three_hosts, write(tmp_path / "lost.toml", program=program, **LOST), tmp_path, "tcp")
+    done = lose_the_third(three_hosts, tmp_path, "kills")
     assert done.status == 1 and done.check("agents_alive")["verdict"] == "invalid", done.stdout + done.stderr
     assert done.check("progress")["verdict"] == "valid"
     assert [(event["host"], event["time_ns"]) for event in done.events_of("host_gone")] == [("c", ASKED_NS)]
@@ -122,8 +126,7 @@ def test_a_host_that_is_killed_is_missed_at_that_barrier(three_hosts: list[Netwo
 
 
 def test_a_host_that_is_cut_off_ends_the_run_as_unknown(three_hosts: list[NetworkHost], tmp_path: Path) -> None:
-    program = {"entry": "tests.system.programs:cuts_its_host", "options": {"vehicle": "v06"}}
-    done = run_on(three_hosts, write(tmp_path / "lost.toml", program=program, **LOST), tmp_path, "tcp")
+    done = lose_the_third(three_hosts, tmp_path, "cuts")
     assert done.status == 3, done.stdout + done.stderr
     stalled = {event["node"]: event["time_ns"] for event in done.events_of("stalled")}
     assert stalled == {"v05": ASKED_NS, "v06": ASKED_NS}

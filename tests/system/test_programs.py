@@ -39,9 +39,7 @@ def test_a_program_that_spins_is_invalid_and_shown(vnet: Vnet, command: str) -> 
 
 
 @pytest.mark.parametrize(("command", "options"), [("run", []), ("simulate", ["--processes", "2"])])
-def test_a_program_that_hangs_makes_the_run_unknown_and_is_shown(
-    vnet: Vnet, command: str, options: list[str]
-) -> None:
+def test_a_program_that_hangs_makes_run_unknown_and_is_shown(vnet: Vnet, command: str, options: list[str]) -> None:
     done = run(vnet, command, "hangs", "--set", "run.stall_timeout_s=3", *options)
     assert done.status == 3
     assert done.verdict["verdict"] == "unknown"
@@ -106,3 +104,23 @@ def test_a_program_that_a_package_of_vnet_s_own_hides_is_named_in_one_line(
     assert done.returncode != 0
     assert done.stderr.count("\n") == 1
     assert done.stderr.endswith(f"{package} is a package of vnet's own: rename {file}\n")
+
+
+SCENARIO = "scenarios/80211p.toml"
+
+
+def test_on_the_wall_clock_frames_share_the_medium_too(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    options = ("--set", "network.vehicles=6", "--duration", "3600", "--pacing", "realtime")
+    run = run_until(
+        lambda: all(len(heard_by(folder, f"v0{number}")) >= 5 for number in range(1, 7)),
+        folder,
+        SCENARIO,
+        *options,
+        "--program",
+        "tests.system.programs:names_neighbours",
+    )
+    assert run.status == 130, run.stderr + run.stdout
+    assert run.outcomes["delivered"] >= 30
+    checks = {name: run.check(name)["verdict"] for name in ("conservation", "range", "fading", "medium", "latency")}
+    assert set(checks.values()) == {"valid"}, checks

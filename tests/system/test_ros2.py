@@ -60,11 +60,8 @@ def test_two_clients_hear_ask_and_see_each_other_as_far_as_the_radio_carries(
     assert done.status in SLOW
     assert done.check("conservation")["verdict"] == done.check("isolation")["verdict"] == "valid"
     sent = pq.read_table(done.folder / "samples.parquet").to_pylist()
-    delivered = {
-        (row["sender"], row["seq"])
-        for row in done.trace()
-        if row["outcome"] == "delivered" and row["receiver"] != row["sender"]
-    }
+    rows = [row for row in done.trace() if row["outcome"] == "delivered" and row["receiver"] != row["sender"]]
+    delivered = {(row["sender"], row["seq"]) for row in rows}
 
     def arrived(sender: str, kind: str, name: str) -> int:
         """Return the messages on a topic or service that have arrived at the other vehicle."""

@@ -38,9 +38,7 @@ def handlers() -> Iterator[list[object]]:
 
 
 def emulation_of(folder: Path, *overrides: str) -> Emulation:
-    scenario = load_scenario(
-        ROOT / "scenarios" / "beacon.toml", ["network.vehicles=2", "run.duration_s=1", *overrides]
-    )
+    scenario = load_scenario(ROOT / "scenarios/beacon.toml", ["network.vehicles=2", "run.duration_s=1", *overrides])
     return prepared(scenario, folder)
 
 

@@ -30,27 +30,24 @@ ENDLESS = "pathlib.Path('new').write_text(str(os.getpid())); os.rename('new', 'p
 
 
 def command(folder: Path, end: str) -> list[str]:
-    scenario(folder)
+    text = (ROOT / "scenarios" / "beacon.toml").read_text()
+    (folder / "beacon.toml").write_text(text.replace("duration_s = 10.0", "duration_s = 2.0"))
     (folder / "deadly.py").write_text(PROGRAM.replace("END", end))
     return [*VNET, "simulate", "beacon.toml", "--program", "deadly.py:main", "--out", "run", "--no-report"]
 
 
-def scenario(folder: Path) -> None:
-    text = (ROOT / "scenarios" / "beacon.toml").read_text()
-    (folder / "beacon.toml").write_text(text.replace("duration_s = 10.0", "duration_s = 2.0"))
+def ended(words: list[str], folder: Path, status: int) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, which is of this status."""
+    done = run(words, cwd=folder, capture_output=True, timeout=TIMEOUT_S)
+    assert done.returncode == status, done.stderr
+    return done
 
 
 @pytest.mark.parametrize(
-    "end",
-    [
-        FAULT,
-        "ctypes.CDLL(None)._exit(0)",
-        "await asyncio.to_thread(ctypes.string_at, 0)",
-    ],
+    "end", [FAULT, "ctypes.CDLL(None)._exit(0)", "await asyncio.to_thread(ctypes.string_at, 0)"]
 )
 def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end: str) -> None:
-    done = run(command(tmp_path, end), cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
-    assert done.returncode == 1, done.stderr
+    done = ended(command(tmp_path, end), tmp_path, 1)
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
     assert verdict["verdict"] == "invalid"
     assert (tmp_path / "run" / "trace.parquet").exists()
@@ -65,9 +62,11 @@ def test_the_end_of_the_process_is_the_death_of_its_vehicle(tmp_path: Path, end:
 def test_a_program_that_stalls_ends_the_run_with_its_name(
     tmp_path: Path, endless: str, kind: str, status: int, processes: str
 ) -> None:
-    words = [*command(tmp_path, endless), "--set", "run.stall_timeout_s=0.3", "--processes", processes]
-    done = run(words, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
-    assert done.returncode == status, done.stderr
+    ended(
+        [*command(tmp_path, endless), "--set", "run.stall_timeout_s=0.3", "--processes", processes],
+        tmp_path,
+        status,
+    )
     assert "v02" in {event["node"] for event in events(tmp_path / "run") if event["kind"] == kind}
 
 
@@ -78,8 +77,7 @@ def test_what_ends_the_process_after_the_run_is_a_death_then_and_no_earlier(tmp_
     ending = f"    finally:\n        if node.id == 'v02':\n            {end}\n"
     program = program.replace("    async for", "    try:\n     async for") + ending
     (tmp_path / "deadly.py").write_text(program)
-    done = run(words, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
-    assert done.returncode == 1, done.stderr
+    ended(words, tmp_path, 1)
     assert died(tmp_path / "run") == {"v02"}
     checks = json.loads((tmp_path / "run" / "verdict.json").read_text())["checks"]
     assert [check["name"] for check in checks if check["verdict"] == "invalid"] == ["agents_alive"]
@@ -94,9 +92,7 @@ CATCHES_ALL = """while True:
 
 def test_a_program_that_catches_all_that_ends_it_has_died_after_the_run(tmp_path: Path) -> None:
     """Outside of its loop `asyncio.sleep` fails at once, and the program goes round for ever."""
-    words = [*command(tmp_path, CATCHES_ALL), "--set", "run.stall_timeout_s=0.3"]
-    done = run(words, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
-    assert done.returncode == 1, done.stderr
+    ended([*command(tmp_path, CATCHES_ALL), "--set", "run.stall_timeout_s=0.3"], tmp_path, 1)
     assert died(tmp_path / "run") == {"v02"}
 
 
@@ -104,10 +100,7 @@ def test_a_program_that_catches_all_that_ends_it_has_died_after_the_run(tmp_path
 def test_what_a_program_has_started_ends_with_the_simulation(tmp_path: Path, processes: str) -> None:
     """Otherwise it would keep what is printed open, and who reads that would wait for ever."""
     begins = "__import__('subprocess').Popen(['sh', '-c', 'sleep 1000; true'])"
-    done = run(
-        [*command(tmp_path, begins), "--processes", processes], cwd=tmp_path, capture_output=True, timeout=60
-    )
-    assert done.returncode == 0, done.stderr
+    ended([*command(tmp_path, begins), "--processes", processes], tmp_path, 0)
 
 
 LATER = """
@@ -152,16 +145,14 @@ def died(folder: Path) -> set[object]:
 
 def test_vehicles_that_end_the_process_die_and_no_others(tmp_path: Path) -> None:
     end = f"{FAULT}\n        if node.id in ('v04', 'v07') and fix.time_ns == 700_000_000:\n            {FAULT}"
-    done = run(command(tmp_path, end), cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
-    assert done.returncode == 1, done.stderr
+    ended(command(tmp_path, end), tmp_path, 1)
     assert died(tmp_path / "run") == {"v02", "v04", "v07"}
 
 
 @pytest.mark.parametrize("options", [["--log-format", "json"], ["--rerun", "save"], ["--check-determinism"]])
 def test_options_hold_for_the_run_that_is_made_again(tmp_path: Path, options: list[str]) -> None:
     """Standard output has one result, and the folder what was asked for."""
-    done = run([*command(tmp_path, FAULT), *options], cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
-    assert done.returncode == 1, done.stderr
+    done = ended([*command(tmp_path, FAULT), *options], tmp_path, 1)
     assert done.stdout.count('"verdict": "invalid"' if "json" in options else "verdict: invalid") >= 1
     if options[0] == "--log-format":
         assert len(done.stdout.splitlines()) == 1
@@ -176,8 +167,7 @@ def test_options_hold_for_the_run_that_is_made_again(tmp_path: Path, options: li
 
 def test_no_folder_is_left_of_the_first_attempt(tmp_path: Path) -> None:
     without_out = [each for each in command(tmp_path, FAULT) if each not in ("--out", "run")]
-    done = run(without_out, cwd=tmp_path, capture_output=True, timeout=TIMEOUT_S)
-    assert done.returncode == 1, done.stderr
+    ended(without_out, tmp_path, 1)
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["beacon-1", "latest"]
     assert died(tmp_path / "runs" / "latest") == {"v02"}
 
@@ -280,9 +270,7 @@ def test_a_signal_that_ends_the_command_ends_its_child(tmp_path: Path, number: s
 
 
 @pytest.mark.parametrize("processes", ["1", "2"])
-def test_sigterm_is_an_interrupt_and_one_that_a_program_sends_itself_its_death(
-    tmp_path: Path, processes: str
-) -> None:
+def test_sigterm_is_interrupt_and_one_that_a_program_sends_itself_its_death(tmp_path: Path, processes: str) -> None:
     told = "pathlib.Path('new').write_text('x'); os.rename('new', 'pid')"
     words = [*command(tmp_path, told), "--processes", processes, "--duration", "3000"]
     process = Command(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

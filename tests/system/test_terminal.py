@@ -1,6 +1,5 @@
 """Terminal output for users, through the commands they type: a picture, one line for each mistake, JSON."""
 
-import errno
 import fcntl
 import json
 import os
@@ -21,7 +20,7 @@ from emulator.drivers.status import Snapshot
 from tests.support.forked_commands import VNET, Command, run
 from tests.support.paths import ROOT
 from tests.support.screen import Screen
-from tests.system.conftest import TIMEOUT_S
+from tests.system.conftest import TIMEOUT_S, read_terminal
 from tests.system.test_failures import long_run
 from vnet.errors import TransportError
 from vnet.transport import session
@@ -45,21 +44,13 @@ def at_a_terminal(
         os.close(slave)
         written = b""
         done = False
-        while part := _read(master):
+        while part := read_terminal(master, written):
             written += part
             if awaited and not done and awaited in written.decode(errors="ignore"):
                 done = True
                 then()
         os.close(master)
     return process.returncode, written.decode().replace("\r\n", "\n")
-
-
-def _read(master: int) -> bytes:
-    try:
-        return os.read(master, 65_536)
-    except OSError as error:  # nobody has the other end open any more
-        assert error.errno == errno.EIO
-        return b""
 
 
 def on_screen(written: str) -> str:

@@ -5,95 +5,54 @@ Each is the agent of the documentation, which imports no vnet, with one of its m
 """
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from docs.examples import foreign_agent
 from docs.examples.foreign_agent import Agent, EndOfRun
 
+Fields = list[Any]
+SAID: dict[str, tuple[tuple[str, ...], Callable[[Fields], Fields]]] = {
+    "OfNoNode": (("Hello",), lambda said: [said[0], "v99", *said[2:]]),
+    "SaysTextForInteger": (("Yield",), lambda said: [*said[:2], "0", *said[3:]]),
+    "ForgetsItsNonce": (("Yield", "Frames"), lambda said: [said[0], b"", *said[2:]]),
+    "CountsByItself": (("Yield",), lambda said: [*said[:2], said[2] + 1, *said[3:]]),
+    "TimerInThePast": (("Yield",), lambda said: [*said[:3], 0, *said[4:]]),
+    "StepsAfterItsWindow": (
+        ("Yield",),
+        lambda said: [*said[:6], [[time_ns + 2_000_000, traffic] for time_ns, traffic in said[6]], *said[7:]],
+    ),
+    "KnowsNoWindows": (("Hello",), lambda said: said[:8]),
+    "NeverAcknowledges": (("Frames",), lambda said: [*said[:3], 0, *said[4:]]),
+}
+"""The fields that go out in place of those of a message, by its type."""
+FORGED = {"covariance_m2": [-1.0, 0.0, 0.0, -1.0], "values": {"../../x": 1.0}}
+"""A covariance that is none, under a name that is none, beside the foreign agent's own report."""
+TRAFFIC: dict[str, Callable[[Fields, Fields, Fields], Fields]] = {
+    "SpeaksForOthers": lambda frames, *more: [[["v02", payload] for _, payload in frames], *more],
+    "SendsHundredMegabytes": lambda frames, *more: [[[node, bytes(100_000_000)] for node, _ in frames], *more],
+    "ReportsNoCovariance": lambda frames, reports, endings: [frames, [each | FORGED for each in reports], endings],
+}
+"""The traffic of yields and frames."""
+
 
 class Alters(Agent):
-    """Alters what it says: `alter` returns the fields that go out, or None for none."""
+    """Makes the mistake of this name in what it says."""
 
-    def alter(self, fields: list[Any]) -> list[Any] | None:
-        raise NotImplementedError
+    mistake: str
 
     def say(self, *fields: Any) -> None:
-        if (altered := self.alter(list(fields))) is not None:
-            super().say(*altered)
-
-
-class OfNoNode(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        return [fields[0], "v99", *fields[2:]] if fields[0] == "Hello" else fields
-
-
-class SaysTextForInteger(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:2], "0", *fields[3:]] if fields[0] == "Yield" else fields
-
-
-class ForgetsItsNonce(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        return [fields[0], b"", *fields[2:]] if fields[0] in ("Yield", "Frames") else fields
-
-
-class CountsByItself(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:2], fields[2] + 1, *fields[3:]] if fields[0] == "Yield" else fields
-
-
-class TimerInThePast(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:3], 0, *fields[4:]] if fields[0] == "Yield" else fields
-
-
-class StepsAfterItsWindow(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        if fields[0] == "Yield":
-            fields[6] = [[time_ns + 2_000_000, traffic] for time_ns, traffic in fields[6]]
-        return fields
-
-
-class KnowsNoWindows(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        return fields[:8] if fields[0] == "Hello" else fields
-
-
-class OtherTraffic(Alters):
-    """Alters the traffic of its yields and frames."""
-
-    def alter(self, fields: list[Any]) -> list[Any]:
-        if fields[0] == "Frames" and fields[5][0]:
-            fields[5] = self.traffic(*fields[5])
-        if fields[0] == "Yield":
-            fields[6] = [[time_ns, self.traffic(*traffic)] for time_ns, traffic in fields[6]]
-        return fields
-
-    def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:
-        raise NotImplementedError
-
-
-class SpeaksForOthers(OtherTraffic):
-    def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:
-        return [[["v02", payload] for _, payload in frames], reports, endings]
-
-
-class SendsHundredMegabytes(OtherTraffic):
-    def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:
-        return [[[node, bytes(100_000_000)] for node, _ in frames], reports, endings]
-
-
-class ReportsNoCovariance(OtherTraffic):
-    """Reports a covariance that is none, under a name that is none, beside the foreign agent's own report."""
-
-    def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:
-        forged = {"covariance_m2": [-1.0, 0.0, 0.0, -1.0], "values": {"../../x": 1.0}}
-        return [frames, [{**report, **forged} for report in reports], endings]
-
-
-class NeverAcknowledges(Alters):
-    def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:3], 0, *fields[4:]] if fields[0] == "Frames" else fields
+        said = list(fields)
+        if self.mistake in SAID:
+            kinds, altered = SAID[self.mistake]
+            said = altered(said) if said[0] in kinds else said
+        else:
+            altered_traffic = TRAFFIC[self.mistake]
+            if said[0] == "Frames" and said[5][0]:
+                said[5] = altered_traffic(*said[5])
+            if said[0] == "Yield":
+                said[6] = [[time_ns, altered_traffic(*traffic)] for time_ns, traffic in said[6]]
+        super().say(*said)
 
 
 class EndsWithAnError(Agent):
@@ -107,5 +66,6 @@ class EndsWithAnError(Agent):
 if __name__ == "__main__":
     mistake = sys.argv.pop(1)
     of_node = dict(each.split("=") for each in mistake.split(",") if "=" in each)
-    foreign_agent.Agent = globals()[of_node.get(sys.argv[sys.argv.index("--node") + 1], mistake)]  # type: ignore[misc]
+    Alters.mistake = of_node.get(sys.argv[sys.argv.index("--node") + 1], mistake)
+    foreign_agent.Agent = EndsWithAnError if mistake == "EndsWithAnError" else Alters  # type: ignore[misc]
     foreign_agent.main()

@@ -1,8 +1,10 @@
 """The cooperative program against attackers, copies, replays, floods, restarts and partitions."""
 
 import copy
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -101,25 +103,28 @@ class Town:
         return {reason for vehicle in self.vehicles[first:] for reason in vehicle.rejected}
 
 
-@pytest.fixture(scope="module")
-def honest() -> Town:
-    """A town of honest vehicles after ten seconds: for reading, and to be copied."""
+@cache
+def town_after(periods: int) -> Town:
+    """A town of honest vehicles after some periods: for reading, and to be copied."""
     town = Town()
-    town.run(100)
+    town.run(periods)
     return town
 
 
-@pytest.fixture(scope="module")
-def quiet() -> Town:
-    """The same after two seconds."""
+def rejected_copies(copies: Callable[[Packet], list[Packet]]) -> list[Counter[str]]:
+    """Counts of what each other vehicle has rejected, if for 20 periods these follow each frame of v3 in vain."""
     town = Town()
+    town.air = lambda _, packets: [
+        each for packet in packets for each in ([packet, *copies(packet)] if packet.sender == "v3" else [packet])
+    ]
     town.run(20)
-    return town
+    assert np.array_equal(town.estimates(), town_after(20).estimates()), "it changes nothing"
+    return [vehicle.rejected for i, vehicle in enumerate(town.vehicles) if i != 3]
 
 
-def test_among_honest_vehicles_nothing_is_rejected(honest: Town) -> None:
-    assert honest.rejected(0) == set()
-    assert honest.errors().max() < 0.7
+def test_among_honest_vehicles_nothing_is_rejected() -> None:
+    assert town_after(100).rejected(0) == set()
+    assert town_after(100).errors().max() < 0.7
 
 
 @pytest.mark.parametrize(
@@ -192,46 +197,28 @@ def test_fixes_that_are_no_numbers_are_not_used_and_not_said() -> None:
         assert subject.rbpf.vehicles == []
 
 
-def again(period: int, packets: list[Packet], how: Callable[[Packet], list[Packet]]) -> list[Packet]:
-    return [copy for packet in packets for copy in ([packet, *how(packet)] if packet.sender == "v3" else [packet])]
+def test_a_flood_is_read_once() -> None:
+    assert rejected_copies(lambda packet: [packet] * 9) == [{"duplicate": 9 * 20}] * 7
 
 
-def test_a_flood_is_read_once(quiet: Town) -> None:
-    town = Town()
-    town.air = lambda period, packets: again(period, packets, lambda packet: [packet] * 9)
-    town.run(20)
-    assert all(vehicle.rejected == {"duplicate": 9 * 20} for i, vehicle in enumerate(town.vehicles) if i != 3)
-    assert np.array_equal(town.estimates(), quiet.estimates()), "and changes nothing"
-
-
-def test_frames_of_the_past_are_old_or_stale(quiet: Town) -> None:
-    town = Town()
+def test_frames_of_the_past_are_old_or_stale() -> None:
     kept: list[Packet] = []
 
     def replay(packet: Packet) -> list[Packet]:
         kept.append(packet)
         return [kept[-3], kept[0]] if len(kept) >= 10 else []
 
-    town.air = lambda period, packets: again(period, packets, replay)
-    town.run(20)
-    assert all(
-        vehicle.rejected == {"duplicate": 11, "stale": 11} for i, vehicle in enumerate(town.vehicles) if i != 3
-    )
-    assert np.array_equal(town.estimates(), quiet.estimates())
+    assert rejected_copies(replay) == [{"duplicate": 11, "stale": 11}] * 7
 
 
-def test_ghosts_are_copies(quiet: Town) -> None:
+def test_ghosts_are_copies() -> None:
     """Be it that they send the same bytes or put their own names to them."""
-    town = Town()
 
     def ghosts(packet: Packet) -> list[Packet]:
         own = replace(decode(packet.payload), name=short_name("v3~2"))
         return [structs.replace(packet, sender="v3~1"), structs.replace(packet, sender="v3~2", payload=encode(own))]
 
-    town.air = lambda period, packets: again(period, packets, ghosts)
-    town.run(20)
-    assert all(vehicle.rejected == {"replayed": 40} for i, vehicle in enumerate(town.vehicles) if i != 3)
-    assert np.array_equal(town.estimates(), quiet.estimates())
+    assert rejected_copies(ghosts) == [{"replayed": 40}] * 7
 
 
 def test_corrupt_frames_are_no_frames() -> None:
@@ -318,8 +305,8 @@ def test_who_has_been_deceived_about_one_is_believed_about_the_others() -> None:
     assert "0000000b" in dict(table.observations(4 * PERIOD_NS, np.eye(2)))
 
 
-def test_a_restarted_vehicle_is_taken_in_at_once_and_the_mean_recovers(honest: Town) -> None:
-    town = copy.deepcopy(honest)
+def test_a_restarted_vehicle_is_taken_in_at_once_and_the_mean_recovers() -> None:
+    town = copy.deepcopy(town_after(100))
     town.vehicles[3] = town.fresh(3, incarnation=1)
     town.run(1)
     assert all(short_name("v3") in v._frames or short_name("v3") in v._share.heard for v in town.vehicles[4:])
@@ -364,13 +351,8 @@ def test_after_a_partition_heals_the_halves_agree_within_ten_seconds() -> None:
 def test_a_scenario_may_have_a_liar_and_what_is_rejected_is_reported(
     tmp_path: Path, exchange: str, reason: str
 ) -> None:
-    attacker = "agents.cooperative.attacker:main"
-    liar = {
-        "nodes": ["v01"],
-        "entry": attacker,
-        "options": {"lie": "offset", "particles": 30, "exchange": exchange},
-    }
     options = {"particles": 30, "exchange": exchange}
+    liar = {"nodes": ["v01"], "entry": "agents.cooperative.attacker:main", "options": {"lie": "offset", **options}}
     program = {"entry": "agents.cooperative:main", "options": options, "exceptions": [liar]}
     network = {"vehicles": 6, "layout": "dense"}
     scenario = Scenario.model_validate({"run": {"duration_s": 2.5}, "network": network, "program": program})

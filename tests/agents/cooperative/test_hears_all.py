@@ -21,7 +21,6 @@ from emulator.world.trips.motion import lateral_offsets_m
 from studies.measure import after, study_cell
 from vnet.errors import VnetError
 from vnet.node import Node
-from vnet.types import Array
 
 DECLARES = "agents.cooperative.declared"
 
@@ -39,11 +38,8 @@ async def say_nothing(node: Node) -> None:
 
 
 def scenario(**sections: Any) -> Scenario:
-    data: dict[str, Any] = {
-        "run": {"duration_s": 15.0, "settle_s": 0.0},
-        "network": {"vehicles": 12},
-        "program": {"entry": f"{__name__}:say_fix"},
-    }
+    run, program = {"duration_s": 15.0, "settle_s": 0.0}, {"entry": f"{__name__}:say_fix"}
+    data: dict[str, Any] = {"run": run, "network": {"vehicles": 12}, "program": program}
     return Scenario.model_validate({**data, **sections})
 
 
@@ -91,22 +87,14 @@ def test_a_cell_without_the_bound_has_no_such_figures() -> None:
 
 @pytest.mark.slow
 def test_outliers_are_told_to_the_bound(recorded: RecordedRun) -> None:
-    plain_m = settled_m(recorded)
-    fix_m = recorded.vectors("fix_m")
+    plain_m, fix_m = settled_m(recorded), recorded.vectors("fix_m")
     fix_m[40:, 3] += 50.0
-    deceived = _with(recorded, _with_fixes(recorded, fix_m))
-    assert settled_m(deceived) == pytest.approx(plain_m, rel=0.5)
-
-
-def _with(recorded: RecordedRun, states: pa.Table) -> RecordedRun:
-    tables = recorded.trace, states, recorded.metrics
-    return RecordedRun(recorded.scenario, *tables, recorded.events, world=recorded.world)
-
-
-def _with_fixes(recorded: RecordedRun, fix_m: Array) -> pa.Table:
     index = recorded.states.schema.get_field_index("fix_m")
     field = recorded.states.schema.field(index)
-    return recorded.states.set_column(index, field, pa.array(fix_m.reshape(-1, 2).tolist(), field.type))
+    states = recorded.states.set_column(index, field, pa.array(fix_m.reshape(-1, 2).tolist(), field.type))
+    tables = recorded.trace, states, recorded.metrics
+    deceived = RecordedRun(recorded.scenario, *tables, recorded.events, world=recorded.world)
+    assert settled_m(deceived) == pytest.approx(plain_m, rel=0.5)
 
 
 @pytest.mark.parametrize(

@@ -44,9 +44,9 @@ class MixedNetwork(MovingNetwork):
             (len(receivers), 2)
         )
 
-    def advance(self) -> None:
-        """Run a period, and move on."""
-        super().advance()
+    def move(self) -> None:
+        """Move on by a period."""
+        super().move()
         for row, each in zip(self._multipath_m, self._receivers, strict=True):
             keep = math.exp(-PERIOD_S / each.tau_s)
             row *= keep
@@ -69,12 +69,9 @@ class MixedNetwork(MovingNetwork):
 
 def consistency(receivers: list[Receiver], seeds: int, reach: int, periods: int = 60) -> float:
     """Return the mean of the normalized squared errors of c over some runs."""
-    found = []
+    found: list[float] = []
     for seed in range(seeds):
-        network = MixedNetwork(receivers, seed, reach)
-        for _ in range(periods):
-            network.advance()
-            found.append(network.normalized())
+        found += MixedNetwork(receivers, seed, reach).advance(periods)
     return float(np.mean(found))
 
 
@@ -108,9 +105,7 @@ receivers = st.builds(
 def test_in_any_network_errors_are_as_stated(drawn: list[Receiver], seed: int, reach: int) -> None:
     """A world is one sample: the normalized squared error of two coordinates is beyond 16 once in ten million."""
     network = MixedNetwork(drawn, seed, reach)
-    for _ in range(40):
-        network.advance()
-    assert network.normalized() < 16
+    assert network.advance(40)[-1] < 16
     for estimator in network.estimators:
         assert np.isfinite(estimator.common_error[0]).all()
         assert (np.linalg.eigvalsh(estimator.common_error[1]) > 0).all()
@@ -126,37 +121,30 @@ class BadStart(MixedNetwork):
 
 
 def test_a_first_fix_that_is_an_outlier_moves_nobody() -> None:
-    found = []
+    found: list[float] = []
     for seed in range(3):
-        network = BadStart([Receiver()] * 6, seed)
-        for _ in range(10):
-            network.advance()
-            found.append(network.normalized())
+        found += BadStart([Receiver()] * 6, seed).advance(10)
     assert np.mean(found) < 2
 
 
 @pytest.mark.parametrize("sigma_m", [0.03, 0.3])
 def test_who_hears_of_older_memories_at_second_hand_alone_is_consistent(sigma_m: float) -> None:
     """Three of a ring of six begin late at once: the middle one hears only the other two."""
-    found = []
+    found: list[float] = []
     for seed in range(3):
         network = MixedNetwork([Receiver(sigma_m)] * 6, seed, 1)
-        for _ in range(20):
-            network.advance()
+        network.advance(20)
         for k in (0, 1, 5):
             network.estimators[k] = network.new(k)
-        for period in range(30):
-            network.advance()
-            found.append(network.normalized() if period > 5 else 0.0)
-    assert np.mean(found) < 1.3
+        found += network.advance(30)[6:]
+    assert np.mean(found) < 1.6
 
 
 def root_mean_square_m(network: MixedNetwork, periods: int, liars: set[str], lie: Change) -> float:
     """Return the error of c of the others over some periods."""
-    squares = []
+    squares, network.change = [], lie
     for _ in range(periods):
-        network.change = lie
-        network.advance()
+        network.advance(1)
         honest = [e for name, e in zip(network.ids, network.estimators, strict=True) if name not in liars]
         squares += [float(np.sum((e.common_error[0] - network.common_m) ** 2)) for e in honest]
     return math.sqrt(np.mean(squares))
@@ -174,8 +162,7 @@ def test_increments_of_a_minority_that_colludes_do_not_take_over(count: int) -> 
         x, y = network.estimators[int(name[1:])].common_error[0] + np.array([0.3, 0.0])
         return replace(frame, increment=(1e3, 0.0, 1e3, 1e3 * float(x), 1e3 * float(y)))
 
-    for _ in range(30):
-        network.advance()
+    network.advance(30)
     assert root_mean_square_m(network, 30, liars, bold) < 0.8
 
 
@@ -192,8 +179,7 @@ def test_increments_of_lanes_that_claim_much_do_not_weigh_as_the_honest_do(count
         more = 30.0 / math.hypot(a, b)
         return replace(frame, increment=(more * a, more * b, kind, more * x + 30.0 * 0.3, age))
 
-    for _ in range(30):
-        network.advance()
+    network.advance(30)
     assert root_mean_square_m(network, 50, liars, bold) < most_m
 
 
@@ -206,8 +192,7 @@ def test_who_claims_ever_older_memories_does_not_stop_the_exchange(reach: int) -
             return frame
         return replace(frame, increment=(0.0, 0.0, -1.0, 0.0, float(2 * network.period)))
 
-    for _ in range(30):
-        network.advance()
+    network.advance(30)
     assert root_mean_square_m(network, 60, {"v0"}, older) < 0.45
 
 

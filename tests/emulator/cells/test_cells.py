@@ -66,11 +66,8 @@ def test_a_live_cell_whose_program_cannot_be_imported_is_refused_before_it_start
 
 
 def test_a_program_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
-    data = {
-        "run": {"name": "cell", "duration_s": 2.0, "settle_s": 0.5},
-        "network": TINY,
-        "program": {"entry": "tests.emulator.testing.programs:faulty"},
-    }
+    run, entry = {"name": "cell", "duration_s": 2.0, "settle_s": 0.5}, "tests.emulator.testing.programs:faulty"
+    data = {"run": run, "network": TINY, "program": {"entry": entry}}
     (row,) = run_cells([Cell({"seed": 1}, Scenario.model_validate(data))], tmp_path)
     assert (row["verdict"], row["failed"]) == ("invalid", "agents_alive")
     assert "SIGSEGV" in row["failure"]

@@ -86,9 +86,7 @@ def test_a_sweep_leaves_a_table_and_a_page_and_goes_on(tmp_path: Path, in_this_p
     rows = table.to_pylist()
     assert all(row["vehicles"] == row["network.vehicles"] and row["verdict"] == "valid" for row in rows)
     assert [row["packet_delivery_ratio"] == 1 for row in rows] == [True] * 4 + [False] * 4
-    assert rows[0]["neighbours"] > rows[-1]["neighbours"] / 2 and rows[0]["last.neighbours"] == 2, (
-        "what is reported"
-    )
+    assert rows[0]["neighbours"] > rows[-1]["neighbours"] / 2 and rows[0]["last.neighbours"] == 2, "as reported"
     assert set(WALL_CLOCK) <= set(table.column_names)
     assert pq.read_table(tmp_path / "sweep.parquet").equals(table)
     page = (tmp_path / "sweep.html").read_text()
@@ -186,15 +184,7 @@ def test_programs_are_compared_on_the_same_seeds(tmp_path: Path, in_this_process
             f"        node.report(east_m={share} + fix.position_m[0])\n"
         )
     files = [str(tmp_path / name) for name in ("a.py", "b.py")]
-    given = [
-        str(tmp_path / "tiny.toml"),
-        "--program",
-        ",".join(files),
-        "--seeds",
-        "2",
-        "--out",
-        str(tmp_path / "o"),
-    ]
+    given = [str(tmp_path / "tiny.toml"), "--program", ",".join(files), "--seeds=2", f"--out={tmp_path / 'o'}"]
     result = CliRunner().invoke(command_app(command), given)
     assert result.exit_code == 0, result.output
     assert "note: 2 seeds: too few for a confidence interval" in result.output
@@ -280,3 +270,18 @@ async def main(node):
     async for fix in node.gnss:
         await node.radio.broadcast(b"")
 """
+
+
+def test_rounding_of_a_constant_difference_is_no_spread() -> None:
+    rows = [
+        {"program.entry": program, "seed": seed, "gap_s": seed + more}
+        for program, more in (("a", 0.1), ("b", 0.3))
+        for seed in range(1, 6)
+    ]
+    (row,) = differences(rows, ["program.entry"], {"gap_s": "gap"})
+    assert row["gap"] == "0.2 ± 0"
+
+
+def test_small_spread_of_small_numbers_is_kept() -> None:
+    assert str(mean_of([1e-13, 2e-13, 3e-13])).endswith("e-13")
+    assert str(mean_of([1e-16, -3e-16, 2e-16], size=1.0)) == str(mean_of([0.0, 0.0, 0.0]))

@@ -1,6 +1,7 @@
 """Runs with faults are judged from their files: what a fault should do and did not, or the reverse, is found."""
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -37,17 +38,8 @@ NEEDED: dict[str, dict[str, Any]] = {
     "custom_sender": {"rule": "tests.support.rules:babbles", "name": "custom_sender"},
 }
 OF_LINKS = (
-    "partition",
-    "block",
-    "loss",
-    "burst_loss",
-    "delay",
-    "jitter",
-    "reorder",
-    "duplicate",
-    "corrupt",
-    "custom",
-)
+    "partition", "block", "loss", "burst_loss", "delay", "jitter", "reorder", "duplicate", "corrupt", "custom",
+)  # fmt: skip
 RESTARTS = ("emulator_restart", "router_restart")
 AT_S, DURATION_S = 2.0, 2.0
 
@@ -158,17 +150,8 @@ async def sends_by_the_clock(node: Node) -> None:
 @pytest.mark.slow
 def test_many_faults_at_once_are_told_apart() -> None:
     kinds: tuple[str, ...] = (
-        "partition",
-        "kill",
-        "pause",
-        "loss",
-        "burst_loss",
-        "duplicate",
-        "corrupt",
-        "delay",
-        "jitter",
-        "DoS",
-    )
+        "partition", "kill", "pause", "loss", "burst_loss", "duplicate", "corrupt", "delay", "jitter", "DoS",
+    )  # fmt: skip
     kinds += ("Sybil", "DataReplay", "StaleMessages", "swizzle", "range", "throttle", "gnss_outage", "gnss_jump")
     faults = [fault(kind, at_s=0.5 + 0.1 * place) for place, kind in enumerate(kinds)]
     recorded = simulated(*faults, radio={"loss": 0.1, "max_peers": 3, "queue_frames": 3, "delivery_tick_us": 100})
@@ -399,9 +382,7 @@ def test_a_frame_that_was_not_sent_as_often_as_it_should_be_is_found(kind: str) 
 @pytest.mark.parametrize(
     ("kind", "planned"), [("DoS", {"factor": 9}), ("Sybil", {"ghosts": 2}), ("DataReplay", {"age_s": 0.9})]
 )
-def test_a_frame_that_was_sent_more_often_or_later_than_planned_is_found(
-    kind: str, planned: dict[str, Any]
-) -> None:
+def test_frame_that_was_sent_more_often_or_later_than_planned_is_found(kind: str, planned: dict[str, Any]) -> None:
     scenario = with_fault(kind).scenario
     assert {key: getattr(scenario.fault[0], key) for key in planned} != planned
     other = scenario.model_copy(update={"fault": (scenario.fault[0].model_copy(update=planned),)})
@@ -550,106 +531,81 @@ def test_a_short_silence_and_a_death_are_no_lack_of_liveness() -> None:
     assert verdict(without_reports(dead, "v03", 4.5), "liveness") is Verdict.VALID
 
 
-async def about_once_a_second(node: Node) -> None:
-    """Report every 0.9 to 1.1 s; one vehicle is silent for the last three seconds."""
-    number = int(node.id[1:])
+def number_of(node: Node) -> int:
+    return int(node.id[1:])
+
+
+REPORTS: dict[str, Callable[[Node, int], bool]] = {
+    "every 0.9 to 1.1 s, v03 not in the last three seconds": lambda node, period: (
+        (period + number_of(node)) % 30 in (0, 9, 20) and (node.id != "v03" or period < 30)
+    ),
+    "a second after it comes up": lambda node, period: not node.incarnation or period >= 40,
+    "four times, then every three seconds": lambda node, period: period < 4 or period % 30 == 0,
+    "from 0.5 s on, v01 never": lambda node, period: node.id != "v01" and period >= 5,
+    "v02 from 1.2 s on, and never after a restart": lambda node, period: (
+        node.id != "v02" or (period >= 12 and not node.incarnation)
+    ),
+    "from the third second on": lambda node, period: period >= 30,
+}
+"""At which of its fixes a vehicle reports, by its period of 0.1 s."""
+
+
+async def reports(node: Node) -> None:
+    """Report at some fixes; one vehicle whose program starts late ends right after a report."""
+    when = str(node.options["when"])
     async for fix in node.gnss:
         period = round(fix.time_ns / 1e8)
-        if (period + number) % 30 in (0, 9, 20) and (node.id != "v03" or period < 30):
+        if REPORTS[when](node, period):
             node.report(fix.position_m, fix.covariance_m2)
+        if when == "from the third second on" and node.id == "v03" and period >= 40:
+            return
+
+
+def reporting(when: str, *faults: dict[str, Any]) -> RecordedRun:
+    return simulated(*faults, program=f"{__name__}:reports", options={"when": when})
+
+
+def of(kind: str, at_s: float, duration_s: float, node: str = "v01") -> dict[str, Any]:
+    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, "nodes": [node]}
+
+
+LATE = of("gnss_outage", 0.0, 3.0, "v02")
+
+
+@pytest.mark.parametrize(
+    ("when", "faults", "expected"),
+    [
+        ("a second after it comes up", [of("kill", 2.0, 1.0)], Verdict.VALID),
+        # A program that nearly stops is not its own measure.
+        ("four times, then every three seconds", [], Verdict.INVALID),
+        # One that never reports, as the leader of a platoon, is expected to if a fault left it no time.
+        ("from 0.5 s on, v01 never", [of("kill", 2.0, 1.0)], Verdict.VALID),
+        ("from 0.5 s on, v01 never", [of("pause", 2.0, 1.0)], Verdict.VALID),
+        ("from 0.5 s on, v01 never", [of("gnss_outage", 2.0, 1.0)], Verdict.VALID),
+        ("from 0.5 s on, v01 never", [of("gnss_freeze", 0.0, 1.0)], Verdict.VALID),
+        ("from 0.5 s on, v01 never", [of("pause", 1.0, 1.0)], Verdict.UNKNOWN),
+        ("from 0.5 s on, v01 never", [of("kill", 0.0, 1.0)], Verdict.UNKNOWN),
+        # What a fault kept from reporting is no measure of the time that others take.
+        ("from 0.5 s on, v01 never", [LATE, of("kill", 2.0, 1.0)], Verdict.VALID),
+        # One that had reported once before a fault is expected to again.
+        ("v02 from 1.2 s on, and never after a restart", [of("kill", 1.25, 0.5, "v02")], Verdict.INVALID),
+    ],
+)
+def test_a_silence_is_judged_by_when_its_vehicle_could_report(
+    when: str, faults: list[dict[str, Any]], expected: Verdict
+) -> None:
+    assert verdict(reporting(when, *faults), "liveness") is expected
 
 
 def test_a_program_that_reports_about_once_a_second_is_alive_until_it_falls_silent() -> None:
-    recorded = simulated(program=f"{__name__}:about_once_a_second")
+    recorded = reporting("every 0.9 to 1.1 s, v03 not in the last three seconds")
     found = checked(recorded, "liveness")
     assert found.verdict is Verdict.INVALID and [row["node"] for row in found.figures["rows"]] == ["v03"]
     assert found.text.endswith("silent for over 2.0 s, v03 from period 28")
 
 
-async def listens_first_when_it_comes_back(node: Node) -> None:
-    """Report with each fix, and a second after it has come up again."""
-    if node.incarnation:
-        await asyncio.sleep(1.0)
-    async for fix in node.gnss:
-        node.report(fix.position_m, fix.covariance_m2)
-
-
-def test_one_that_reports_a_second_after_it_has_come_up_is_alive() -> None:
-    fault = {"kind": "kill", "at_s": 2.0, "duration_s": 1.0, "nodes": ["v01"]}
-    recorded = simulated(fault, program=f"{__name__}:listens_first_when_it_comes_back")
-    assert verdict(recorded, "liveness") is Verdict.VALID
-
-
-async def nearly_stops(node: Node) -> None:
-    """Report in the first four periods, and every three seconds after them."""
-    async for fix in node.gnss:
-        period = round(fix.time_ns / 1e8)
-        if period < 4 or period % 30 == 0:
-            node.report(fix.position_m, fix.covariance_m2)
-
-
-def test_a_program_that_nearly_stops_is_not_its_own_measure() -> None:
-    assert verdict(simulated(program=f"{__name__}:nearly_stops"), "liveness") is Verdict.INVALID
-
-
-async def first_is_silent(node: Node) -> None:
-    """Report with each fix from 0.5 s on, but for the first vehicle, which never does."""
-    async for fix in node.gnss:
-        if node.id != "v01" and fix.time_ns >= 500_000_000:
-            node.report(fix.position_m, fix.covariance_m2)
-
-
-@pytest.mark.parametrize(
-    ("kind", "at_s", "expected"),
-    [
-        ("kill", 2.0, Verdict.VALID),
-        ("pause", 2.0, Verdict.VALID),
-        ("gnss_outage", 2.0, Verdict.VALID),
-        ("gnss_freeze", 0.0, Verdict.VALID),
-        ("pause", 1.0, Verdict.UNKNOWN),
-        ("kill", 0.0, Verdict.UNKNOWN),
-    ],
-)
-def test_one_that_never_reports_is_expected_to_only_if_a_fault_left_it_no_time(
-    kind: str, at_s: float, expected: Verdict
-) -> None:
-    """As the leader of a platoon, which has no gap to report; others began after 0.5 s."""
-    fault = {"kind": kind, "at_s": at_s, "duration_s": 1.0, "nodes": ["v01"]}
-    recorded = simulated(fault, program=f"{__name__}:first_is_silent")
-    assert verdict(recorded, "liveness") is expected
-
-
-async def second_begins_late_and_never_again(node: Node) -> None:
-    """Report with each fix; the second vehicle from 1.2 s on, and never after a restart."""
-    async for fix in node.gnss:
-        if node.id != "v02" or (fix.time_ns >= 1_200_000_000 and not node.incarnation):
-            node.report(fix.position_m, fix.covariance_m2)
-
-
-def test_one_that_had_reported_once_before_a_fault_is_expected_to_again() -> None:
-    fault = {"kind": "kill", "at_s": 1.25, "duration_s": 0.5, "nodes": ["v02"]}
-    recorded = simulated(fault, program=f"{__name__}:second_begins_late_and_never_again")
-    assert verdict(recorded, "liveness") is Verdict.INVALID
-
-
-def test_what_a_fault_kept_from_reporting_is_no_measure_of_the_time_that_others_take() -> None:
-    late = {"kind": "gnss_outage", "at_s": 0.0, "duration_s": 3.0, "nodes": ["v02"]}
-    killed = {"kind": "kill", "at_s": 2.0, "duration_s": 1.0, "nodes": ["v01"]}
-    recorded = simulated(late, killed, program=f"{__name__}:first_is_silent")
-    assert verdict(recorded, "liveness") is Verdict.VALID
-
-
-async def starts_late_and_ends(node: Node) -> None:
-    """Report from the third second on; one vehicle ends right after a report."""
-    async for fix in node.gnss:
-        if fix.time_ns >= 3_000_000_000:
-            node.report(fix.position_m, fix.covariance_m2)
-        if node.id == "v03" and fix.time_ns >= 4_000_000_000:
-            return
-
-
 def test_a_program_may_start_late_and_end_with_a_report() -> None:
-    recorded = simulated(program=f"{__name__}:starts_late_and_ends")
+    recorded = reporting("from the third second on")
     assert verdict(recorded, "liveness") is verdict(recorded, "down_respected") is Verdict.VALID
 
 

@@ -20,6 +20,8 @@ from tests.support.folder_edits import EDITS, Edit, forge, listing, table
 from tests.support.paths import ROOT
 from tests.support.recorded import recorded
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = {
     "run": {"duration_s": 4.0, "settle_s": 1.0},
     "network": {"vehicles": 8, "layout": "dense"},
@@ -49,30 +51,20 @@ def broken(judgement: Judgement) -> set[str]:
     return {check.name for check in judgement.checks if check.verdict is Verdict.INVALID}
 
 
-@pytest.mark.slow
 def test_a_run_as_it_was_written_is_valid_and_every_check_of_its_folder_judged_it(run: Path) -> None:
     judgement = check_run(run)
     assert judgement.verdict is Verdict.VALID
     names = {check.name for check in judgement.checks}
     assert {
-        "files",
-        "truth",
-        "metrics",
-        "outcomes",
-        "verdict_file",
-        "fault_events",
-        "row_order",
-        "reports",
+        *["files", "truth", "metrics", "outcomes", "verdict_file", "fault_events", "row_order", "reports"]
     } <= names
 
 
-@pytest.mark.slow
 def test_forging_nothing_changes_nothing(copy: Path) -> None:
     forge(copy)
     assert check_run(copy).verdict is Verdict.VALID
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("edit", EDITS, ids=[edit.what for edit in EDITS])
 def test_an_edit_is_found_as_an_accident_and_as_a_forgery(copy: Path, edit: Edit) -> None:
     edit.apply(copy)
@@ -106,7 +98,16 @@ def reverse_events(folder: Path) -> None:
     path.write_text("".join(reversed(path.read_text().splitlines(keepends=True))))
 
 
-@pytest.mark.slow
+def happens(**event: object) -> Callable[[Path], None]:
+    """Return what adds an event."""
+
+    def apply(folder: Path) -> None:
+        with (folder / "events.jsonl").open("a") as file:
+            file.write(json.dumps(event) + "\n")
+
+    return apply
+
+
 @pytest.mark.parametrize(
     ("edit", "name"),
     [
@@ -114,8 +115,21 @@ def reverse_events(folder: Path) -> None:
         (says("reproduce", "vnet run --agent 'a b'; rm -rf ~ x"), "verdict_file"),
         (says("order", {"kind": "pct", "seed": 1, "deviations": 2, "left": None}), "verdict_file"),
         (reverse_events, "row_order"),
+        (happens(kind="collapsed", node="v01", time_ns=1), "row_order"),
+        (happens(kind="log", node="v99", time_ns=1, level="info", text="here"), "row_order"),
+        (happens(kind="note", node=None, time_ns=-5), "row_order"),
+        (happens(kind="note", node=None, time_ns=10**30), "row_order"),
     ],
-    ids=["another command", "one more command", "another order", "events reversed"],
+    ids=[
+        "another command",
+        "one more command",
+        "another order",
+        "events reversed",
+        "kind",
+        "node",
+        "before",
+        "after",
+    ],
 )
 def test_further_forgeries_are_found(copy: Path, edit: Callable[[Path], None], name: str) -> None:
     edit(copy)
@@ -123,7 +137,6 @@ def test_further_forgeries_are_found(copy: Path, edit: Callable[[Path], None], n
     assert name in broken(check_run(copy))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["agent", "python my_agent.py {node}", "sh -c './agent $0' {node}"])
 def test_a_command_with_agents_of_the_users_own_is_no_forgery(copy: Path, agent: str) -> None:
     command = f"vnet run --agent {shlex.quote(agent)} {shlex.quote(str(copy / 'scenario.toml'))}"
@@ -144,7 +157,6 @@ def of_format(number: int) -> Callable[[Path], None]:
     return apply
 
 
-@pytest.mark.slow
 def test_a_folder_whose_manifest_is_gone_is_invalid_and_an_earlier_one_needs_none(copy: Path) -> None:
     without_manifest(copy)
     assert broken(check_run(copy)) == {"files"}
@@ -154,7 +166,6 @@ def test_a_folder_whose_manifest_is_gone_is_invalid_and_an_earlier_one_needs_non
     assert "files" in {left.name for left in judgement.not_exercised}
 
 
-@pytest.mark.slow
 def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_is_wrong(copy: Path) -> None:
     next(edit for edit in EDITS if edit.found_by == "truth").apply(copy)
     forge(copy)
@@ -164,7 +175,6 @@ def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_
     assert (broken(judgement), judgement.verdict) == (set(), Verdict.UNKNOWN)
 
 
-@pytest.mark.slow
 def test_a_log_is_of_the_manifest_whatever_its_vehicle_is_called(copy: Path) -> None:
     (copy / "logs" / PROGRAMS_LOG).write_text("what programs printed\n")
     (copy / "logs" / "programs.log").write_text("of a vehicle\n")
@@ -174,7 +184,6 @@ def test_a_log_is_of_the_manifest_whatever_its_vehicle_is_called(copy: Path) -> 
     assert broken(check_run(copy)) == {"files"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "nothing.parquet"])
 def test_a_manifest_names_files_of_the_folder_alone(copy: Path, name: str) -> None:
     path = copy / "manifest.json"
@@ -184,19 +193,16 @@ def test_a_manifest_names_files_of_the_folder_alone(copy: Path, name: str) -> No
     assert [row["file"] for row in found.figures["rows"]] == [name]
 
 
-@pytest.mark.slow
 def test_a_run_whose_world_comes_from_a_file_says_why_it_is_not_computed_again(tmp_path: Path) -> None:
     (tmp_path / "network.csv").write_text("id,x_m,y_m,heading_rad\na,0,0,0\nb,100,0,0\n")
     network = {"kind": "file", "path": tmp_path / "network.csv"}
     folder = simulated(tmp_path / "run", network=network, fault=[], program={"entry": "agents.beacon:main"})
     judgement = check_run(folder)
     assert judgement.verdict is Verdict.VALID
-    assert {left.name: left.reason for left in judgement.not_exercised}["truth"].startswith(
-        "the world comes from files"
-    )
+    (reason,) = [left.reason for left in judgement.not_exercised if left.name == "truth"]
+    assert reason.startswith("the world comes from files")
 
 
-@pytest.mark.slow
 def test_a_busy_ratio_is_computed_again(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "log_distance"}, "mac": {}, "bitrate_mbps": 6.0}
     folder = simulated(tmp_path / "run", radio=radio, fault=[], program={"entry": "agents.beacon:main"})
@@ -206,22 +212,20 @@ def test_a_busy_ratio_is_computed_again(tmp_path: Path) -> None:
     assert "outcomes" in broken(check_run(folder))
 
 
-@pytest.mark.slow
 def test_files_that_vnet_adds_to_a_finished_run_are_no_edit(copy: Path) -> None:
     (copy / "report.html").write_text("a report")
     (copy / "recording.rrd").write_text("a recording")
     assert check_run(copy).verdict is Verdict.VALID
 
 
-@pytest.mark.slow
-def test_a_file_that_the_manifest_lacks_is_told(copy: Path) -> None:
-    shutil.copy(copy / "states.parquet", copy / "busy.parquet")
+@pytest.mark.parametrize("name", ["busy.parquet", "logs/v77.log"])
+def test_a_file_that_the_manifest_lacks_is_told(copy: Path, name: str) -> None:
+    shutil.copy(copy / "states.parquet", copy / name)
     assert broken(check_run(copy)) == {"files"}
     write_manifest(RunFolder(copy))
     assert check_run(copy).verdict is Verdict.VALID
 
 
-@pytest.mark.slow
 def test_payloads_are_those_of_the_trace(tmp_path: Path) -> None:
     run = {"duration_s": 1.0, "keep_payloads": True}
     folder = simulated(tmp_path / "run", run=run, fault=[], program={"entry": "agents.beacon:main"})
@@ -238,30 +242,6 @@ def test_payloads_are_those_of_the_trace(tmp_path: Path) -> None:
     assert "payloads" in broken(check_run(folder))
 
 
-EVENTS = [
-    {"kind": "collapsed", "node": "v01", "time_ns": 1},
-    {"kind": "log", "node": "v99", "time_ns": 1, "level": "info", "text": "here"},
-    {"kind": "note", "node": None, "time_ns": -5},
-    {"kind": "note", "node": None, "time_ns": 10**30},
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("event", EVENTS, ids=["kind", "node", "before", "after"])
-def test_an_event_that_cannot_be_is_told(copy: Path, event: dict[str, object]) -> None:
-    with (copy / "events.jsonl").open("a") as file:
-        file.write(json.dumps(event) + "\n")
-    forge(copy)
-    assert "row_order" in broken(check_run(copy))
-
-
-@pytest.mark.slow
-def test_a_log_that_the_manifest_lacks_is_told(copy: Path) -> None:
-    (copy / "logs" / "v77.log").write_text("made up\n")
-    assert broken(check_run(copy)) == {"files"}
-
-
-@pytest.mark.slow
 def test_no_verdict_of_the_file_itself_excuses_its_files(copy: Path) -> None:
     verdict = json.loads((copy / "verdict.json").read_text())
     left = {"name": "files", "verdict": "valid", "text": "all kept", "figures": {"unkept": ["x"]}}
@@ -273,7 +253,6 @@ def test_no_verdict_of_the_file_itself_excuses_its_files(copy: Path) -> None:
     assert files.verdict is Verdict.UNKNOWN
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("speed_m_s", [40.0, -40.0])
 def test_a_folder_is_valid_where_vehicles_meet_or_part_in_a_period_that_the_run_does_not_complete(
     tmp_path: Path, speed_m_s: float

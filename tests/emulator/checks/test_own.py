@@ -2,7 +2,8 @@
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -66,7 +67,7 @@ def verdict(run):
 async def waiting(run):
     pass
 
-number = 5
+
 
 def elsewhere(run):
     import os
@@ -84,6 +85,9 @@ def clearing(run):
 SCENARIO = (
     '[run]\nname = "own"\nduration_s = 0.5\nsettle_s = 0.0\n[network]\nvehicles = 3\n[radio]\nrange_m = 1e5\n'
 )
+
+
+Give = Callable[..., dict[str, CheckResult | NotExercised]]
 
 
 @pytest.fixture
@@ -125,10 +129,15 @@ def findings(recorded: RecordedRun, *functions: str) -> dict[str, CheckResult | 
 
 
 @pytest.fixture
-def module(here: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The module `own_checks`, to be given functions."""
-    monkeypatch.syspath_prepend(str(here))
-    return import_module("own_checks")
+def give(here: Path, recorded: RecordedRun, monkeypatch: pytest.MonkeyPatch) -> Give:
+    """Judge by functions of `own_checks`, of which `given` is this one."""
+
+    def judged(given: Callable[[emulator.Run], object], *functions: str) -> dict[str, CheckResult | NotExercised]:
+        monkeypatch.syspath_prepend(str(here))
+        monkeypatch.setattr(import_module("own_checks"), "given", given, raising=False)
+        return findings(recorded, *functions or ("given",))
+
+    return judged
 
 
 def test_results_stand_in_the_verdict_of_a_run(here: Path) -> None:
@@ -208,29 +217,21 @@ def test_what_goes_wrong_is_unknown(recorded: RecordedRun, function: str, name: 
 
 
 @answers("check")
-def test_nonsense_is_unknown_and_says_what_is_allowed(
-    recorded: RecordedRun, module: Any, kind: str, answer: str, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "given", lambda run: eval(answer, {"np": np}), raising=False)
-    found = findings(recorded, "given")["own:own_checks.given"]
+def test_nonsense_is_unknown_and_says_what_is_allowed(give: Give, kind: str, answer: str, said: str) -> None:
+    found = give(lambda run: eval(answer, {"np": np}))["own:own_checks.given"]
     assert isinstance(found, CheckResult)
     assert (found.verdict, found.text[: len(said)]) == (Verdict.UNKNOWN, said)
 
 
-def test_a_result_that_is_nonsense_hides_no_other(
-    recorded: RecordedRun, module: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_result_that_is_nonsense_hides_no_other(give: Give) -> None:
     answer = [("a", "valid", "", {"x": float("nan")}), ("b", "invalid", "too late")]
-    monkeypatch.setattr(module, "given", lambda run: answer, raising=False)
-    found = findings(recorded, "given")
+    found = give(lambda run: answer)
     verdicts = {name: finding.verdict for name, finding in found.items() if isinstance(finding, CheckResult)}
     assert verdicts["own:b"] is Verdict.INVALID
     assert verdicts["own:own_checks.given"] is Verdict.UNKNOWN
 
 
-def test_figures_of_numpy_are_plain_numbers(
-    recorded: RecordedRun, module: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_figures_of_numpy_are_plain_numbers(give: Give) -> None:
     figures = {
         "n": np.int64(3),
         "share": np.float32(0.5),
@@ -239,40 +240,25 @@ def test_figures_of_numpy_are_plain_numbers(
         "t": None,
     }
     answer = [("a", Verdict.VALID, "line\nline", figures)]
-    monkeypatch.setattr(module, "given", lambda run: answer, raising=False)
-    found = findings(recorded, "given")["own:a"]
     expected = {"n": 3, "share": 0.5, "all": [1.0, 2.0], "is": True, "t": None}
-    assert found == CheckResult("own:a", Verdict.VALID, "line\\nline", expected)
+    assert give(lambda run: answer)["own:a"] == CheckResult("own:a", Verdict.VALID, "line\\nline", expected)
     json.dumps(expected)
 
 
-def test_ctrl_c_ends_the_checks_and_keeps_what_is_there(
-    recorded: RecordedRun, module: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_ends_the_checks_and_keeps_what_is_there(give: Give) -> None:
     def interrupted(run: emulator.Run) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "number", interrupted)
-    found = findings(recorded, "single", "number", "sound")
+    found = give(interrupted, "single", "given", "sound")
     texts = {name: finding.text for name, finding in found.items() if isinstance(finding, CheckResult)}
-    assert texts == {
-        "own:one": "nobody knows",
-        "own:own_checks.number": "interrupted",
-        "own:own_checks.sound": "interrupted",
-    }
+    cut_short = dict.fromkeys(["own:own_checks.given", "own:own_checks.sound"], "interrupted")
+    assert texts == {"own:one": "nobody knows"} | cut_short
 
 
 def test_where_the_machine_did_not_keep_up_a_failed_own_check_is_unknown(recorded: RecordedRun) -> None:
     own = [CheckResult("own:near", Verdict.INVALID, "too near")]
     assert judge(recorded, own).verdict is Verdict.INVALID
-    gap = RecordedRun(
-        recorded.scenario,
-        recorded.trace,
-        recorded.states,
-        recorded.metrics,
-        [*recorded.events, Event(0, "transport_gap", "v01", {"count": 1})],
-        world=recorded.world,
-    )
+    gap = replace(recorded, events=[*recorded.events, Event(0, "transport_gap", "v01", {"count": 1})])
     (found,) = [check for check in judge(gap, own).checks if check.name == "own:near"]
     assert (found.verdict, found.text) == (Verdict.UNKNOWN, "too near; but the machine did not keep up")
 

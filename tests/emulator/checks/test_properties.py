@@ -41,9 +41,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         "run": {"duration_s": 2.0, "settle_s": 0.0},
         "network": {"vehicles": 4},
         "radio": {"range_m": 1e6},
-        "program": {"entry": "tests.emulator.checks.test_properties:brakes"},
+        "program": {"entry": f"{__name__}:brakes"},
     }
     return Run.open(recorded(scenario, tmp_path_factory.mktemp("run") / "run"))
+
+
+BRAKES = "tests.emulator.checks.test_properties:brakes"
+SHORT = {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}}
 
 
 def braked(moment: Moment) -> bool:
@@ -160,8 +164,9 @@ def fault_scenario() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    program = "tests.emulator.checks.test_properties:counts_the_dead"
-    return simulate(fault_scenario(), program=program, out=tmp_path_factory.mktemp("run") / "run")
+    return simulate(
+        fault_scenario(), program=f"{__name__}:counts_the_dead", out=tmp_path_factory.mktemp("run") / "run"
+    )
 
 
 def kill(moment: Moment) -> bool:
@@ -174,11 +179,8 @@ def dead(moment: Moment, cause: Moment) -> bool:
 
 @pytest.mark.slow
 def test_a_fault_is_an_event_of_each_of_its_nodes(faulty: Run) -> None:
-    told = [
-        (m.time_s, m.node, m.event, m["kind"], m["fault"])
-        for m in moments(faulty, "event")
-        if m.event in ("fault_started", "fault_ended")
-    ]
+    of_faults = [m for m in moments(faulty, "event") if m.event in ("fault_started", "fault_ended")]
+    told = [(m.time_s, m.node, m.event, m["kind"], m["fault"]) for m in of_faults]
     loss = [(0.3, "fault_started", "loss", "loss-1"), (0.4, "fault_ended", "loss", "loss-1")]
     on_v02 = [(0.5, "v02", "fault_started", "kill", "kill-0"), (1.5, "v02", "fault_ended", "kill", "kill-0")]
     assert told == [(t, node, *rest) for t, *rest in loss for node in ("v01", "v02", "v03")] + on_v02
@@ -208,9 +210,7 @@ def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty:
 
 @pytest.mark.slow
 def test_a_test_promises_what_follows_a_fault_that_it_injects(tmp_path: Path) -> None:
-    scenario = make_scenario(
-        fault_scenario() | {"fault": []}, {"program": "tests.emulator.checks.test_properties:counts_the_dead"}
-    )
+    scenario = make_scenario(fault_scenario() | {"fault": []}, {"program": f"{__name__}:counts_the_dead"})
 
     async def story() -> None:
         async with RunHarness(scenario, tmp_path / "run") as emu:
@@ -241,22 +241,14 @@ def test_the_result_is_one_of_a_check_of_ones_own(tmp_path: Path, monkeypatch: p
         "from emulator.checks.properties import always\n\n\n"
         "def check(run):\n    yield always(run, 'small', lambda m: m['count'] < 0.5)\n"
     )
-    judged = simulate(
-        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
-        program="tests.emulator.checks.test_properties:brakes",
-        checks=[str(checks) + ":check"],
-        out=tmp_path / "run",
-    )
+    judged = simulate(SHORT, program=BRAKES, checks=[f"{checks}:check"], out=tmp_path / "run")
     (check,) = [check for check in judged.checks if check.name == "own:small"]
     assert judged.verdict == "invalid" and check.text.startswith("is false: first of v01 at 0.5 s")
 
 
 @pytest.mark.slow
 def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
-    scenario = make_scenario(
-        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
-        {"program": "tests.emulator.checks.test_properties:brakes"},
-    )
+    scenario = make_scenario(SHORT, {"program": BRAKES})
 
     def counts(moment: Moment) -> bool:
         return bool(moment["count"] >= 0)
@@ -302,10 +294,7 @@ def test_a_promise_with_the_name_of_a_check_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: Path) -> None:
-    scenario = make_scenario(
-        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
-        {"program": "tests.emulator.checks.test_properties:brakes"},
-    )
+    scenario = make_scenario(SHORT, {"program": BRAKES})
 
     async def story(folder: str, promise: Callable[[RunHarness], None]) -> None:
         async with RunHarness(scenario, tmp_path / folder) as emu:
@@ -333,10 +322,7 @@ def test_events_of_a_run_and_moments_of_a_property_are_named_alike() -> None:
     own = Event(5, "event", "v01", {"name": "warned", "details": {"number": 3}})
     vnets = Event(6, "crashed", "v01", {"error": "tired"})
     foreign = Event(7, "event", "v01", {"details": 3})
-    assert [(each.name, each.values) for each in (own, vnets, foreign)] == [
-        ("warned", {"number": 3}),
-        ("crashed", {"error": "tired"}),
-        ("", {}),
-    ]
+    found = [(each.name, each.values) for each in (own, vnets, foreign)]
+    assert found == [("warned", {"number": 3}), ("crashed", {"error": "tired"}), ("", {})]
     run = cast(Run, SimpleNamespace(events=[own, vnets, foreign], scenario=SimpleNamespace(fault=[])))
     assert [(m.name, m.values) for m in moments(run, "event")] == [(e.name, e.values) for e in run.events]

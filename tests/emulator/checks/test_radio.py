@@ -77,6 +77,15 @@ def became(columns: dict[str, Any], row: int, outcome: str) -> None:
     columns["outcome"][row], columns["arrival_ns"][row] = outcome, None
 
 
+def arrives(row: int) -> Change:
+    """Return the change by which one that does not arrive does."""
+
+    def change(columns: dict[str, Any], _: np.ndarray) -> None:
+        columns["outcome"][row], columns["arrival_ns"][row] = "delivered", columns["left_ns"][row] + 2_500_000
+
+    return change
+
+
 def test_what_really_happened_is_valid(shared: RecordedRun, faded: RecordedRun) -> None:
     for recorded in (shared, faded):
         judgement = judge(recorded)
@@ -86,8 +95,7 @@ def test_what_really_happened_is_valid(shared: RecordedRun, faded: RecordedRun) 
 
 
 def test_on_a_disc_neither_is_exercised(tmp_path: Path) -> None:
-    scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "program": {"entry": "agents.beacon:main"}})
-    emulation = prepared(scenario, tmp_path / "run")
+    emulation = prepared({"run": {"duration_s": 1.0}, "program": {"entry": "agents.beacon:main"}}, tmp_path / "run")
     simulate(emulation)
     judgement, _ = conclude(emulation, 1.0, "simulate")
     left = {check.name: check.reason for check in judgement.not_exercised}
@@ -112,12 +120,7 @@ def test_a_run_in_which_nobody_speaks_is_unknown_and_not_valid(shared: RecordedR
 
 def test_without_fading_one_frame_beyond_the_threshold_is_one_too_many(shared: RecordedRun) -> None:
     hopeless = np.flatnonzero(shared.outcome_is("faded"))[0]
-
-    def arrives(columns: dict[str, Any], _: np.ndarray) -> None:
-        columns["outcome"][hopeless] = "delivered"
-        columns["arrival_ns"][hopeless] = columns["left_ns"][hopeless] + 2_500_000
-
-    broken = checked(changed(shared, arrives), "fading")
+    broken = checked(changed(shared, arrives(int(hopeless))), "fading")
     assert broken.verdict is Verdict.INVALID
     assert broken.figures["impossible"] == 1
     assert broken.figures["rows"][0]["outcome"] == "delivered"
@@ -126,27 +129,20 @@ def test_without_fading_one_frame_beyond_the_threshold_is_one_too_many(shared: R
 
 
 def test_with_fading_any_pair_may_do_anything_once(faded: RecordedRun) -> None:
-    weakest = np.flatnonzero(faded.outcome_is("faded"))[0]
-
-    def arrives(columns: dict[str, Any], _: np.ndarray) -> None:
-        columns["outcome"][weakest] = "delivered"
-        columns["arrival_ns"][weakest] = columns["left_ns"][weakest] + 2_500_000
-
-    assert verdict(changed(faded, arrives), "fading") is Verdict.VALID
+    weakest = int(np.flatnonzero(faded.outcome_is("faded"))[0])
+    assert verdict(changed(faded, arrives(weakest)), "fading") is Verdict.VALID
 
 
-def test_too_much_and_too_little_fading_is_seen_where_no_link_alone_tells(
-    faded: RecordedRun,
-) -> None:
+def test_too_much_and_too_little_fading_is_seen_where_no_link_alone_tells(faded: RecordedRun) -> None:
     few = replace(faded, trace=faded.trace.slice(0, faded.trace.num_rows // 4))
 
     def fade(columns: dict[str, Any], arrived: np.ndarray) -> None:
         for row in arrived[::4].tolist():
             became(columns, row, "faded")
 
-    def arrive(columns: dict[str, Any], _: np.ndarray) -> None:
+    def arrive(columns: dict[str, Any], arrived: np.ndarray) -> None:
         for row in np.flatnonzero(few.outcome_is("faded")).tolist():
-            columns["outcome"][row], columns["arrival_ns"][row] = "delivered", columns["left_ns"][row] + 2_500_000
+            arrives(row)(columns, arrived)
 
     for change in (fade, arrive):
         found = checked(changed(few, change), "fading")
@@ -182,12 +178,7 @@ def test_nobody_hears_while_it_sends(shared: RecordedRun) -> None:
         for row in np.flatnonzero(shared.outcome_is("collided")).tolist()
         if ((shared.sender == shared.receiver[row]) & (began < left[row]) & (left > began[row])).any()
     )
-
-    def hears(columns: dict[str, Any], _: np.ndarray) -> None:
-        columns["outcome"][deaf] = "delivered"
-        columns["arrival_ns"][deaf] = columns["left_ns"][deaf] + 2_500_000
-
-    assert checked(changed(shared, hears), "medium").figures["heard_while_sending"] == 1
+    assert checked(changed(shared, arrives(deaf)), "medium").figures["heard_while_sending"] == 1
 
 
 def moved(recorded: RecordedRun, row: int, by_ns: int) -> RecordedRun:
@@ -355,9 +346,7 @@ def test_what_a_fault_keeps_from_a_receiver_is_still_on_air(tmp_path: Path) -> N
     plain, blocked = run(tmp_path / "a", mac={}), run(tmp_path / "b", [block], mac={})
     assert np.array_equal(plain.on_air_ns, blocked.on_air_ns)
     others = (plain.sender != 0) & (plain.sent_ns < 2_500_000_000)
-    assert (
-        plain.trace["outcome"].to_numpy()[others].tolist() == blocked.trace["outcome"].to_numpy()[others].tolist()
-    )
+    assert (plain.trace["outcome"].to_numpy()[others] == blocked.trace["outcome"].to_numpy()[others]).all()
     mine = (blocked.sender == 0) & (blocked.sent_ns < 2_500_000_000)
     assert set(blocked.trace["outcome"].to_numpy()[mine]) == {"fault"}
 

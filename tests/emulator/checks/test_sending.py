@@ -39,11 +39,8 @@ async def mixes(node: Node) -> None:
 
 
 def run_of(folder: Path, **sections: Any) -> RecordedRun:
-    scenario = {
-        "run": {"duration_s": 1.2, "settle_s": 0.0},
-        "network": {"vehicles": 8, "layout": "dense"},
-        **sections,
-    }
+    run = {"duration_s": 1.2, "settle_s": 0.0}
+    scenario = {"run": run, "network": {"vehicles": 8, "layout": "dense"}, **sections}
     result = emulator.simulate(scenario, program=mixes, out=folder)
     found = {check.name: check.verdict for check in result.checks}
     assert not [name for name, verdict in found.items() if verdict == "invalid"], found
@@ -123,14 +120,11 @@ def test_a_broken_exchange_is_found(tmp_path: Path) -> None:
     ):
         forged = [{**each, **change} if each is row else each for each in rows]
         table = pa.Table.from_pylist(forged, schema=recorded.trace.schema)
-        assert badly_acknowledged(with_trace(recorded, table)) >= 1, change
+        changed = RecordedRun(recorded.scenario, table, recorded.states, recorded.metrics, recorded.events)
+        assert badly_acknowledged(changed) >= 1, change
 
 
 def badly_acknowledged(recorded: RecordedRun) -> int:
     found = check_medium(recorded)
     assert isinstance(found, CheckResult)
     return int(found.figures["badly_acknowledged"])
-
-
-def with_trace(of: RecordedRun, trace: pa.Table) -> RecordedRun:
-    return RecordedRun(of.scenario, trace, of.states, of.metrics, of.events)

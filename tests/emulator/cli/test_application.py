@@ -21,17 +21,8 @@ from tests.support.paths import ROOT
 
 ALL = {context.command_path: context.command for context in contexts("vnet", typer.main.get_command(app))}
 SLOW_TO_IMPORT = [
-    "numpy",
-    "scipy",
-    "pydantic",
-    "zenoh",
-    "pyarrow",
-    "matplotlib",
-    "rerun",
-    "rich",
-    "msgspec",
-    "asyncio",
-]
+    "numpy", "scipy", "pydantic", "zenoh", "pyarrow", "matplotlib", "rerun", "rich", "msgspec", "asyncio",
+]  # fmt: skip
 # Imported at the start of Python: prints at its end, or where it would start again, which modules were imported.
 SPY = """
 import atexit, json, os, sys
@@ -161,10 +152,5 @@ def test_what_may_change_or_go_in_any_version_is_marked_in_help_and_reference() 
         for option in command.params
         if "(experimental)" in (getattr(option, "help", None) or "")
     }
-    assert marked == {
-        "vnet host",
-        "vnet run --hosts",
-        "vnet emulator --hosts",
-        "vnet access --hosts",
-    }
+    assert marked == {"vnet host", "vnet run --hosts", "vnet emulator --hosts", "vnet access --hosts"}
     assert "(experimental)" in str(environment.__doc__).splitlines()[0]

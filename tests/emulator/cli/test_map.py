@@ -61,9 +61,7 @@ def test_datum_says_keys_for_the_map_and_keeps_trips_to_evaluate_with(driven: tu
     keys = tomllib.loads(text.split("# the other")[0])
     assert np.abs(keys["datum_m"]).max() < 0.5 and 0 < keys["datum_sigma_m"] < 0.5
     assert abs(keys["aside_m"]) < 0.5 and 0 < keys["sigma_m"] < 1.5
-    first, second = (
-        {line.split(",")[0] for line in path.read_text().splitlines()[1:]} for path in (driven[1], rest)
-    )
+    first, second = ({row.split(",")[0] for row in path.read_text().splitlines()[1:]} for path in (driven[1], rest))
     assert len(second) == 6 and second < first
 
 

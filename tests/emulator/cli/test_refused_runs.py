@@ -21,10 +21,7 @@ UNKNOWN = 3
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A current folder with programs, one of which is good; this process forgets them."""
-    programs = {
-        "good": "async def main(node):\n    pass\n",
-        "leaves_early": "import os\nos._exit(7)\n",
-    }
+    programs = {"good": "async def main(node):\n    pass\n", "leaves_early": "import os\nos._exit(7)\n"}
     for name, code in programs.items():
         (tmp_path / f"{name}.py").write_text(code)
     monkeypatch.chdir(tmp_path)

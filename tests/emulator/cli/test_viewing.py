@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from emulator.scenario.scenario import Scenario
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
 from tests.emulator.test_playback import Watched, watch
@@ -17,14 +16,12 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": 2.0, "settle_s": 0.5, "name": "watched"},
-            "network": {"vehicles": 4},
-            "program": {"entry": "agents.cooperative:main", "options": {"particles": 40}},
-            "fault": [{"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"count": 1}}],
-        }
-    )
+    scenario = {
+        "run": {"duration_s": 2.0, "settle_s": 0.5, "name": "watched"},
+        "network": {"vehicles": 4},
+        "program": {"entry": "agents.cooperative:main", "options": {"particles": 40}},
+        "fault": [{"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"count": 1}}],
+    }
     watched = watch(scenario, tmp_path_factory.mktemp("cli") / "run")
     with Recorder(Sinks(save=watched.folder / "live.rrd"), "watched") as recorder:
         for stream, message in watched.told:

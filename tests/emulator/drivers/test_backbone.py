@@ -4,7 +4,7 @@ import asyncio
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.drivers.backbone import BackboneNetwork
@@ -41,7 +41,6 @@ messages = st.lists(st.tuples(st.integers(0, 10**8), st.sampled_from(NAMES), st.
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(messages, st.floats(0.001, 50), st.floats(0, 50), st.sampled_from([0.0, 0.5, 1.0]))
 def test_messages_keep_their_order_and_none_is_early_or_forgotten(
     sent: list[tuple[int, str, str | None]], latency_ms: float, jitter_ms: float, loss: float

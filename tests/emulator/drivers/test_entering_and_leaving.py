@@ -117,11 +117,8 @@ def test_frames_reach_whom_their_sender_is_near_when_it_sends(
     )
     recorded = run_scenario(folder / "run", scenario)
     listed = {(row["sent_ns"], row["sender"], row["receiver"]) for row in rows_of(recorded)}
-    admitted = {
-        (row["sent_ns"], row["sender"], row["receiver"])
-        for row in rows_of(recorded)
-        if row["outcome"] != "peer_cap"
-    }
+    rows = [row for row in rows_of(recorded) if row["outcome"] != "peer_cap"]
+    admitted = {(row["sent_ns"], row["sender"], row["receiver"]) for row in rows}
     rounded = [(float(f"{x_m:.6f}"), speed) for x_m, speed in drives]
     for period in range(15):
         x_m = [float(f"{x + speed * period / 5:.6f}") for x, speed in rounded]

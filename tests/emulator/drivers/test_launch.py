@@ -17,22 +17,17 @@ pytestmark = pytest.mark.slow
 SAY = "import os; print(os.getsid(0), os.getpgrp() == os.getpid())"
 
 
-def test_a_process_has_its_own_group_in_the_session_of_who_starts_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("own_session", [False, True], ids=["agent", "what must not starve"])
+def test_a_process_has_its_own_group_in_the_session_of_who_starts_it_or_its_own(
+    tmp_path: Path, own_session: bool
+) -> None:
     """Ctrl-C must not reach it; and Linux gives processor time to sessions first, then to processes by niceness."""
     launcher = Launcher(tmp_path)
-    launcher.start("v1", ["-c", SAY], None, {})
+    launcher.start("v1", ["-c", SAY], None, {}, own_session=own_session)
+    pid = launcher.pids["v1"]
     launcher.wait_for("v1", 60.0)
     launcher.stop()
-    assert launcher.log_tail("v1").split() == [str(os.getsid(0)), "True"]
-
-
-def test_what_must_not_starve_has_a_session_of_its_own(tmp_path: Path) -> None:
-    launcher = Launcher(tmp_path)
-    launcher.start("recorder", ["-c", SAY], None, {}, own_session=True)
-    pid = launcher.pids["recorder"]
-    launcher.wait_for("recorder", 60.0)
-    launcher.stop()
-    assert launcher.log_tail("recorder").split() == [str(pid), "True"]
+    assert launcher.log_tail("v1").split() == [str(pid if own_session else os.getsid(0)), "True"]
 
 
 @pytest.mark.parametrize(("states", "is_told"), [("R" * 50, False), ("RRDRRRS", True), ("S", True)])

@@ -15,7 +15,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep, run_in_lockstep
 from emulator.drivers.processes import Heard, Processes, ProtocolError
 from emulator.radio.outcomes import Outcome
-from tests.support.multi_loop_driver import emulation_of, scenario_of
+from tests.support.multi_loop_driver import emulation_of, fault, scenario_of
 from vnet.radio import Packet, SentFrame
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
@@ -32,11 +32,6 @@ def barrier(
     sections = {"radio": {"loss": 0.0}, **sections}
     emulation = emulation_of(scenario_of(list(faults), "agents.beacon:main", **sections))
     return Lockstep(emulation, processes), emulation
-
-
-def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
-    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
-    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
 
 
 def yielded(
@@ -249,9 +244,7 @@ def test_faults_act_before_anything_else_of_their_instant() -> None:
     assert lockstep.take_actions() == [], "each is told once"
     yield_all(lockstep, grants)
     grants = lockstep.step()
-    assert times(grants) == {"v03": 700 * MS}, (
-        "a process that was paused is granted the instant at which it resumes"
-    )
+    assert times(grants) == {"v03": 700 * MS}, "a paused process is granted the instant at which it resumes"
     assert grants["v03"].seq == 1
     yield_all(lockstep, grants)
     grants = lockstep.step()
@@ -348,11 +341,8 @@ def test_packets_of_a_window_are_shown_before_it_and_decided_after_it() -> None:
     # v02's program ends a nanosecond before its packet arrives, and v03's as it arrives.
     ends_ns = {"v02": arrivals_ns["v02"] - 1, "v03": arrivals_ns["v03"]}
     for process_id, grant in grants.items():
-        steps = [
-            wire.Step(ends_ns[n], wire.Traffic((), (), [wire.Ending(n, "finished")]))
-            for n in ends_ns
-            if n == process_id
-        ]
+        ended = wire.Traffic((), (), [wire.Ending(process_id, "finished")])
+        steps = [wire.Step(ends_ns[process_id], ended)] if process_id in ends_ns else []
         lockstep.receive(process_id, wire.Yield(b"n", grant.seq, None, [], [], steps, 1))
     assert lockstep.step() == {}
     rows = {row["receiver"]: row["outcome"] for row in emulation.engine.trace.to_table().to_pylist()}
@@ -391,9 +381,7 @@ def test_a_flood_that_nobody_takes_is_bounded_and_that_of_a_window_is_not(monkey
     yield_all(lockstep, grants)
     grants = lockstep.step()
     assert times(grants) == {"v01": 100 * MS, "v03": 110 * MS}
-    assert [each.payload[0] for each in packets_of(lockstep, "v03")] == list(range(15, 20)), (
-        "of the past the newest"
-    )
+    assert [each.payload[0] for each in packets_of(lockstep, "v03")] == list(range(15, 20)), "the newest ones"
 
 
 # All rules at once: vehicles that do something at random.

@@ -51,11 +51,8 @@ def log_of(emulation: Emulation) -> str:
 
 
 def told(emulation: Emulation) -> list[tuple[Any, ...]]:
-    return [
-        (event.time_ns, event.kind, event.node, event.details)
-        for event in emulation.folder.events
-        if event.kind in ("log", "event")
-    ]
+    noted = [event for event in emulation.folder.events if event.kind in ("log", "event")]
+    return [(event.time_ns, event.kind, event.node, event.details) for event in noted]
 
 
 @pytest.mark.slow
@@ -130,11 +127,7 @@ def test_what_a_restart_ends_is_not_heard_any_more(run: Callable[[Scenario], Emu
 def test_lines_that_are_broken_keep_their_beginning_apart() -> None:
     emulation = run_together(scenario_of([], f"{__name__}:breaks_lines", vehicles=2))
     lines = (emulation.folder.logs / "v01.log").read_text().splitlines()
-    assert lines[:3] == [
-        "0.000000 v01 info: one",
-        "    two",
-        "0.000000 v01 info: event said text=one\\ntwo",
-    ]
+    assert lines[:3] == ["0.000000 v01 info: one", "    two", "0.000000 v01 info: event said text=one\\ntwo"]
 
 
 @pytest.mark.slow

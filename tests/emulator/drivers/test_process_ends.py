@@ -29,24 +29,28 @@ async def sends(node: Node) -> None:
         await node.radio.broadcast(b"x")
 
 
+def exits_in_a_thread() -> None:
+    thread = threading.Thread(target=os._exit, args=[0])
+    thread.start()
+    thread.join()
+
+
+WAYS: dict[str, Callable[[], object]] = {
+    "os": lambda: os._exit(0),
+    "the module below": lambda: posix._exit(0),
+    "another program": lambda: os.execlp("true", "true"),
+    "a callback": lambda: asyncio.get_running_loop().call_soon(os._exit, 0),
+    "a thread": exits_in_a_thread,
+    "a job": lambda: asyncio.to_thread(os._exit, 0),
+}
+
+
 async def exits(node: Node) -> None:
     await asyncio.sleep(0.5)
     if node.id == "v02":
-        os._exit(0)
-    await sends(node)
-
-
-async def exits_by_the_module_below(node: Node) -> None:
-    await asyncio.sleep(0.5)
-    if node.id == "v02":
-        posix._exit(0)
-    await sends(node)
-
-
-async def becomes_another_program(node: Node) -> None:
-    await asyncio.sleep(0.5)
-    if node.id == "v02":
-        os.execlp("true", "true")
+        done = WAYS[node.options.get("way", "os")]()
+        if asyncio.iscoroutine(done):
+            await done
     await sends(node)
 
 
@@ -58,28 +62,6 @@ async def exits_and_catches_everything(node: Node) -> None:
     except BaseException:
         await asyncio.sleep(0)
         node.report(survived=1)
-    await sends(node)
-
-
-async def exits_in_a_task(node: Node) -> None:
-    if node.id == "v02":
-        asyncio.get_running_loop().call_later(0.5, os._exit, 0)
-    await sends(node)
-
-
-async def exits_in_a_thread(node: Node) -> None:
-    await asyncio.sleep(0.5)
-    if node.id == "v02":
-        thread = threading.Thread(target=os._exit, args=[0])
-        thread.start()
-        thread.join()
-    await sends(node)
-
-
-async def exits_in_a_job(node: Node) -> None:
-    await asyncio.sleep(0.5)
-    if node.id == "v02":
-        await asyncio.to_thread(os._exit, 0)
     await sends(node)
 
 
@@ -100,25 +82,14 @@ async def forks(node: Node) -> None:
     await sends(node)
 
 
-DURING = [
-    exits,
-    exits_by_the_module_below,
-    becomes_another_program,
-    exits_and_catches_everything,
-    exits_in_a_task,
-    exits_in_a_thread,
-    exits_in_a_job,
-]
-
-
-def run_of(program: Program, run: Run) -> Emulation:
-    return run(scenario_of([], f"{__name__}:{program.__name__}", vehicles=3))
+def run_of(program: Program, run: Run, **options: str) -> Emulation:
+    return run(scenario_of([], f"{__name__}:{program.__name__}", vehicles=3, program={"options": options}))
 
 
 @pytest.mark.parametrize("run", [run_together, run_forked])
-@pytest.mark.parametrize("program", DURING, ids=lambda program: program.__name__)
-def test_a_vehicle_that_ends_its_process_has_died_alone(program: Program, run: Run) -> None:
-    emulation = run_of(program, run)
+@pytest.mark.parametrize("way", [*WAYS, "caught"])
+def test_a_vehicle_that_ends_its_process_has_died_alone(way: str, run: Run) -> None:
+    emulation = run_of(exits_and_catches_everything, run) if way == "caught" else run_of(exits, run, way=way)
     (died,) = [event for event in emulation.folder.events if event.kind == "died"]
     assert (died.node, died.time_ns) == ("v02", 500_000_000)
     assert died.details["how"].startswith("os.")
@@ -131,7 +102,7 @@ def test_a_vehicle_that_ends_its_process_has_died_alone(program: Program, run: R
 
 def test_the_line_of_the_program_that_ended_its_process_is_named() -> None:
     (died,) = [event for event in run_of(exits, run_together).folder.events if event.kind == "died"]
-    line = exits.__code__.co_firstlineno + 3
+    line = WAYS["os"].__code__.co_firstlineno
     assert died.details["place"] == f"{Path(__file__).name}:{line}"
 
 

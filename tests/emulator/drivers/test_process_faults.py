@@ -12,7 +12,8 @@ import pytest
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario
-from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
+from tests.emulator.checks.test_faults import NEEDED
+from tests.support.multi_loop_driver import emulation_of, fault, run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.radio import SentFrame
 from vnet.reports import Report
@@ -161,11 +162,6 @@ async def wakes_up(node: Node) -> None:
     await asyncio.gather(tick("first"), tick("second"), locate(), hear())
 
 
-def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
-    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
-    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
-
-
 def both(faults: list[dict[str, Any]], program: str, **sections: Any) -> tuple[Emulation, dict[str, list[Entry]]]:
     """Run simulated and apart, and see that both are the same; returns the simulation and what was noted in it."""
     scenario = scenario_of(faults, program if ":" in program else f"{HERE}:{program}", **sections)
@@ -195,11 +191,8 @@ def sent_by(emulation: Emulation, node: str) -> list[int]:
 def reports(emulation: Emulation, node: str) -> list[tuple[int, float]]:
     """(time of the period, reported incarnation) of a node, where it reported."""
     states = emulation.metrics.states_table().to_pylist()
-    return [
-        (row["time_ns"], row["incarnation"])
-        for row in states
-        if row["node"] == node and row["incarnation"] is not None
-    ]
+    rows = [row for row in states if row["node"] == node and row["incarnation"] is not None]
+    return [(row["time_ns"], row["incarnation"]) for row in rows]
 
 
 def test_who_is_killed_is_silent_deaf_and_comes_back_as_another() -> None:
@@ -425,19 +418,6 @@ def test_reports_of_who_was_killed_at_that_instant_are_discarded_with_its_frames
     assert all(row["estimate_m"] is None for row in emulation.metrics.states_table().to_pylist())
 
 
-PARAMETERS: dict[str, dict[str, Any]] = {
-    "loss": {"probability": 0.5},
-    "delay": {"delay_ms": 200},
-    "jitter": {"jitter_ms": 100},
-    "throttle": {"bitrate_mbps": 0.02},
-    "range": {"range_m": 500},
-    "gnss_jump": {"offset_m": [5, 5]},
-    "gnss_ramp": {"rate_m_s": [1, 0]},
-    "custom": {"rule": "tests.support.rules:everything"},
-    "custom_sender": {"rule": "tests.support.rules:babbles"},
-}
-
-
 def drawn(seed: int, kinds: list[str], together: int) -> list[dict[str, Any]]:
     """A schedule of faults drawn at random, many of them at the same instants."""
     rng = random.Random(seed)
@@ -446,20 +426,15 @@ def drawn(seed: int, kinds: list[str], together: int) -> list[dict[str, Any]]:
     for _ in range(rng.randint(2, 6)):
         kind = rng.choice(kinds)
         chosen = [node for group in rng.sample(groups, rng.randint(1, len(groups))) for node in group]
-        more = dict(PARAMETERS.get(kind, {}))
+        more = dict(NEEDED.get(kind, {}))
         if kind == "skew":
             more["offset_ms"] = rng.choice([-1000, -130, 50, 500])
         if kind == "drift":
             more["rate_ppm"] = rng.choice([-500_000, 500_000, 1000, 333_333])
-        who = chosen if has_nodes(kind) else []
+        who = chosen if "nodes" in type(parse_fault(fault(kind, 0, 1, **more))).model_fields else []
         at_s = rng.choice([0, 0.2, 0.4, 1, rng.uniform(0, 2.4)])
         faults.append(fault(kind, round(at_s, 3), rng.choice([0.2, 0.4, 1, 1.7]), *who, **more))
     return faults
-
-
-def has_nodes(kind: str) -> bool:
-    needed = PARAMETERS.get(kind, {}) | {"skew": {"offset_ms": 0}, "drift": {"rate_ppm": 0}}.get(kind, {})
-    return "nodes" in type(parse_fault(fault(kind, 0, 1, **needed))).model_fields
 
 
 @pytest.mark.parametrize(("seed", "together"), [(0, 1), (1, 2), (2, 2), (3, 1)])

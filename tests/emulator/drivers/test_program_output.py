@@ -59,11 +59,8 @@ def test_prints_are_in_the_log_of_their_vehicle_and_in_the_terminal(
     terminal = capsys.readouterr()
     for node in ("v01", "v02"):
         said = [f"{node} in {where}" for where in WHERE]
-        assert log_of(emulation, node).splitlines() == [
-            *said,
-            f"0.100000 {node} info: noted",
-            f"{node} without an end{node} finished",
-        ]
+        rest = [f"0.100000 {node} info: noted", f"{node} without an end{node} finished"]
+        assert log_of(emulation, node).splitlines() == [*said, *rest]
         assert [line for line in said if f"{line}\n" not in terminal.out] == [f"{node} in error"]
         assert f"{node} in error\n" in terminal.err
 

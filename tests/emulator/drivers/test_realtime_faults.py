@@ -28,9 +28,9 @@ def fault(kind: str, at_s: float, duration_s: float, **more: Any) -> dict[str, A
     return {"kind": kind, "at_s": at_s, "duration_s": duration_s, "nodes": {"ids": ["v02"]}, **more}
 
 
-def started(*faults: dict[str, Any], **network: Any) -> tuple[RealTime, Emulation]:
-    plan = scenario_of(faults, "agents.beacon:main", run={"pacing": "realtime"}, network=network)
-    emulation = emulation_of(plan)
+def started(*faults: dict[str, Any], **sections: Any) -> tuple[RealTime, Emulation]:
+    run = {"pacing": "realtime"} | sections.pop("run", {})
+    emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run=run, **sections))
     realtime = RealTime(emulation, [[node] for node in IDS])
     realtime.start(0)
     return realtime, emulation
@@ -45,9 +45,7 @@ def with_units() -> RealTime:
 
 
 def test_a_result_in_a_batch_that_was_missed_goes_out_again() -> None:
-    plan = scenario_of((), "agents.beacon:main", run={"pacing": "realtime"}, radio={"mac": {}})
-    realtime = RealTime(emulation_of(plan), [[node] for node in IDS])
-    realtime.start(0)
+    realtime, _ = started(radio={"mac": {}})
     traffic = wire.Traffic([SentFrame("v01", b"x", to="v02", number=7)])
     realtime.receive(10 * MS, "v01", wire.Frames(b"n", 0, 1, [], traffic))
     batch = realtime.due(100 * MS)["v01"]
@@ -92,9 +90,7 @@ def test_an_old_message_of_the_backbone_goes_out_again_to_a_process_that_was_pau
 
 
 def test_a_process_is_told_of_frames_that_were_lost_until_it_has_taken_that() -> None:
-    plan = scenario_of((), "agents.beacon:main", run={"pacing": "realtime"})
-    realtime = RealTime(emulation_of(plan), [[node] for node in IDS])
-    realtime.start(0)
+    realtime, _ = started()
     realtime.receive(10 * MS, "v01", wire.Frames(b"n", 3, 1, [], wire.Traffic()))
     batch = realtime.due(11 * MS)["v01"]
     assert batch.lost == [(0, 2)]
@@ -109,7 +105,7 @@ def test_a_process_is_told_of_frames_that_were_lost_until_it_has_taken_that() ->
 def test_a_frame_meets_the_faults_of_its_time_on_a_machine_that_is_late(network: dict[str, Any]) -> None:
     """While messages wait to be taken, `due` is not called."""
     cut = {"kind": "partition", "at_s": 0.5, "duration_s": 0.5, "groups": [["v02"], ["v01", "v03", "v04"]]}
-    realtime, emulation = started(cut, **network)
+    realtime, emulation = started(cut, network=network)
     for seq, time_ns in enumerate((10 * MS, 700 * MS, 1200 * MS)):
         traffic = wire.Traffic([SentFrame("v01", b"x")])
         realtime.receive(time_ns, "v01", wire.Frames(b"n", seq, 1, [], traffic))
@@ -182,10 +178,7 @@ def test_what_an_operator_does_late_makes_no_fault_miss_its_end() -> None:
 @pytest.mark.parametrize("is_told", [True, False])
 def test_a_program_that_does_not_come_up_again_has_died(is_told: bool) -> None:
     """Its process may end before it has said a word, or never say one."""
-    run = {"pacing": "realtime", "join_timeout_s": 0.5}
-    emulation = emulation_of(scenario_of([fault("kill", 0.5, 0.5)], "agents.beacon:main", run=run))
-    realtime = RealTime(emulation, [[node] for node in IDS])
-    realtime.start(0)
+    realtime, emulation = started(fault("kill", 0.5, 0.5), run={"join_timeout_s": 0.5})
     for time_ms in (500, 1000):
         realtime.due(time_ms * MS)
         realtime.take_actions()
@@ -199,11 +192,8 @@ def test_a_program_that_does_not_come_up_again_has_died(is_told: bool) -> None:
 
 
 def test_a_program_that_does_not_come_up_again_is_ended_once_its_time_is_over() -> None:
-    run = {"pacing": "realtime", "join_timeout_s": 0.5}
     faults = [fault("kill", 0.5, 0.5), fault("pause", 0.5, 2.0, nodes=["v03"])]
-    emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run=run))
-    realtime = RealTime(emulation, [[node] for node in IDS])
-    realtime.start(0)
+    realtime, emulation = started(*faults, run={"join_timeout_s": 0.5})
     realtime.due(1000 * MS)
     realtime.take_actions()
     realtime.give_up_starts(1499 * MS)
@@ -219,8 +209,7 @@ def test_a_program_that_does_not_come_up_again_is_ended_once_its_time_is_over() 
 
 def test_a_fault_that_programs_cannot_have_is_refused_as_it_is_injected() -> None:
     """Else nothing would come of it, and the scenario that the run leaves could not be read."""
-    scenario = Scenario.model_validate({"run": {"pacing": "realtime"}, "program": {"kind": "zenoh"}})
-    emulation = emulation_of(scenario)
+    emulation = emulation_of(Scenario.model_validate({"run": {"pacing": "realtime"}, "program": {"kind": "zenoh"}}))
     for text in fault("skew", 1.0, 0.2, offset_ms=5.0), fault("drift", 1.0, 0.2, rate_ppm=5.0):
         with pytest.raises(ScenarioError, match="in real time nothing changes the clock"):
             emulation.inject(parse_fault(text), 0)
@@ -241,9 +230,8 @@ def test_healing_ends_a_fault_at_once_and_again_changes_nothing() -> None:
 
 def test_whose_program_has_ended_is_not_up_again_when_its_process_is() -> None:
     realtime, emulation = started(fault("kill", 0.5, 0.2))
-    realtime.receive(
-        100 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic((), (), [wire.Ending("v02", "finished")]))
-    )
+    ended = wire.Traffic((), (), [wire.Ending("v02", "finished")])
+    realtime.receive(100 * MS, "v02", wire.Frames(b"n", 0, 1, [], ended))
     realtime.due(900 * MS)
     assert [(a.stop, a.start) for a in realtime.take_actions()] == [({}, []), ({}, [])]
     assert not emulation.welcome("v02", b"n").runs
@@ -448,22 +436,25 @@ class _Restarting(Processes):
         return None
 
 
+def run_to_the_end(processes: _Restarting, *faults: dict[str, Any], **run: Any) -> tuple[RealTime, Emulation]:
+    """Run in real time by the clock of these processes."""
+    plan = scenario_of(faults, "agents.beacon:main", run={"pacing": "realtime", **run})
+    realtime = RealTime(emulation := emulation_of(plan), [[node] for node in IDS])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("emulator.drivers.realtime.time", SimpleNamespace(monotonic_ns=lambda: processes.now_ns))
+        patch.setattr(wire, "HEAD_START_NS", 0)
+        asyncio.run(run_in_real_time(realtime, processes))
+    return realtime, emulation
+
+
 @pytest.mark.parametrize("kind", ["emulator_restart", "router_restart"])
 @pytest.mark.parametrize(
     ("slow_ms", "least"),
     [(range(0), 0), (range(1101, 1102), 0), (range(1602, 1610), 1)],
     ids=["fast", "slow in catching up", "slow later"],
 )
-def test_a_run_in_real_time_keeps_up_whatever_a_restart_holds_back(
-    kind: str, slow_ms: range, least: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plan = scenario_of([{"kind": kind, "at_s": 0.401}], "agents.beacon:main", run={"pacing": "realtime"})
-    emulation = emulation_of(plan)
-    realtime = RealTime(emulation, [[node] for node in IDS])
-    processes = _Restarting(slow_ms)
-    monkeypatch.setattr("emulator.drivers.realtime.time", SimpleNamespace(monotonic_ns=lambda: processes.now_ns))
-    monkeypatch.setattr(wire, "HEAD_START_NS", 0)
-    asyncio.run(run_in_real_time(realtime, processes))
+def test_a_run_in_real_time_keeps_up_whatever_a_restart_holds_back(kind: str, slow_ms: range, least: int) -> None:
+    realtime, emulation = run_to_the_end(_Restarting(slow_ms), {"kind": kind, "at_s": 0.401})
     count, total = late_count(realtime, emulation)
     assert total > 100 and (count >= least if least else count == 0)
     rows = emulation.engine.trace.to_table().to_pylist()
@@ -476,17 +467,12 @@ def test_a_run_in_real_time_keeps_up_whatever_a_restart_holds_back(
     [(0.2, None, [1500]), (1.02, 1450, []), (1.02, 2190, []), (0.95, 2140, []), (0.95, None, [2150])],
 )
 def test_a_restart_takes_no_time_from_a_program_that_starts(
-    restart_s: float, ready_ms: int | None, died_ms: list[int], monkeypatch: pytest.MonkeyPatch
+    restart_s: float, ready_ms: int | None, died_ms: list[int]
 ) -> None:
     """It starts at 1 s, and the restart takes 0.7 s."""
-    run = {"pacing": "realtime", "join_timeout_s": 0.5}
     faults = [fault("kill", 0.5, 0.5), {"kind": "emulator_restart", "at_s": restart_s}]
-    emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run=run))
-    realtime = RealTime(emulation, [[node] for node in IDS])
     processes = _Restarting(range(0), ready_ms)
-    monkeypatch.setattr("emulator.drivers.realtime.time", SimpleNamespace(monotonic_ns=lambda: processes.now_ns))
-    monkeypatch.setattr(wire, "HEAD_START_NS", 0)
-    asyncio.run(run_in_real_time(realtime, processes))
+    realtime, emulation = run_to_the_end(processes, *faults, join_timeout_s=0.5)
     realtime.finish()
     assert [event.time_ns // MS for event in emulation.folder.events if event.kind == "died"] == died_ms
     assert emulation.up["v02"] is (died_ms == [])

@@ -130,9 +130,7 @@ def test_a_live_process_that_gives_up_a_send_goes_on(nodes_per_process: int) -> 
 def test_a_result_is_that_of_the_trace() -> None:
     emulation = run_together(scenario(loss=0.3))
     rows = [row for row in emulation.engine.trace.to_table().to_pylist() if row["attempt"]]
-    results = [
-        event for event in emulation.folder.events if event.kind == "event" and event.details["name"] == "result"
-    ]
+    results = [e for e in emulation.folder.events if e.kind == "event" and e.details["name"] == "result"]
     assert len(results) > 50
     for node in emulation.world.node_ids:
         mine = [row for row in rows if row["sender"] == node]
@@ -167,7 +165,5 @@ def test_a_result_for_a_paused_vehicle_waits_and_the_run_goes_on() -> None:
     for run in (run_together, run_apart):
         emulation = run(plan)
         first, last = (event for event in emulation.folder.events if event.kind == "event")
-        assert [(each.details["name"], each.time_ns) for each in (first, last)] == [
-            ("result", 110_000_000),
-            ("later", 300_000_000),
-        ]
+        told = [(each.details["name"], each.time_ns) for each in (first, last)]
+        assert told == [("result", 110_000_000), ("later", 300_000_000)]

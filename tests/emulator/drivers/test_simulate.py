@@ -36,7 +36,6 @@ async def computes_for_ever(node: Node) -> None:
             signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("program", ["is_interrupted", "computes_for_ever"])
 def test_an_interruption_is_recorded_and_the_run_judged(
     tmp_path: Path, program: str, caplog: pytest.LogCaptureFixture
@@ -46,10 +45,7 @@ def test_an_interruption_is_recorded_and_the_run_judged(
     wall_s, interrupted = simulate(emulation)
     assert interrupted
     assert signal.getsignal(signal.SIGINT) is before
-    assert [(event.kind, event.time_ns) for event in emulation.folder.events] == [
-        ("started", 0),
-        ("interrupted", AT_NS),
-    ]
+    assert [(e.kind, e.time_ns) for e in emulation.folder.events] == [("started", 0), ("interrupted", AT_NS)]
     judgement, _ = conclude(emulation, wall_s, "simulate")
     assert judgement.exit_status == 3
     gc.collect()
@@ -59,7 +55,6 @@ def test_an_interruption_is_recorded_and_the_run_judged(
         assert caplog.text == "", "asyncio has nothing to complain of"
 
 
-@pytest.mark.slow
 def test_whoever_sees_to_interruptions_goes_on_doing_so(tmp_path: Path) -> None:
     seen: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, frame: seen.append(number))
@@ -85,7 +80,6 @@ async def two_wake_ups_a_second(node: Node) -> None:
         await node.radio.broadcast(b"x" * (40 if node.id == "v02" else 7))
 
 
-@pytest.mark.slow
 def test_costs_are_those_of_each_vehicles_program(tmp_path: Path) -> None:
     program = {"entry": "tests.emulator.drivers.test_simulate:two_wake_ups_a_second"}
     emulation = emulate(tmp_path / "run", program=program)

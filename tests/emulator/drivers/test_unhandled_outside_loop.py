@@ -7,20 +7,28 @@ import gc
 import os
 import sys
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any
 
 import pytest
 
 from emulator.records.verdicts import Verdict
-from tests.emulator.drivers.test_unhandled import RUNS, exceptions, judged, places, run_all, sends
+from tests.emulator.drivers.test_unhandled import (
+    RUNS,
+    Program,
+    entry,
+    exceptions,
+    half_way,
+    judged,
+    places,
+    run_all,
+    sends,
+)
 from tests.support.multi_loop_driver import run_together, scenario_of
 from vnet.node import Node
 
 pytestmark = pytest.mark.slow
-
-Program = Callable[[Node], Awaitable[None]]
 
 
 @pytest.fixture(autouse=True)
@@ -34,19 +42,11 @@ class FailsWhenDiscarded:
         raise ValueError("boom")
 
 
-def discards() -> None:
-    FailsWhenDiscarded()
-
-
 def run_thread(target: Callable[..., object], *args: object) -> None:
     """Start a thread and wait for it, as no emulated time passes meanwhile."""
     thread = threading.Thread(target=target, args=args)
     thread.start()
     thread.join()
-
-
-def entry(program: Program) -> str:
-    return f"{__name__}:{program.__name__}"
 
 
 # Programs that are told of.
@@ -58,27 +58,9 @@ async def fails_in_a_thread(node: Node) -> None:
     await sends(node)
 
 
-async def fails_in_a_thread_of_a_thread(node: Node) -> None:
-    await asyncio.sleep(0.5)
-    run_thread(run_thread, int, "x")
-    await sends(node)
-
-
 async def fails_in_a_thread_of_a_job(node: Node) -> None:
     await asyncio.sleep(0.5)
     await asyncio.to_thread(run_thread, int, "x")
-    await sends(node)
-
-
-async def fails_when_discarded(node: Node) -> None:
-    await asyncio.sleep(0.5)
-    FailsWhenDiscarded()
-    await sends(node)
-
-
-async def fails_when_discarded_in_a_thread(node: Node) -> None:
-    await asyncio.sleep(0.5)
-    run_thread(FailsWhenDiscarded)
     await sends(node)
 
 
@@ -145,10 +127,10 @@ TOLD: dict[Program, tuple[str, float]] = {
     submits_and_forgets: ("in an executor job", 0.5),
     imports_an_executor_and_forgets: ("in an executor job", 0.5),
     fails_in_a_thread: ("in a thread", 0.5),
-    fails_in_a_thread_of_a_thread: ("in a thread", 0.5),
+    half_way(lambda: run_thread(run_thread, int, "x")): ("in a thread", 0.5),
     fails_in_a_thread_of_a_job: ("in a thread", 0.5),
-    fails_when_discarded: ("in __del__", 0.5),
-    fails_when_discarded_in_a_thread: ("in __del__", 0.5),
+    half_way(FailsWhenDiscarded): ("in __del__", 0.5),
+    half_way(lambda: run_thread(FailsWhenDiscarded)): ("in __del__", 0.5),
     fails_when_discarded_at_the_end: ("in __del__", 3.0),
     ignores_the_end_of_a_generator: ("in numbers", 0.5),
 }
@@ -202,7 +184,7 @@ async def handles_it_by_a_hook(node: Node) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.parametrize("program", [leaves_a_thread, handles_it_by_a_hook], ids=lambda program: program.__name__)
+@pytest.mark.parametrize("program", [leaves_a_thread, handles_it_by_a_hook])
 def test_what_ends_a_thread_quietly_is_none(program: Program) -> None:
     emulation = run_together(scenario_of([], entry(program), vehicles=2))
     assert exceptions(emulation) == []
@@ -215,7 +197,7 @@ async def fails_in_a_job_whose_threads_another_started(node: Node) -> None:
         await loop.run_in_executor(None, int, "1")
     await asyncio.sleep(0.5)
     if node.id == "v02":
-        await loop.run_in_executor(None, discards)
+        await loop.run_in_executor(None, lambda: bool(FailsWhenDiscarded()))
     await sends(node)
 
 

@@ -51,6 +51,14 @@ def same(one: Sequence[Any], other: Sequence[Any]) -> bool:
     return repr(one) == repr(other)  # by their text: NaN is not equal to itself
 
 
+def assert_same_in_all_ways(scenario: Scenario) -> None:
+    """Compare a run with windows, on one loop, in processes and on loops of their own, with one without."""
+    reference = fingerprint(simulated(scenario, False))
+    assert same(fingerprint(simulated(scenario, True)), reference)
+    assert same(fingerprint(run_forked(with_windows(scenario, True))), reference)
+    assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
+
+
 def with_windows(scenario: Scenario, windows: bool) -> Scenario:
     return scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": windows})})
 
@@ -95,10 +103,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
 @settings(max_examples=4, deadline=None)
 @given(scenarios())
 def test_random_runs_are_the_same_with_and_without_windows(scenario: Scenario) -> None:
-    reference = fingerprint(simulated(scenario, False))
-    assert same(fingerprint(simulated(scenario, True)), reference)
-    assert same(fingerprint(run_forked(with_windows(scenario, True))), reference)
-    assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
+    assert_same_in_all_ways(scenario)
 
 
 def test_a_medium_under_heavy_load_is_the_same_with_and_without_windows() -> None:
@@ -139,11 +144,8 @@ def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
     }
     path = write_trips(tmp_path_factory.mktemp("trips") / "trips.csv", vehicles)
     radio = {"latency_ms": latency_ms}
-    scenario = scenario_of_trips(path, 1.6, IMPROVISES, radio=radio, run={"seed": seed, "settle_s": 0.2})
-    reference = fingerprint(simulated(scenario, False))
-    assert same(fingerprint(simulated(scenario, True)), reference)
-    assert same(fingerprint(run_forked(with_windows(scenario, True))), reference)
-    assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
+    run = {"seed": seed, "settle_s": 0.2}
+    assert_same_in_all_ways(scenario_of_trips(path, 1.6, IMPROVISES, radio=radio, run=run))
 
 
 # Packets that the process has, but whose receiver has not run since they arrived.

@@ -139,11 +139,8 @@ def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
     heard = [(number[r["receiver"]], r["arrival_ns"]) for r in rows if r["outcome"] == "delivered"]
     assert inbound == sorted(heard)
     outbound = sorted((p["interface"], p["time_ns"]) for p in found if p["direction"] == 2)
-    sent = {
-        (number[r["sender"]], r["sent_ns"], r["seq"], r["copy"])
-        for r in rows
-        if not (r["copy"] and r["cause"].startswith("duplicate"))
-    }
+    own = [r for r in rows if not (r["copy"] and r["cause"].startswith("duplicate"))]
+    sent = {(number[r["sender"]], r["sent_ns"], r["seq"], r["copy"]) for r in own}
     assert outbound == sorted(emission[:2] for emission in sent)
 
 
@@ -276,9 +273,7 @@ def test_without_to_the_file_s_name_says_the_format(
 
 
 @pytest.mark.parametrize("to", ["pcapng", "mcap", "csv", "links"])
-def test_an_export_goes_where_it_is_told_and_never_over_something_else(
-    folder: Path, tmp_path: Path, to: str
-) -> None:
+def test_export_goes_where_it_is_told_and_never_over_something_else(folder: Path, tmp_path: Path, to: str) -> None:
     out = tmp_path / "out"
     done = RUNNER.invoke(app, ["export", str(folder), "--to", to, "--out", str(out)])
     assert done.exit_code == 0 and str(out) in done.stdout.replace("\n", "")

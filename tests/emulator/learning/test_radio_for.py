@@ -182,11 +182,7 @@ def test_agents_whose_episode_is_over_neither_send_nor_receive() -> None:
         return b"here"
 
     radio = emulator.radio_for(
-        env,
-        PERFECT,
-        position_m=env.position_m,
-        send=tell,
-        receive=lambda agent, observation, packets: len(packets),
+        env, PERFECT, position_m=env.position_m, send=tell, receive=lambda agent, observation, packets: len(packets)
     )
     radio.reset(seed=1)
     assert radio.step(dict.fromkeys(env.possible_agents, 1))[0] == {"car_0": 2, "car_1": 2, "car_2": 2}

@@ -24,11 +24,7 @@ from vnet.errors import VnetError
 
 HOUSE = "house,10,5\nhouse,60,5\nhouse,60,45\nhouse,10,45\n"
 FAR_AWAY = "barn,9000,0\nbarn,9010,0\nbarn,9010,10\n"
-VEHICLES = {
-    "car": [(0, 4, along(0, 30))],
-    "hidden": [(0, 4, still(0, 50))],
-    "seen": [(0, 4, still(0, -5))],
-}
+VEHICLES = {"car": [(0, 4, along(0, 30))], "hidden": [(0, 4, still(0, 50))], "seen": [(0, 4, still(0, -5))]}
 """A car drives behind the block, and another vehicle stands beside it."""
 
 

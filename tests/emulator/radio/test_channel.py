@@ -19,6 +19,7 @@ from emulator.radio.topology import Disc, Topology
 from emulator.records.distributions import binomial_interval
 from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of
 from emulator.scenario.scenario import Radio
+from tests.support.radio import drained
 
 MS = 1_000_000
 seeds = st.integers(0, 2**63 - 1)
@@ -88,7 +89,6 @@ def test_draws_depend_on_the_frame_and_not_on_what_was_drawn_before(
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(seeds, st.lists(st.tuples(frames_of, st.integers(0, 99)), min_size=1, max_size=6), st.data())
 def test_single_draws_are_those_of_the_frames_whole_vectors(
     seed: int, frames: list[tuple[tuple[int, int], int]], data: st.DataObject
@@ -156,7 +156,6 @@ def test_the_range_is_a_closed_disc_without_its_centre() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(lattice, st.integers(1, 5), st.integers(1, 6), st.sets(st.integers(0, 11), max_size=4))
 def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
     places: list[tuple[int, int]], cap: int, reach: int, down: set[int]
@@ -220,10 +219,8 @@ def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.tuples(st.integers(0, 2_000_000), st.integers(0, 1400)), min_size=1, max_size=25),
-    st.integers(1, 4),
+    st.lists(st.tuples(st.integers(0, 2_000_000), st.integers(0, 1400)), min_size=1, max_size=25), st.integers(1, 4)
 )
 def test_the_queue_fills_and_drains_with_the_bit_rate(gaps: list[tuple[int, int]], limit: int) -> None:
     times = np.cumsum([gap for gap, _ in gaps]).tolist()
@@ -238,8 +235,7 @@ def test_oversize_frames_and_other_senders_take_no_place_in_a_queue() -> None:
     subject = Engine(["a", "b", "c"], quick.model_copy(update={"jitter_ms": 0.0}), 1, np.zeros((3, 2)), None)
     subject.transmit(0, 0, [bytes(100), *[bytes(101)] * 4, bytes(100), bytes(100)])
     subject.transmit(0, 1, [bytes(100)])
-    subject.drain()
-    rows = [row for row in subject.trace.to_table().to_pylist() if row["receiver"] == "c"]
+    rows = [row for row in drained(subject) if row["receiver"] == "c"]
     assert [row["outcome"] for row in rows] == [
         "delivered",
         *["oversize"] * 4,

@@ -9,11 +9,8 @@ from emulator.radio.csma import BusyRatioMeter, LimericControl, ReactiveControl
 from emulator.radio.engine import Engine
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.outcomes import Outcome
-from emulator.scenario.radio import (
-    EtsiReactive,
-    Limeric,
-)
-from tests.support.radio import engine, line
+from emulator.scenario.radio import EtsiReactive, Limeric
+from tests.support.radio import drained, engine, line
 
 MS = 1_000_000
 
@@ -156,8 +153,7 @@ def test_of_what_waits_the_newest_goes() -> None:
     )
     for number in range(10):
         subject.transmit(number * 10 * MS, 0, [bytes(100)])
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    rows = drained(subject)
     assert [row["seq"] for row in rows if row["outcome"] == "delivered"] == [0, 5, 9]
     assert {row["outcome"] for row in rows} == {"delivered", "held_back"}
     on_air_ms = [round(row["on_air_ns"] / MS) for row in rows if row["on_air_ns"] is not None]

@@ -4,14 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.radio.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
 from emulator.radio.reception import reception_draws
-from emulator.scenario.radio import (
-    RATES_MBPS,
-)
+from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio
 from tests.support.radio import nist_qpsk_half
 
@@ -55,7 +53,6 @@ def test_faster_modes_need_more_and_all_improve_with_the_signal(rate: float, hal
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.integers(1, 1000), min_size=1, max_size=6), st.floats(0.1, 100), st.sampled_from([3.0, 6.0, 27.0])
 )

@@ -12,11 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emulator.pages.palette import PALETTE
 from emulator.radio.engine import INITIAL_CAPACITY, NO_ARRIVAL_NS, Delivery, Engine
-from emulator.radio.outcomes import Outcome
+from emulator.radio.outcomes import DRAWN, Outcome, Stage, decided_at
 from emulator.radio.trace import Trace
 from emulator.scenario.scenario import Radio
 from emulator.world.radio_inputs import RadioInputs
+from tests.support.radio import drained
 
 PERIOD_NS = 100_000_000
 seeds = st.integers(0, 2**63 - 1)
@@ -50,8 +52,7 @@ def test_every_pair_has_exactly_one_outcome(count: int, seed: int, loss: float, 
         subject.transmit(number * 1_000_000, number % count, [bytes(size)] * 2)
         if number == 3 and count > 1:
             subject.set_up(0, False)
-    subject.drain()
-    table = rows(subject)
+    table = drained(subject)
     sent = Counter((row["sender"], row["seq"]) for row in table)
     degree = in_range(position).sum(axis=1)
     assert all(number == degree[int(sender[1:])] for (sender, _), number in sent.items())
@@ -105,8 +106,7 @@ def test_a_sender_that_is_down_sends_nothing_and_goes_on_counting() -> None:
     subject.transmit(1, 0, [b"x"])
     subject.set_up(0, True)
     subject.transmit(2, 0, [b"x"])
-    subject.drain()
-    assert [row["seq"] for row in rows(subject)] == [0, 1]
+    assert [row["seq"] for row in drained(subject)] == [0, 1]
 
 
 def test_what_the_transport_lost_is_said_so() -> None:
@@ -225,7 +225,6 @@ def test_a_row_of_a_long_trace_in_which_bytes_were_changed_costs_no_more_than_of
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(seeds, st.integers(2, 9), st.integers(0, 3))
 def test_arrivals_at_one_time_are_ordered_and_are_shown_in_that_order(seed: int, count: int, tick_ms: int) -> None:
     """With a delivery tick many packets arrive at the same time: then sender, number and receiver decide."""
@@ -279,3 +278,21 @@ def test_frames_on_their_way_load_no_module(monkeypatch: pytest.MonkeyPatch) -> 
         subject.transmit(number * PERIOD_NS, number % 4, [b"x"])
         assert len(list(subject.advance(number * PERIOD_NS + PERIOD_NS // 2))) == 3
     assert set(sys.modules) == before
+
+
+def test_numbers_names_and_stages() -> None:
+    assert [outcome.value for outcome in Outcome] == list(range(len(Outcome))), "they index tables"
+    assert Outcome(7) is Outcome.fault and Outcome.fault.title == "fault" and Outcome.peer_cap.title == "peer cap"
+    assert set(Outcome) - set(DRAWN) == {Outcome.pending, Outcome.out_of_range}
+    assert DRAWN[0] is Outcome.delivered
+    staged = {outcome for outcome in Outcome if outcome.stage is not None}
+    assert staged == {*DRAWN}
+    assert decided_at(Stage.SENDER) == ("queue_full", "oversize", "held_back", "no_grant")
+    assert decided_at(Stage.ARRIVAL) == ("delivered", "receiver_down", "transport")
+
+
+def test_outcomes_are_told_apart_by_colour_and_by_sign() -> None:
+    colours = [PALETTE[outcome.colour] for outcome in DRAWN]
+    for shade in ("light", "dark", "either"):
+        assert len({getattr(colour, shade) for colour in colours}) == len(DRAWN)
+    assert len({outcome.sign for outcome in DRAWN}) == len(DRAWN)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import emulator
@@ -14,7 +14,7 @@ from emulator.radio.dot11p import abilities_of, airtime_ns
 from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio as RadioSection
 from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, fault
-from tests.support.radio import engine, line
+from tests.support.radio import drained, engine, line
 from vnet import Node
 from vnet.radio import Radio, SentFrame
 
@@ -48,15 +48,13 @@ def run(coroutine: Any) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
 @given(st.floats(-40, 0), st.sampled_from(RATES_MBPS), st.integers(20, 200))
 def test_power_shifts_the_received_one_and_rate_the_airtime(
     gain_db: float, rate_mbps: float, distance_m: int
 ) -> None:
     subject = engine(line(0, distance_m), **PHYSICAL)
     subject.transmit(0, 0, [bytes(300), SentFrame("v0", bytes(300), 20 + gain_db, rate_mbps)])
-    subject.drain()
-    usual, chosen = subject.trace.to_table().to_pylist()
+    usual, chosen = drained(subject)
     assert chosen["rssi_dbm"] - usual["rssi_dbm"] == pytest.approx(gain_db, abs=0.011)
     if "gain_db" in chosen:
         assert (usual["gain_db"], usual["bitrate_mbps"]) == (0, 6)
@@ -69,8 +67,7 @@ def test_a_weak_frame_is_in_range_but_fades_and_a_fast_one_needs_a_better_signal
     subject = engine(line(0, 300), **PHYSICAL)
     choices: list[dict[str, Any]] = [{}, {"power_dbm": 5.0}, {"rate_mbps": 27.0}, {"rate_mbps": 3.0}]
     subject.transmit(0, 0, [SentFrame("v0", bytes(300), **chosen) for chosen in choices])
-    subject.drain()
-    outcomes = [row["outcome"] for row in subject.trace.to_table().to_pylist()]
+    outcomes = [row["outcome"] for row in drained(subject)]
     assert outcomes == ["delivered", "faded", "faded", "delivered"]
 
 
@@ -80,8 +77,7 @@ def test_a_weak_frame_keeps_the_medium_free_beyond_its_own_range() -> None:
         subject = engine(line(0, 300), **PHYSICAL)
         subject.transmit(0, 0, [SentFrame("v0", bytes(1000), power_dbm)])
         subject.transmit(MS, 1, [bytes(100)])
-        subject.drain()
-        first, second = subject.trace.to_table().to_pylist()
+        first, second = drained(subject)
         assert (second["on_air_ns"] < first["left_ns"]) is together
 
 
@@ -144,16 +140,10 @@ async def varies(node: Node) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("mac", [True, False], ids=["medium", "queues"])
 def test_the_checks_know_of_powers_and_rates(mac: bool, tmp_path: Path) -> None:
-    radio = {
-        "path_loss": {"kind": "log_distance", "tx_power_dbm": 45.0},
-        "max_peers": 1000,
-        **({"mac": {}} if mac else {}),
-    }
-    scenario = {
-        "run": {"duration_s": 2.0, "settle_s": 0.0},
-        "network": {"vehicles": 8, "layout": "dense"},
-        "radio": {**radio, "fading": {}},
-    }
+    path_loss = {"kind": "log_distance", "tx_power_dbm": 45.0}
+    radio = {"path_loss": path_loss, "max_peers": 1000, **({"mac": {}} if mac else {})}
+    run, network = {"duration_s": 2.0, "settle_s": 0.0}, {"vehicles": 8, "layout": "dense"}
+    scenario = {"run": run, "network": network, "radio": {**radio, "fading": {}}}
     result = emulator.simulate(scenario, program=varies, out=tmp_path / "run")
     found = {check.name: check.verdict for check in result.checks}
     for name in ("fading", "latency", "conservation", *(["medium"] if mac else [])):
@@ -192,8 +182,7 @@ def test_a_stale_frame_has_the_addressee_power_and_rate_of_the_old_one_and_its_s
 def test_a_frame_to_nobody_leaves_no_columns_for_its_choices() -> None:
     subject = engine(line(0, 50), **PHYSICAL)
     subject.transmit(0, 0, [SentFrame("v0", b"x", 5.0, 12.0, to="v9"), b"y"])
-    subject.drain()
-    (row,) = subject.trace.to_table().to_pylist()
+    (row,) = drained(subject)
     assert not {"gain_db", "attempt"} & row.keys()
 
 

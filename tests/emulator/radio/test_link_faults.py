@@ -282,6 +282,4 @@ def test_a_flood_fills_the_senders_own_queue_and_has_draws_of_its_own() -> None:
     rows = [row for row in air.rows() if link(row) == ("v1", "v0")]
     assert Counter(row["outcome"] for row in rows)["queue_full"] >= 20 * 30
     lost = {seq: {r["copy"]: r["outcome"] for r in rows if r["seq"] == seq} for seq in range(20)}
-    assert len({tuple(sorted(outcomes.items())) for outcomes in lost.values()}) > 15, (
-        "each copy is drawn for itself"
-    )
+    assert len({tuple(sorted(outcomes.items())) for outcomes in lost.values()}) > 15, "each is drawn for itself"

@@ -17,6 +17,7 @@ from emulator.scenario.radio import Buildings as Section
 from emulator.scenario.scenario import Radio
 from emulator.world.buildings import Buildings
 from emulator.world.radio_inputs import RadioInputs
+from tests.support.radio import drained
 
 pytestmark = pytest.mark.slow
 
@@ -217,8 +218,7 @@ def test_around_a_corner_a_frame_is_weaker_by_the_walls_and_the_way_inside() -> 
     for floor_dbm, expected in ((-150.0, [20 - 47.86 - 20 * np.log10(np.hypot(100, 60)) - loss]), (-94.0, [])):
         subject = engine(AROUND_IT, path_loss={"kind": "log_distance", "floor_dbm": floor_dbm})
         subject.transmit(0, 0, [b"x"])
-        subject.drain()
-        rows = {row["receiver"]: row for row in subject.trace.to_table().to_pylist()}
+        rows = {row["receiver"]: row for row in drained(subject)}
         assert rows["v2"]["outcome"] == "delivered" and rows["v2"]["rssi_dbm"] == pytest.approx(-67.86, abs=0.006)
         assert [rows["v1"]["rssi_dbm"] for _ in expected] == [pytest.approx(each, abs=0.006) for each in expected]
         assert ("v1" in rows) == bool(expected), "below the floor it is out of range"
@@ -232,8 +232,7 @@ def test_who_is_hidden_behind_a_building_counts_neither_for_the_peer_cap_nor_for
         subject = engine(position_m, max_peers=2, mac={}, **radio)
         for sender in (1, 2, 3):
             subject.transmit(sender * 10_000_000, sender, [b"x"])
-        subject.drain()
-        rows = subject.trace.to_table().to_pylist()
+        rows = drained(subject)
         assert {r["sender"] for r in rows if r["receiver"] == "v0" and r["outcome"] == "delivered"} == heard
     together = engine(AROUND_IT[:2], mac={})
     for sender in (0, 1):

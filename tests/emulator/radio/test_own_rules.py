@@ -265,12 +265,15 @@ def handled(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
         assert signal.getsignal(own_functions.WAKE_UP) is handler
 
 
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["here", "on another thread"])
 @pytest.mark.parametrize("name", ["sleeps", "locks_up"])
-def test_a_rule_that_waits_is_interrupted_and_handlers_stay(name: str, handled: list[int]) -> None:
-    air, free = chatted(rule(name), periods=3), chatted(periods=3)
+def test_a_rule_that_waits_is_left_and_handlers_stay(name: str, elsewhere: bool, handled: list[int]) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        call = (lambda *given, **more: pool.submit(chatted, *given, **more).result()) if elsewhere else chatted
+        air = call(rule(name), periods=3)
     (failure,) = air.failures
     assert failure.error.startswith("does not answer within 0 s of waiting (rules.py:")
-    assert air.rows() == free.rows()
+    assert air.rows() == chatted(periods=3).rows()
     assert handled == [], "no handler but the call's own saw the signal"
 
 
@@ -281,15 +284,6 @@ def test_other_signals_of_the_kind_reach_the_handler_of_before(
     air = chatted(rule("alarms"), periods=2)
     assert air.failures == []
     assert handled == [own_functions.WAKE_UP] * 10
-
-
-@pytest.mark.parametrize("name", ["sleeps", "locks_up"])
-def test_a_rule_that_waits_on_another_thread_is_left_behind(name: str, handled: list[int]) -> None:
-    with ThreadPoolExecutor(1) as pool:
-        air = pool.submit(chatted, rule(name), periods=3).result()
-    (failure,) = air.failures
-    assert failure.error.startswith("does not answer within 0 s of waiting (rules.py:")
-    assert air.rows() == chatted(periods=3).rows()
 
 
 def test_a_rule_that_computes_on_another_thread_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,10 +335,7 @@ def test_calls_are_bounded_one_by_one_and_not_in_sum(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        (
-            "tests.support.nowhere:rule",
-            "cannot import: ModuleNotFoundError: No module .*nowhere'",
-        ),
+        ("tests.support.nowhere:rule", "cannot import: ModuleNotFoundError: No module .*nowhere'"),
         ("tests.support.rules:nobody", r"module tests.support.rules \(.*rules.py\) has no 'nobody'"),
         ("tests.support.rules:NUMBER", r"is not a function of a frame and a state: def NUMBER\(frame, state\)"),
         ("tests.support.rules:waits", r"is not a function of a frame and a state: def waits\(frame, state\)"),

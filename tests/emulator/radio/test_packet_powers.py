@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.support.radio import engine, line
+from tests.support.radio import drained, engine, line
 from vnet.transport import wire
 
 MS = 1_000_000
@@ -43,8 +43,7 @@ def test_interference_counts_by_the_time_that_it_lasts() -> None:
     (lone,) = subject.advance(10 * MS)
     subject.transmit(10 * MS, 0, [bytes(300)])
     subject.transmit(10 * MS + 300_000, 2, [bytes(300)])
-    subject.drain()
-    rows = [row for row in subject.trace.to_table().to_pylist() if row["receiver"] == "v1"]
+    rows = [row for row in drained(subject) if row["receiver"] == "v1"]
     _, first, second = sorted(rows, key=lambda row: row["sent_ns"])
     left_ns, other_ns = first["left_ns"], second["on_air_ns"]
     share = (left_ns - other_ns) / (left_ns - first["on_air_ns"] - 40_000)
@@ -76,8 +75,7 @@ def test_fading_is_in_the_power_and_the_trace_has_what_the_packet_says() -> None
 def test_a_frame_that_never_was_on_air_has_no_power_in_the_trace() -> None:
     subject = engine(line(0, 60), path_loss=LOG_DISTANCE, mac={}, queue_frames=1)
     subject.transmit(0, 0, [bytes(100)] * 3)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    rows = drained(subject)
     assert [row["rssi_dbm"] is None for row in rows] == [row["outcome"] == "queue_full" for row in rows]
     assert any(row["outcome"] == "queue_full" for row in rows)
 

@@ -14,7 +14,7 @@ from emulator.radio.topology import Topology, connectivity_of, distances_m
 from emulator.scenario.loading import dump_scenario, load_scenario
 from emulator.scenario.scenario import Radio, Scenario
 from tests.support.motion import along, scenario_of_trips, write_trips
-from tests.support.radio import engine, line, nist_qpsk_half
+from tests.support.radio import drained, engine, line, nist_qpsk_half
 from tests.support.recorded import prepared
 
 MS = 1_000_000
@@ -31,8 +31,7 @@ def test_the_longest_frames_destroy_each_other_between_hidden_terminals() -> Non
     subject = engine(line(0, 450, 900), **radio)
     subject.transmit(0, 0, [bytes(65_000)])
     subject.transmit(50_000, 2, [bytes(65_000)])
-    subject.drain()
-    outcomes = [row["outcome"] for row in subject.trace.to_table().to_pylist() if row["receiver"] == "v1"]
+    outcomes = [row["outcome"] for row in drained(subject) if row["receiver"] == "v1"]
     assert outcomes == ["collided", "collided"]
 
 
@@ -94,8 +93,7 @@ def test_without_fading_the_threshold_is_a_circle() -> None:
     """20 dBm are -82 dBm after 509.3 m, and -94 dBm, the floor, after 2 028 m."""
     subject = engine(line(0, 509, 510, 2027, 2029), path_loss={"kind": "log_distance"})
     subject.transmit(0, 0, [bytes(300)])
-    subject.drain()
-    outcomes = [row["outcome"] for row in subject.trace.to_table().to_pylist()]
+    outcomes = [row["outcome"] for row in drained(subject)]
     assert outcomes == ["delivered", "faded", "faded"]
     assert subject.counts[Outcome.out_of_range] == 1
 
@@ -154,8 +152,7 @@ def test_without_a_medium_frames_do_not_interfere() -> None:
     subject = engine(line(0, 50, 100), path_loss={"kind": "free_space"})
     for node in range(3):
         subject.transmit(0, node, [bytes(300)])
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    rows = drained(subject)
     assert {row["outcome"] for row in rows} == {"delivered"}
     assert "on_air_ns" not in rows[0]
     assert all(448_000 + 2 * MS <= row["arrival_ns"] <= 448_000 + 3 * MS for row in rows)

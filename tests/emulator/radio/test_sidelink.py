@@ -1,7 +1,8 @@
 """Sidelinks: laws of the MAC, outcomes in their order, and exact probabilities of small grids."""
 
 from collections import Counter
-from itertools import groupby, pairwise, product
+from collections.abc import Iterable
+from itertools import accumulate, groupby, pairwise, product
 from math import sqrt
 from typing import Any
 
@@ -17,7 +18,7 @@ from emulator.scenario.radio import WinnerB1
 from emulator.scenario.scenario import Radio, least_transit_ns
 from tests.emulator.radio.test_csma import crowds, planned, run, scattered
 from tests.support.faulty_engine import FaultyEngine
-from tests.support.radio import engine, line
+from tests.support.radio import drained, engine, line
 from vnet.radio import SentFrame
 
 MS, S = 1_000_000, 1_000_000_000
@@ -53,8 +54,22 @@ def beacons(
     for time_ns, node in sends:
         subject.transmit(time_ns, node, [SentFrame("", bytes(size), period_ms=period_ms)])
         subject.advance(time_ns)
-    subject.drain()
-    return subject.trace.to_table().to_pylist()
+    return drained(subject)
+
+
+def sent(
+    radio: dict[str, Any],
+    frames: Iterable[tuple[int, int, float | None]],
+    seed: int = 1,
+    metres: int = 50,
+    **more: Any,
+) -> list[dict[str, Any]]:
+    """Let one vehicle send to another, at times in ns, bytes with a period in ms; return the rows of the trace."""
+    subject = engine(line(0, metres), seed, access_jitter_ms=0.0, **radio, **more)
+    for time_ns, size, period_ms in frames:
+        subject.advance(time_ns)
+        subject.transmit(time_ns, 0, [SentFrame("", bytes(size), period_ms=period_ms)])
+    return drained(subject)
 
 
 # Reading.
@@ -78,9 +93,7 @@ def test_winner_b1_is_the_published_formula() -> None:
     expected = np.maximum(np.where(far_m < 177.4, near, beyond), free)
     assert loss_db(model, far_m) == pytest.approx(expected)
     high = loss_db(model, np.array([300.0]), (np.array([6.0]), np.array([1.5])))
-    assert high == pytest.approx(22.7 * np.log10(300) + 27 + 20 * np.log10(5.91)), (
-        "the breakpoint is four times as far"
-    )
+    assert high == pytest.approx(22.7 * np.log10(300) + 27 + 20 * np.log10(5.91)), "beyond the breakpoint"
 
 
 # Time.
@@ -101,7 +114,6 @@ def test_however_time_is_cut_the_same_happens(
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(0, 400 * MS), min_size=1, max_size=12, unique=True), kinds, keys)
 def test_frames_go_on_air_in_whole_slots_and_never_arrive_within_the_window(
     times_ns: list[int], radio: dict[str, Any], keys: dict[str, Any]
@@ -140,12 +152,7 @@ def test_periodic_frames_keep_their_resource_for_the_counter_and_change_it_then(
 
 
 def test_a_period_is_learned_from_frames_where_a_program_does_not_say_it() -> None:
-    subject = engine(line(0, 50), **LTE)
-    for n in range(60):
-        subject.transmit(n * 50 * MS, 0, [b"x"])
-        subject.advance(n * 50 * MS)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()[30:]
+    rows = sent(LTE, ((n * 50 * MS, 1, None) for n in range(60)))[30:]
     gaps = Counter((b["on_air_ns"] - a["on_air_ns"]) // MS for a, b in pairwise(rows))
     assert gaps[50] > 0.7 * len(rows)
 
@@ -153,14 +160,10 @@ def test_a_period_is_learned_from_frames_where_a_program_does_not_say_it() -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("radio", [LTE, NR])
 def test_flows_of_two_periods_have_a_reservation_each(radio: dict[str, Any]) -> None:
-    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, keep_probability=0.8))
-    for n in range(100):
-        for period_ms, size in ((100, 100), (200, 120))[: 2 - n % 2]:
-            subject.transmit(n * 100 * MS, 0, [SentFrame("", bytes(size), period_ms=period_ms)])
-        subject.advance(n * 100 * MS)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
-    for size, period_ms in ((100, 100), (120, 200)):
+    flows = (100, 100), (200, 120)
+    frames = ((n * 100 * MS, size, ms) for n in range(100) for ms, size in flows[: 2 - n % 2])
+    rows = sent(with_mac(radio, keep_probability=0.8), frames)
+    for period_ms, size in flows:
         on_air_ns = [row["on_air_ns"] for row in rows if row["size_bytes"] == size]
         kept = sum(after - before == period_ms * MS for before, after in pairwise(on_air_ns))
         assert kept >= 0.8 * len(on_air_ns)
@@ -172,14 +175,8 @@ def test_flows_of_two_periods_have_a_reservation_each(radio: dict[str, Any]) -> 
 @pytest.mark.parametrize("radio", [LTE, NR, with_mac(NR, sensing_ms=100)])
 def test_reservations_of_one_sender_never_meet(radio: dict[str, Any], again: bool) -> None:
     """No frame waits for a slot in which another flow transmits, and none loses its second transmission by one."""
-    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, t2_ms=30, retransmit=again))
-    for n in range(600):
-        for period_ms in (100, 200, 300):
-            if n * 100 % period_ms == 0:
-                subject.transmit(n * 100 * MS, 0, [SentFrame("", b"x", period_ms=period_ms)])
-        subject.advance(n * 100 * MS)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    frames = ((n * 100 * MS, 1, ms) for n in range(600) for ms in (100, 200, 300) if n * 100 % ms == 0)
+    rows = sent(with_mac(radio, t2_ms=30, retransmit=again), frames)
     assert max(row["left_ns"] - row["sent_ns"] for row in rows) <= 31 * MS
     slot_ns = MS if radio is LTE else MS // 2
     assert min(row["left_ns"] - row["on_air_ns"] for row in rows) >= (2 if again else 1) * slot_ns
@@ -187,33 +184,19 @@ def test_reservations_of_one_sender_never_meet(radio: dict[str, Any], again: boo
 
 @pytest.mark.slow
 def test_frames_with_a_resource_of_their_own_are_sent_twice_beside_others() -> None:
-    subject = engine(
-        line(0, 50), access_jitter_ms=0.0, **with_mac(NR, scheduling="dynamic", retransmit=True, t2_ms=40)
-    )
-    for n in range(800):
-        subject.transmit(n * 100 * MS // 4, 0, [SentFrame("", b"x")])
-        subject.advance(n * 100 * MS // 4)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    radio = with_mac(NR, scheduling="dynamic", retransmit=True, t2_ms=40)
+    rows = sent(radio, ((n * 25 * MS, 1, None) for n in range(800)))
     assert min(row["left_ns"] - row["on_air_ns"] for row in rows) >= MS
 
 
 def test_a_reservation_that_is_too_short_for_a_frame_leaves_its_slot() -> None:
-    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(NR, scs_khz=15))
-    for n in range(300):
-        subject.transmit(n * 2 * MS, 0, [SentFrame("", bytes(100 + n % 7 * 60), period_ms=2)])
-        subject.advance(n * 2 * MS)
-    subject.drain()
-    assert {row["outcome"] for row in subject.trace.to_table().to_pylist()} == {"delivered"}
+    rows = sent(with_mac(NR, scs_khz=15), ((n * 2 * MS, 100 + n % 7 * 60, 2) for n in range(300)))
+    assert {row["outcome"] for row in rows} == {"delivered"}
 
 
 def test_queue_frames_counts_the_frames_of_all_flows() -> None:
-    subject = engine(line(0, 50), access_jitter_ms=0.0, queue_frames=2, **LTE)
-    for time_ms, period_ms in ((0, 100), (1, 200), (2, 300)):
-        subject.transmit(time_ms * MS, 0, [SentFrame("", b"x", period_ms=period_ms)])
-        subject.advance((time_ms + 1) * MS)
-    subject.drain()
-    assert [row["outcome"] for row in subject.trace.to_table().to_pylist()].count("queue_full") == 1
+    rows = sent(LTE, ((n * MS, 1, 100 * (n + 1)) for n in range(3)), queue_frames=2)
+    assert [row["outcome"] for row in rows].count("queue_full") == 1
 
 
 def test_re_evaluation_leaves_a_resource_alone_that_nobody_has_reserved() -> None:
@@ -226,50 +209,31 @@ def test_re_evaluation_leaves_a_resource_alone_that_nobody_has_reserved() -> Non
 def test_flows_that_use_all_slots_leave_some_frames_without_a_place(
     scs_khz: int, periods_ms: tuple[int, ...], again: bool
 ) -> None:
-    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(NR, scs_khz=scs_khz, retransmit=again))
-    for n in range(200):
-        for period_ms in periods_ms:
-            subject.transmit(n * MS, 0, [SentFrame("", bytes(50), period_ms=period_ms)])
-        subject.advance(n * MS)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    frames = ((n * MS, 50, period_ms) for n in range(200) for period_ms in periods_ms)
+    rows = sent(with_mac(NR, scs_khz=scs_khz, retransmit=again), frames)
     outcomes = Counter(row["outcome"] for row in rows)
     assert outcomes["delivered"] >= (90 if again else 190)
     assert set(outcomes) <= {"delivered", "no_grant", "queue_full"} and len(rows) == 200 * len(periods_ms)
     slot_ns = MS * 15 // scs_khz
-    sent = [{row["on_air_ns"], row["left_ns"] - slot_ns} for row in rows if row["on_air_ns"] is not None]
-    assert max(Counter(begin for begins in sent for begin in begins).values()) == 1, "one transmission a slot"
+    begun = [{row["on_air_ns"], row["left_ns"] - slot_ns} for row in rows if row["on_air_ns"] is not None]
+    assert max(Counter(begin for begins in begun for begin in begins).values()) == 1, "one transmission a slot"
 
 
 @pytest.mark.parametrize("radio", [LTE, NR])
 def test_a_frame_that_would_wait_longer_than_t2_has_a_resource_of_its_own(radio: dict[str, Any]) -> None:
-    subject = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, t2_ms=20))
-    for time_ms in (0, 500, 1000, 1200):
-        subject.transmit(time_ms * MS, 0, [SentFrame("", b"x", period_ms=500)])
-        subject.advance(time_ms * MS)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    rows = sent(with_mac(radio, t2_ms=20), ((time_ms * MS, 1, 500) for time_ms in (0, 500, 1000, 1200)))
     assert max(row["left_ns"] - row["sent_ns"] for row in rows) <= 22 * MS
 
 
 def test_a_frame_keeps_its_window_where_a_longer_one_ends_the_reservation_it_waits_for() -> None:
-    def sent(seed: int, *frames: tuple[int, int]) -> list[dict[str, Any]]:
-        subject = engine(line(0, 50), seed, access_jitter_ms=0.0, **LTE)
-        for time_ns, size in frames:
-            subject.advance(time_ns)
-            subject.transmit(time_ns, 0, [SentFrame("", bytes(size), period_ms=100)])
-        subject.drain()
-        rows: list[dict[str, Any]] = subject.trace.to_table().to_pylist()
-        return rows
-
     for seed in range(8):
-        first_ns = sent(seed, (0, 50))[0]["on_air_ns"]
-        rows = sent(seed, (0, 50), (first_ns + 2 * MS, 50), (first_ns + 70 * MS, 500))
+        first_ns = sent(LTE, [(0, 50, 100)], seed)[0]["on_air_ns"]
+        frames = [(0, 50, 100), (first_ns + 2 * MS, 50, 100), (first_ns + 70 * MS, 500, 100)]
+        rows = sent(LTE, frames, seed)
         assert [row["on_air_ns"] - row["sent_ns"] <= 100 * MS for row in rows] == [True] * 3
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.tuples(st.sampled_from([0, 2, 30, 150]), st.sampled_from([50, 300, 500])), min_size=2, max_size=40),
     st.sampled_from([LTE, with_mac(LTE, one_shot=True), NR]),
@@ -279,13 +243,9 @@ def test_a_frame_keeps_its_window_where_a_longer_one_ends_the_reservation_it_wai
 def test_no_frame_waits_beyond_its_window_whatever_the_others_size(
     frames: list[tuple[int, int]], radio: dict[str, Any], t2_ms: int, period_ms: int
 ) -> None:
-    subject, time_ms = engine(line(0, 50), access_jitter_ms=0.0, **with_mac(radio, t2_ms=t2_ms)), 0
-    for gap_ms, size in frames:
-        time_ms += gap_ms
-        subject.advance(time_ms * MS)
-        subject.transmit(time_ms * MS, 0, [SentFrame("", bytes(size), period_ms=period_ms)])
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    times_ms = accumulate(gap_ms for gap_ms, _ in frames)
+    each = ((ms * MS, size, period_ms) for ms, (_, size) in zip(times_ms, frames, strict=True))
+    rows = sent(with_mac(radio, t2_ms=t2_ms), each)
     assert len(rows) == len(frames)
     for row in rows:
         assert row["outcome"] in ("delivered", "queue_full", "no_grant")
@@ -302,9 +262,7 @@ def test_one_shots_leave_the_reservation_now_and_then() -> None:
     rows = beacons(engine(line(0, 50), **with_mac(LTE, one_shot=True)), 1, 60.0)
     phase = [row["on_air_ns"] % (100 * MS) for row in rows]
     is_shot = [at not in (before, after) for before, at, after in zip(phase, phase[1:], phase[2:], strict=False)]
-    assert max(len(list(run)) for is_one, run in groupby(is_shot) if not is_one) == 5, (
-        "the sixth is one at the latest"
-    )
+    assert max(len(list(run)) for is_one, run in groupby(is_shot) if not is_one) == 5, "the sixth is one"
     kept = [(n, at) for n, (at, is_one) in enumerate(zip(phase[1:], is_shot, strict=False)) if not is_one]
     first = [n for n, at in (next(run) for _, run in groupby(kept, lambda each: each[1]))]
     assert 9 < np.mean(np.diff(first)) < 11.5, "the counter of 5 to 15 frames counts them"
@@ -321,12 +279,9 @@ def test_one_shots_take_nothing_from_the_probability_to_keep_a_resource() -> Non
 
 @pytest.mark.parametrize("scheduling", ["sps", "dynamic"])
 def test_no_more_frames_wait_than_the_queue_has_however_they_are_scheduled(scheduling: str) -> None:
-    subject = engine(line(0, 50), queue_frames=2, access_jitter_ms=0.0, **with_mac(NR, scheduling=scheduling))
-    for time_ns in range(0, 60 * MS, 3 * MS):
-        subject.advance(time_ns)
-        subject.transmit(time_ns, 0, [SentFrame("", bytes(20), period_ms=100)])
-    subject.drain()
-    taken = [row for row in subject.trace.to_table().to_pylist() if row["outcome"] != "queue_full"]
+    frames = ((time_ns, 20, 100) for time_ns in range(0, 60 * MS, 3 * MS))
+    rows = sent(with_mac(NR, scheduling=scheduling), frames, queue_frames=2)
+    taken = [row for row in rows if row["outcome"] != "queue_full"]
     mac = Radio.model_validate(NR).sidelink
     assert mac is not None
     decided = [row["on_air_ns"] - (mac.t1_slots - 1) * mac.slot_ns for row in taken]
@@ -339,35 +294,22 @@ def test_no_more_frames_wait_than_the_queue_has_however_they_are_scheduled(sched
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_one_shot_that_ends_a_reservation_leaves_nothing_that_waited_for_it(seed: int) -> None:
-    subject = engine(line(0, 50), seed, access_jitter_ms=0.0, **with_mac(LTE, one_shot=True))
-    for time_ms, size in [*((each, 50) for each in (100, 200, 220, 320, 420, 520, 620, 720, 820)), (840, 500)]:
-        subject.advance(time_ms * MS)
-        subject.transmit(time_ms * MS, 0, [SentFrame("", bytes(size), period_ms=100)])
-    subject.drain()
-    assert len(subject.trace.to_table()) == 10
+    times_ms = (100, 200, 220, 320, 420, 520, 620, 720, 820, 840)
+    frames = ((time_ms * MS, 500 if time_ms == 840 else 50, 100) for time_ms in times_ms)
+    assert len(sent(with_mac(LTE, one_shot=True), frames, seed)) == 10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("radio", [LTE, NR])
 def test_a_burst_delays_no_frame_that_follows_it(radio: dict[str, Any]) -> None:
-    subject = engine(line(0, 50), access_jitter_ms=0.0, **radio)
-    for n in range(250):
-        for _ in range(6 if n == 50 else 1):
-            subject.transmit(n * 20 * MS, 0, [SentFrame("", b"x", period_ms=20)])
-        subject.advance(n * 20 * MS)
-    subject.drain()
-    rows = [row for row in subject.trace.to_table().to_pylist() if row["sent_ns"] > 1.1 * S]
+    frames = ((n * 20 * MS, 1, 20) for n in range(250) for _ in range(6 if n == 50 else 1))
+    rows = [row for row in sent(radio, frames) if row["sent_ns"] > 1.1 * S]
     assert max(row["on_air_ns"] - row["sent_ns"] for row in rows) <= 25 * MS
 
 
 @pytest.mark.slow
 def test_one_shots_leave_no_frame_behind() -> None:
-    subject = engine(line(0, 50), **with_mac(LTE, one_shot=True))
-    for n in range(500):
-        subject.transmit(n * 20 * MS, 0, [b"x"])
-        subject.advance(n * 20 * MS)
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    rows = sent(with_mac(LTE, one_shot=True), ((n * 20 * MS, 1, None) for n in range(500)))
     assert max(row["on_air_ns"] - row["sent_ns"] for row in rows) <= 102 * MS
 
 
@@ -395,8 +337,7 @@ def test_equal_signals_on_one_resource_collide_and_beside_each_other_do_not() ->
         for n in range(300):
             for node in (0, 1):
                 subject.transmit(n * 50 * MS, node, [b"x"])
-        subject.drain()
-        rows = subject.trace.to_table().to_pylist()
+        rows = drained(subject)
         heard = [row for row in rows if row["receiver"] == "v2"]
         times = Counter(row["on_air_ns"] for row in heard)
         together = [row["outcome"] for row in heard if times[row["on_air_ns"]] == 2]
@@ -433,12 +374,8 @@ def test_noise_is_that_of_the_subchannels_on_which_a_frame_went_out() -> None:
     faded = Counter[int]()
     for sizes in ((380,), (380, 190)):
         noisy = LTE | {"receiver": {"noise_figure_db": 23.0}}
-        subject = engine(line(0, 320), access_jitter_ms=0.0, **with_mac(noisy, keep_probability=0.8))
-        for n in range(1000):
-            subject.transmit(n * 100 * MS, 0, [SentFrame("", bytes(sizes[n % len(sizes)]), period_ms=100)])
-            subject.advance(n * 100 * MS)
-        subject.drain()
-        for row in subject.trace.to_table().to_pylist():
+        frames = ((n * 100 * MS, sizes[n % len(sizes)], 100) for n in range(1000))
+        for row in sent(with_mac(noisy, keep_probability=0.8), frames, metres=320):
             faded[len(sizes)] += row["outcome"] == "faded"
     assert faded[1] > 100 and chance(faded[2], 1000, faded[1] / 1000)
 
@@ -452,9 +389,9 @@ def test_occupancy_limit_drops_frames_of_a_busy_channel_alone(again: bool) -> No
     outcomes = Counter(row["outcome"] for row in rows if row["receiver"] == "v0")
     assert outcomes["no_grant"] > 0.3 * outcomes.total()
     on_air = [row for row in rows if row["on_air_ns"] is not None]
-    sent = {(row["sender"], begin) for row in on_air for begin in (row["on_air_ns"], row["left_ns"] - MS)}
-    for sender in {sender for sender, _ in sent}:
-        begins = sorted(on_air_ns for each, on_air_ns in sent if each == sender)
+    begun = {(row["sender"], begin) for row in on_air for begin in (row["on_air_ns"], row["left_ns"] - MS)}
+    for sender in {sender for sender, _ in begun}:
+        begins = sorted(on_air_ns for each, on_air_ns in begun if each == sender)
         assert all(later - first >= S for first, later in zip(begins, begins[4:], strict=False))
     quiet = beacons(engine(line(0, 50), **LTE | {"congestion": {**limit["congestion"], "busy": [0.2]}}), 2, 3.0)
     assert "no_grant" not in {row["outcome"] for row in quiet}
@@ -463,15 +400,13 @@ def test_occupancy_limit_drops_frames_of_a_busy_channel_alone(again: bool) -> No
 def test_a_full_queue_and_a_throttle_act_as_on_other_macs() -> None:
     subject = engine(line(0, 50), queue_frames=1, **LTE)
     subject.transmit(0, 0, [b"x", b"y", b"z"])
-    subject.drain()
-    outcomes = Counter(row["outcome"] for row in subject.trace.to_table().to_pylist())
+    outcomes = Counter(row["outcome"] for row in drained(subject))
     assert outcomes == {"delivered": 1, "queue_full": 2}
     slowed = engine(line(0, 50), **LTE)
     throttle = Throttle(kind="throttle", bitrate_mbps=0.01, at_s=0.0, duration_s=1.0)
     slowed.set_faults([planned(0, throttle, (0, S), 2, 0)], 0)
     slowed.transmit(0, 0, [bytes(100)])
-    slowed.drain()
-    (row,) = slowed.trace.to_table().to_pylist()
+    (row,) = drained(slowed)
     assert row["on_air_ns"] >= 80 * MS
 
 
@@ -480,8 +415,7 @@ def test_duplicates_and_copies_are_as_on_other_macs() -> None:
     again = Duplicate(kind="duplicate", probability=1.0, delay_ms=2.0, at_s=0.0, duration_s=1.0)
     subject.set_faults([planned(0, again, (0, S), 2)], 0)
     subject.transmit(0, 0, [b"x"])
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    rows = drained(subject)
     assert [row["copy"] for row in rows] == [0, 1] and rows[1]["arrival_ns"] == rows[0]["arrival_ns"] + 2 * MS
 
 
@@ -517,8 +451,7 @@ def test_dynamic_selections_meet_as_often_as_all_pairs_of_choices_say(slots: int
     for n in range(trials):
         for node in (0, 1):
             subject.transmit(n * 300 * MS + MS // 2, node, [b"x"])
-    subject.drain()
-    rows = subject.trace.to_table().to_pylist()
+    rows = drained(subject)
     pairs = list(product(product(range(slots), range(subchannels)), repeat=2))
     same_slot = sum(one[0] == other[0] for one, other in pairs) / len(pairs)
     same = sum(one == other for one, other in pairs) / len(pairs)

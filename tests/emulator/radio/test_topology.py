@@ -73,7 +73,6 @@ def test_rows_of_neighbours_and_matrices_give_the_same_run(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 30), st.integers(1, 6), st.booleans())
 def test_the_cap_admits_the_same_links_of_both(seed: int, count: int, cap: int, is_matrix: bool) -> None:
     rng = np.random.default_rng(seed)

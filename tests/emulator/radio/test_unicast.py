@@ -13,7 +13,7 @@ from emulator.radio.dot11p import AIFSN_AND_CW, MAX_WINDOW, SIFS_NS, SLOT_NS, ai
 from emulator.radio.engine import Engine
 from emulator.radio.frames import Receptions, Transmission, UnicastResult
 from emulator.radio.unicast import ACK_BYTES, ACK_TIMEOUT_NS, EIFS_NS, MOST_ATTEMPTS, ack_airtime_ns
-from tests.support.radio import engine, line
+from tests.support.radio import drained, engine, line
 from vnet.radio import SentFrame
 
 MS = 1_000_000
@@ -30,9 +30,7 @@ sends = st.lists(
 """Frames: time, sender, and addressee: one of five vehicles, or nobody, or all."""
 radios = st.fixed_dictionaries(
     {
-        "mac": st.fixed_dictionaries(
-            {"access_category": st.sampled_from([*AIFSN_AND_CW]), "eifs": st.booleans()},
-        ),
+        "mac": st.fixed_dictionaries({"access_category": st.sampled_from([*AIFSN_AND_CW]), "eifs": st.booleans()}),
         "loss": st.sampled_from([0.0, 0.4, 0.9]),
         "fading": st.sampled_from([None, {}]),
         "max_peers": st.sampled_from([2, 1000]),
@@ -149,8 +147,7 @@ def test_others_keep_silent_until_an_acknowledgement_that_they_cannot_sense_has_
         subject = engine(line(0, 350, -350), **PHYSICAL)
         subject.transmit(0, 0, [SentFrame("v0", bytes(200), to=f"v{to}" if to < 6 else None)])
         subject.transmit(AIFS_NS + 50_000, 2, [bytes(200)])
-        subject.drain()
-        first, second = (next(row for row in rows_of(subject) if row["sender"] == f"v{n}") for n in (0, 2))
+        first, second = (next(row for row in drained(subject) if row["sender"] == f"v{n}") for n in (0, 2))
         slots, rest = divmod(second["on_air_ns"] - first["left_ns"] - silent_ns - AIFS_NS, SLOT_NS)
         assert rest == 0 and 0 <= slots <= 15
 
@@ -164,8 +161,7 @@ def test_a_backoff_that_counts_stops_where_a_frame_is_read_and_not_sensed() -> N
         subject.transmit(0, 2, [bytes(200)])
         subject.transmit(start_ns, 0, [SentFrame("v0", bytes(20), to="v1")])
         subject.transmit(start_ns, 2, [bytes(200)])
-        subject.drain()
-        rows = rows_of(subject)
+        rows = drained(subject)
         left_ns = next(row["left_ns"] for row in rows if row["sender"] == "v0")
         after_ns = next(row["on_air_ns"] for row in rows if (row["sender"], row["seq"]) == ("v2", 1)) - left_ns
         slots, rest = divmod(after_ns - silent_ns, SLOT_NS)
@@ -193,8 +189,7 @@ def test_who_cannot_decode_a_broadcast_waits_longer_only_if_asked_to(eifs: bool)
     subject = engine(line(0, 400), **{**PHYSICAL, "mac": {"eifs": eifs}})
     subject.transmit(0, 0, [SentFrame("v0", bytes(300), rate_mbps=27.0)])
     subject.transmit(AIFS_NS + 50_000, 1, [bytes(200)])
-    subject.drain()
-    first, second = rows_of(subject)
+    first, second = drained(subject)
     assert first["outcome"] == "faded"
     slots, rest = divmod(second["on_air_ns"] - first["left_ns"] - AIFS_NS - (EIFS_NS if eifs else 0), SLOT_NS)
     assert rest == 0 and 0 <= slots <= 15
@@ -220,8 +215,7 @@ def test_a_vehicle_that_is_down_acknowledges_nothing_and_is_told_nothing() -> No
     subject = engine(line(0, 50), **PHYSICAL)
     subject.transmit(0, 0, [SentFrame("v0", b"x", to="v1")])
     subject.set_up(0, False)
-    subject.drain()
-    assert subject.take_results(10**12) == [] and rows_of(subject)[0]["acked"]
+    assert subject.take_results(10**12) == [] and drained(subject)[0]["acked"]
     assert subject.next_result_ns() is None
 
 
@@ -295,8 +289,7 @@ def test_what_becomes_of_an_attempt_does_not_depend_on_the_looks_at_the_engine(s
         subject.set_up(1, False)
         for stop_ns in stops:
             subject.advance(stop_ns)
-        subject.drain()
-        return [row["outcome"] for row in rows_of(subject)]
+        return [row["outcome"] for row in drained(subject)]
 
     at_once = outcomes([])
     assert outcomes(range(LATENCY_NS, 60 * MS, 100_000)) == at_once

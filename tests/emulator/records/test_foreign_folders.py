@@ -12,27 +12,18 @@ import pytest
 
 from emulator.checks.judge import check_run
 from emulator.records import tables
-from emulator.scenario.scenario import Scenario
 from emulator.stream import messages
 from tests.support.recorded import recorded
 from vnet.errors import VnetError
 
-FILES = (
-    "scenario.toml",
-    "verdict.json",
-    "events.jsonl",
-    "trace.parquet",
-    "states.parquet",
-    "metrics.parquet",
-    "world.npz",
-)
+TABLES = ("trace.parquet", "states.parquet", "metrics.parquet")
+FILES = ("scenario.toml", "verdict.json", "events.jsonl", *TABLES, "world.npz")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scenario = Scenario.model_validate(
-        {"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "program": {"entry": "agents.beacon:main"}}
-    )
+    network, program = {"vehicles": 3}, {"entry": "agents.beacon:main"}
+    scenario = {"run": {"duration_s": 1.0}, "network": network, "program": program}
     return recorded(scenario, tmp_path_factory.mktemp("foreign") / "run")
 
 

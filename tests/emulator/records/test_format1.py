@@ -27,14 +27,10 @@ def run(tmp_path: Path) -> Path:
     return copy
 
 
-def give_inputs(run: Path) -> None:
-    path = run / "scenario.toml"
-    path.write_text(path.read_text().replace("/nowhere/", f"{FOLDER}/inputs/"))
-
-
 @pytest.mark.slow
 def test_with_its_inputs_every_reader_reads_it(run: Path, tmp_path: Path) -> None:
-    give_inputs(run)
+    scenario = run / "scenario.toml"
+    scenario.write_text(scenario.read_text().replace("/nowhere/", f"{FOLDER}/inputs/"))
     judgement = check_run(run)
     assert judgement.verdict is Verdict.VALID
     assert judgement.trace_sha256 == RecordedRun.open(run).record.trace_sha256

@@ -125,7 +125,6 @@ def test_every_figure_is_the_one_that_its_definition_gives(seed: int, count: int
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 30), st.sampled_from([0.0, 0.02, 0.6, 1.0]))
 def test_the_figures_of_many_periods_are_those_of_each_bit_by_bit(
     seed: int, vehicles: int, periods: int, missing: float
@@ -153,9 +152,7 @@ def _random_report(rng: np.random.Generator, node: str, missing: float) -> Repor
     matrix = rng.normal(0, 1, (2, 2))
     covariance = (matrix @ matrix.T).ravel().tolist() if rng.random() < 0.9 else [0.0] * 4
     sizes = {"common_error_m": 2, "stacked_common_error_m": 2, "mean_m": 2}
-    values: Values = {
-        name: rng.normal(0, 1, size).tolist() for name, size in sizes.items() if rng.random() >= missing
-    }
+    values: Values = {name: rng.normal(0, 1, n).tolist() for name, n in sizes.items() if rng.random() >= missing}
     if rng.random() >= missing:
         values["common_error_covariance_m2"] = covariance
     x_m, y_m = rng.normal(0, 1, 2).tolist()

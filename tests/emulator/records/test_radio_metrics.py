@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.checks.judge import RecordedRun
-from emulator.records.radio_metrics import radio_metrics, rows_of_pairs
+from emulator.records.radio_metrics import radio_metrics, rows_of_pairs, unicast_figures
 from emulator.records.tables import STATES
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import run_scenario
+from tests.support.exchange_programs import COPYING, exchange_run
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
 PERIOD_NS = 100_000_000
@@ -163,7 +164,6 @@ def close(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(traces())
 def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.ndarray, bool]) -> None:
     rows, position_m, moves = trace
@@ -176,7 +176,6 @@ def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.n
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(traces(), st.floats(5, 300), st.floats(0, 0.9))
 def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(
     trace: tuple[list[Row], np.ndarray, bool], within_m: float, from_s: float
@@ -190,7 +189,6 @@ def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(traces(), st.floats(5, 200))
 def test_vehicles_distances_and_totals_add_up(trace: tuple[list[Row], np.ndarray, bool], bin_m: float) -> None:
     rows, position_m, moves = trace
@@ -253,11 +251,8 @@ def test_how_busy_a_vehicle_finds_the_medium_is_of_the_time_in_which_it_is_there
 
 def test_frames_that_are_lost_on_their_way_to_who_is_down_are_no_attempts(tmp_path: Path) -> None:
     fault = {"kind": "kill", "nodes": ["v03"], "at_s": 1.0, "duration_s": 2.0}
-    sections = {
-        "run": {"duration_s": 5.0, "settle_s": 1.0},
-        "network": {"vehicles": 3},
-        "radio": {"loss": 0.3, "range_m": 1e5},
-    }
+    run, radio = {"duration_s": 5.0, "settle_s": 1.0}, {"loss": 0.3, "range_m": 1e5}
+    sections = {"run": run, "network": {"vehicles": 3}, "radio": radio}
     program = {"entry": "agents.beacon:main"}
     recorded = run_scenario(tmp_path, Scenario.model_validate(sections | {"program": program, "fault": [fault]}))
     links = [link for link in radio_metrics(recorded).links.to_pylist() if link["receiver"] == "v03"]
@@ -271,3 +266,21 @@ def test_a_run_in_which_nothing_was_sent_has_no_links(tmp_path: Path) -> None:
     told = radio_metrics(evidence_of([], np.zeros((1, 3, 2)), moves=False))
     assert not len(told.links) and not len(told.distances) and len(told.vehicles) == 3
     assert told.totals["delivery_ratio"] is None
+
+
+@pytest.mark.slow
+def test_figures_of_frames_to_one_vehicle_are_what_the_program_was_told(tmp_path: Path) -> None:
+    """Also of those that faults have lost or altered, and without those that faults have sent again."""
+    lossy = [
+        {"kind": "loss", "at_s": 0.4, "duration_s": 0.2, "probability": 1.0, "nodes": ["b"]},
+        {"kind": "corrupt", "at_s": 0.0, "duration_s": 0.2, "probability": 1.0},
+        {"kind": "StaleMessages", "at_s": 0.6, "duration_s": 0.2, "age_s": 0.05, "nodes": ["a"]},
+    ]
+    recorded = exchange_run(tmp_path, [*COPYING, *lossy])
+    told = [event.details["details"] for event in recorded.event("event")]
+    assert len(told) == 80 and {row["cause"] for row in recorded.trace.to_pylist()} >= {"loss-2", "corrupt-3"}
+    figures = unicast_figures(recorded)
+    assert figures is not None
+    assert figures.sent == len(told)
+    assert figures.acknowledged == sum(each["delivered"] for each in told)
+    assert figures.retries == sum(each["attempts"] - 1 for each in told)

@@ -50,16 +50,18 @@ async def guess(node: Node) -> None:
         node.report(fix.position_m, fix.covariance_m2, middle_m=[0.0, 0.0])
 
 
-SCENARIO = {
-    "run": {"duration_s": 2.0, "settle_s": 0.0},
-    "network": {"vehicles": 3},
-    "program": {"entry": f"{__name__}:guess"},
-}
+SCENARIO = Scenario.model_validate(
+    {
+        "run": {"duration_s": 2.0, "settle_s": 0.0},
+        "network": {"vehicles": 3},
+        "program": {"entry": f"{__name__}:guess"},
+    }
+)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulate_into(Scenario.model_validate(SCENARIO), tmp_path_factory.mktemp("runs") / "run")
+    return simulate_into(SCENARIO, tmp_path_factory.mktemp("runs") / "run")
 
 
 @pytest.mark.slow
@@ -95,7 +97,7 @@ def test_a_recording_and_the_live_picture_have_a_declared_figure(run: Path, tmp_
             recorder.take(stream, message)
     curve = read_back(tmp_path / "run.rrd")["/figures/middle"]
     assert list(curve.static["SeriesLines:names"]) == ["RMSE"]
-    session = Session(Scenario.model_validate(SCENARIO), tmp_path / "again")
+    session = Session(SCENARIO, tmp_path / "again")
     course = Course(session.emulation)
     session.open().run()
     console = Console(file=io.StringIO(), width=100, height=20)
@@ -121,10 +123,7 @@ def test_a_folder_shows_declared_charts_where_the_program_is_not_installed(run: 
 def test_views_of_a_folder_that_cannot_be_are_one_line(run: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(run, tmp_path / "run"))
     verdict = json.loads((folder / "verdict.json").read_text())
-    for change, said in {
-        "id": "<b>",
-        "lines": {},
-    }.items():
+    for change, said in {"id": "<b>", "lines": {}}.items():
         wrong = {**verdict, "views": {"charts": [{**verdict["views"]["charts"][0], change: said}]}}
         (folder / "verdict.json").write_text(json.dumps(wrong))
         with pytest.raises(VnetError, match=rf"verdict\.json: views\.charts\.0\.{change}"):
@@ -189,6 +188,21 @@ class Broken:
         return Broken.answer(len(periods["fix_m"]))
 
 
+BrokenRun = Callable[[Callable[[int], Any]], Path]
+
+
+@pytest.fixture
+def broken(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> BrokenRun:
+    """Simulate with a figure whose function answers so."""
+    monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:Broken")
+
+    def run(answer: Callable[[int], Any]) -> Path:
+        monkeypatch.setattr(Broken, "answer", answer, raising=False)
+        return simulate_into(SCENARIO, tmp_path / "run")
+
+    return run
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("answer", "said"),
@@ -206,12 +220,10 @@ class Broken:
     ],
 )
 def test_figures_that_fail_are_named_and_the_rest_is_kept(
-    answer: Callable[[int], Any], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    answer: Callable[[int], Any], said: str, monkeypatch: pytest.MonkeyPatch, broken: BrokenRun
 ) -> None:
-    monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:Broken")
-    monkeypatch.setattr(Broken, "answer", answer, raising=False)
     monkeypatch.setattr(own_functions, "LIMIT_S", 0.2)
-    folder = simulate_into(Scenario.model_validate(SCENARIO), tmp_path / "run")
+    folder = broken(answer)
     verdicts = {check.name: (check.verdict.value, check.text) for check in check_run(folder).checks}
     assert verdicts["own_rules"][0] == "invalid"
     assert verdicts["own_rules"][1].startswith(f"FIGURES ({__name__}:Broken) {said}")
@@ -225,27 +237,20 @@ def test_figures_that_fail_are_named_and_the_rest_is_kept(
 
 
 @pytest.mark.slow
-def test_figures_that_fail_for_several_periods_together_are_computed_one_by_one(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("answer", "kept"),
+    [
+        (lambda count: {"half": [0.5]}, [0.5] * 20),
+        (lambda count: {"half": np.where(np.arange(count) < 9, np.nan, 2)}, [None] * 9 + [2.0] * 11),
+    ],
+    ids=["fails for several periods together, and is computed one by one", "not finite, and a whole number"],
+)
+def test_figures_that_are_odd_are_kept(
+    broken: BrokenRun, answer: Callable[[int], Any], kept: list[float | None]
 ) -> None:
-    monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:Broken")
-    monkeypatch.setattr(Broken, "answer", lambda count: {"half": [0.5]}, raising=False)
-    folder = simulate_into(Scenario.model_validate(SCENARIO), tmp_path / "run")
+    folder = broken(answer)
     assert {check.name: check.verdict.value for check in check_run(folder).checks}["metrics"] == "valid"
-    assert pq.read_table(folder / "metrics.parquet")["half"].to_pylist() == [0.5] * 20
-
-
-@pytest.mark.slow
-def test_a_figure_that_is_not_finite_or_a_whole_number_is_one(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setitem(globals(), "FIGURES", f"{__name__}:Broken")
-    monkeypatch.setattr(
-        Broken, "answer", lambda count: {"half": np.where(np.arange(count) < 9, np.nan, 2)}, raising=False
-    )
-    folder = simulate_into(Scenario.model_validate(SCENARIO), tmp_path / "run")
-    assert {check.name: check.verdict.value for check in check_run(folder).checks}["metrics"] == "valid"
-    assert pq.read_table(folder / "metrics.parquet")["half"].to_pylist() == [None] * 9 + [2.0] * 11
+    assert pq.read_table(folder / "metrics.parquet")["half"].to_pylist() == kept
 
 
 @pytest.mark.parametrize("kind", [Wrong, OfTexts])
@@ -257,7 +262,7 @@ def test_a_declaration_that_cannot_be_is_refused(kind: type, monkeypatch: pytest
 
 @pytest.mark.slow
 def test_a_run_that_ends_before_its_first_period_has_the_columns_of_its_program(tmp_path: Path) -> None:
-    scenario = Scenario.model_validate({**SCENARIO, "program": {"entry": "agents.cooperative:main"}})
+    scenario = Scenario.model_validate({"program": {"entry": "agents.cooperative:main"}})
     Session(scenario, tmp_path / "run").open().close()
     judged = check_run(tmp_path / "run", own_checks=True)
     assert not [check.text for check in judged.checks if check.name.startswith("own:")], "none is applicable"

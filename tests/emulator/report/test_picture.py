@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from emulator.drivers.session import Session
 from emulator.pages.canvas import BLUE
 from emulator.records.events import SAID, SAMPLES
 from emulator.report.drawing import Line, time_figure
@@ -25,7 +24,7 @@ from emulator.report.picture import (
     write_picture,
 )
 from emulator.report.source import Source
-from emulator.scenario.scenario import Scenario
+from tests.support.recorded import recorded
 from vnet.errors import VnetError
 from vnet.node import Node
 
@@ -42,18 +41,14 @@ async def tell(node: Node) -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("picture") / "run"
     fault = {"kind": "partition", "at_s": 0.3, "duration_s": 0.3, "groups": [["v01"], ["v02", "v03"]]}
-    tables: dict[str, Any] = {
+    scenario = {
         "program": {"entry": f"{__name__}:tell"},
         "run": {"name": "r", "duration_s": 1.0, "settle_s": 0.2},
         "network": {"vehicles": 3},
         "fault": [fault],
     }
-    session = Session(Scenario.model_validate(tables), folder).open()
-    session.run()
-    session.close()
-    return folder
+    return recorded(scenario, tmp_path_factory.mktemp("picture") / "run")
 
 
 def test_a_picture_has_map_and_curves_without_a_display(

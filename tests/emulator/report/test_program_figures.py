@@ -7,7 +7,6 @@ from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import classes
 from emulator.report.program_figures import points, program_charts, text_shares, usual_periods
 from emulator.report.source import Source
-from emulator.scenario.scenario import Scenario
 from tests.support.recorded import recorded
 from vnet import Node
 
@@ -31,16 +30,9 @@ async def talkative(node: Node) -> None:
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Source:
     """A run of one second."""
-    folder = tmp_path_factory.mktemp("run") / "run"
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": 1.0, "settle_s": 0.1},
-            "network": {"vehicles": 4, "layout": "dense"},
-            "program": {"entry": f"{__name__}:talkative"},
-        }
-    )
-    recorded(scenario, folder)
-    return Source(folder)
+    run, network = {"duration_s": 1.0, "settle_s": 0.1}, {"vehicles": 4, "layout": "dense"}
+    scenario = {"run": run, "network": network, "program": {"entry": f"{__name__}:talkative"}}
+    return Source(recorded(scenario, tmp_path_factory.mktemp("run") / "run"))
 
 
 @pytest.mark.slow

@@ -13,16 +13,7 @@ from emulator.pages.page import render
 from emulator.records.events import Event
 from emulator.records.recorded_run import Emissions
 from emulator.report.source import Source
-from emulator.report.timeline import (
-    Bar,
-    Mark,
-    Timeline,
-    bars_of,
-    choose,
-    marks_of,
-    points_of,
-    timeline,
-)
+from emulator.report.timeline import Bar, Mark, Timeline, bars_of, choose, marks_of, points_of, timeline
 from emulator.scenario.scenario import Scenario
 
 PROGRAM = """

@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -131,7 +131,6 @@ def written_faults(draw: st.DrawFn) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(st.lists(written_faults(), max_size=5))
 def test_any_faults_survive_being_written_and_read(
     tmp_path_factory: pytest.TempPathFactory, written: list[dict[str, Any]]
@@ -159,7 +158,6 @@ def same(one: FaultPlan, other: FaultPlan) -> bool:
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(st.lists(written_faults(), max_size=5), st.data())
 def test_a_plan_as_it_is_written_down_is_the_same_plan_whatever_was_healed(
     tmp_path_factory: pytest.TempPathFactory, written: list[dict[str, Any]], data: st.DataObject

@@ -24,9 +24,3 @@ def test_draws_of_frames_keep_their_values() -> None:
 @pytest.mark.parametrize("other", [stream(2, "gnss", 3), stream(1, "heading", 3), stream(1, "gnss", 4)])
 def test_seed_name_and_item_each_make_another_stream(other: np.random.Generator) -> None:
     assert (stream(1, "gnss", 3).random(4) != other.random(4)).all()
-
-
-def test_draws_of_a_frame_depend_on_no_other_frame() -> None:
-    one, other = Draws(1, "loss"), Draws(1, "loss")
-    one.uniform(5, 1, 3)
-    assert one.uniform(2, 9, 4).tolist() == other.uniform(2, 9, 4).tolist()

@@ -49,9 +49,9 @@ def test_what_is_no_toml_or_much_too_large_is_one_line(tmp_path: Path, text: str
     assert all(part in message for part in parts), message
 
 
-def test_overrides_win_and_bare_words_are_strings(tmp_path: Path) -> None:
+def test_overrides_win_the_last_of_two_and_bare_words_are_strings(tmp_path: Path) -> None:
     path = write(tmp_path, "[radio]\nloss = 0.1")
-    scenario = load_scenario(path, ["radio.loss=0.3", "program.options.fusion=random", "run.seed=7"])
+    scenario = load_scenario(path, ["radio.loss=0.3", "program.options.fusion=random", "run.seed=2", "run.seed=7"])
     assert scenario.radio.loss == 0.3
     assert scenario.program.options == {"fusion": "random"}
     assert scenario.run.seed == 7
@@ -64,10 +64,6 @@ def test_bytes_that_are_no_scenario_are_one_line(tmp_path: Path, folder: bool) -
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)
     assert str(caught.value).startswith(f"{path}: {'cannot be read' if folder else 'not valid TOML'}")
-
-
-def test_the_last_of_two_overrides_wins(tmp_path: Path) -> None:
-    assert load_scenario(write(tmp_path, ""), ["run.seed=2", "run.seed=3"]).run.seed == 3
 
 
 def test_a_dumped_scenario_is_the_same_scenario(tmp_path: Path) -> None:
@@ -114,21 +110,11 @@ OPTIONS = st.recursive(
     options=st.dictionaries(st.text(), OPTIONS, max_size=4),
 )
 def test_any_scenario_survives_its_dump(
-    tmp_path_factory: pytest.TempPathFactory,
-    seed: int,
-    loss: float,
-    duration_s: float,
-    layout: str,
-    options: dict[str, object],
+    tmp_path_factory: Any, seed: int, loss: float, duration_s: float, layout: str, options: dict[str, object]
 ) -> None:
-    original = Scenario.model_validate(
-        {
-            "run": {"seed": seed, "duration_s": duration_s},
-            "network": {"layout": layout},
-            "radio": {"loss": loss},
-            "program": {"options": options},
-        }
-    )
+    run, program = {"seed": seed, "duration_s": duration_s}, {"options": options}
+    sections = {"run": run, "network": {"layout": layout}, "radio": {"loss": loss}, "program": program}
+    original = Scenario.model_validate(sections)
     path = tmp_path_factory.mktemp("dump") / "s.toml"
     path.write_bytes(dump_scenario(original).encode())
     again = load_scenario(path)
@@ -136,7 +122,7 @@ def test_any_scenario_survives_its_dump(
     assert math.copysign(1, again.radio.loss) == math.copysign(1, loss)
 
 
-def test_a_changed_input_file_is_noticed(tmp_path: Path) -> None:
+def test_an_input_file_that_has_changed_or_is_gone_is_noticed(tmp_path: Path) -> None:
     (tmp_path / "n.csv").write_text(CSV)
     original = load_scenario(write(tmp_path, "[network]\nkind = 'file'\npath = 'n.csv'"))
     recorded = tmp_path / "recorded.toml"
@@ -144,12 +130,6 @@ def test_a_changed_input_file_is_noticed(tmp_path: Path) -> None:
     (tmp_path / "n.csv").write_text(CSV.replace("0,0,0", "0,1,0"))
     with pytest.raises(ScenarioError, match=r"n\.csv has changed"):
         load_scenario(recorded)
-
-
-def test_an_input_file_that_is_gone_is_noticed(tmp_path: Path) -> None:
-    (tmp_path / "n.csv").write_text(CSV)
-    recorded = tmp_path / "recorded.toml"
-    recorded.write_text(dump_scenario(load_scenario(write(tmp_path, "[network]\nkind = 'file'\npath = 'n.csv'"))))
     (tmp_path / "n.csv").unlink()
     with pytest.raises(ScenarioError, match=r"n\.csv'?: no such file"):
         load_scenario(recorded)
@@ -275,3 +255,28 @@ def test_missing_extras_of_maps_and_sumo_are_named_before_the_world_is_built(
     )
     with pytest.raises(ScenarioError, match=library):
         scenario.require_extras()
+
+
+def loaded(tmp_path: Path, text: str) -> str:
+    path = tmp_path / "units.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_two_lines_declare_a_unit_which_runs_the_program_of_vehicles(tmp_path: Path) -> None:
+    scenario = load_scenario(Path(loaded(tmp_path, "[[roadside]]\nposition_m = [10, 20]\n")))
+    assert [unit.name for unit in scenario.roadside] == ["rsu01"]
+    assert scenario.program.of("rsu01").entry == scenario.program.entry
+
+
+def test_a_program_of_its_own_survives_recording(tmp_path: Path) -> None:
+    (tmp_path / "unit.py").write_text("async def main(node): ...\n")
+    text = '[[roadside]]\nposition_m = [0, 0]\nid = "gate"\nentry = "unit.py"\noptions = { green_s = 20 }\n'
+    scenario = load_scenario(Path(loaded(tmp_path, text + "[[roadside]]\nposition_m = [1, 0]\n")))
+    assert [unit.name for unit in scenario.roadside] == ["gate", "rsu02"]
+    assert (scenario.program.of("gate").entry, scenario.program.of("gate").options) == (
+        "unit:main",
+        {"green_s": 20},
+    )
+    again = load_scenario(Path(loaded(tmp_path, dump_scenario(scenario))))
+    assert again.program == scenario.program and dump_scenario(again) == dump_scenario(scenario)

@@ -1,15 +1,15 @@
 """The scenario of a call from Python: its sources, its changes, and what is wrong with either in one line."""
 
 from datetime import date
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 import pytest
 
-from emulator.scenario.loading import as_overrides, parse_values, scenario_of
+from emulator.scenario.loading import as_overrides, parse_values, scenario_of, wrong_value
 from tests.support.paths import ROOT
-from vnet.errors import ScenarioError
+from vnet.errors import OverrideError, ScenarioError
 
 
 def test_a_path_a_name_data_and_a_scenario_are_sources() -> None:
@@ -103,3 +103,17 @@ def test_values_of_a_list_are_toml_or_bare_words(text: str, values: list[Any]) -
 
 def test_overrides_are_one_line_each() -> None:
     assert as_overrides({"run.name": "ü\n", "radio.loss": 1}) == ['run.name="ü\\n"', "radio.loss=1"]
+
+
+def test_of_several_overrides_of_a_section_none_is_blamed_for_what_all_make() -> None:
+    problem, path = "run: tape goes with order", PurePath("s.toml")
+    both = ["run.order=shuffle", "run.tape=t"]
+    assert str(wrong_value(path, problem, both)) == f"s.toml: {problem}"
+    assert isinstance(wrong_value(path, problem, both[1:]), OverrideError)
+    assert isinstance(wrong_value(path, "run.tape = 3: a path", both), OverrideError)
+    of_one = wrong_value(
+        path, "radio.mac: reservation_ms = 150: 100 or 200", ["radio.mac.kind=a", "radio.mac.reservation_ms=150"]
+    )
+    assert isinstance(of_one, OverrideError) and of_one.key == "radio.mac.reservation_ms"
+    of_list = wrong_value(path, "radio.mac: bler.2 = 5: less", ["radio.mac.kind=a", "radio.mac.bler=[1, 5]"])
+    assert isinstance(of_list, OverrideError) and of_list.key == "radio.mac.bler"

@@ -162,7 +162,5 @@ def test_nothing_moves_while_events_and_frames_come(height: int) -> None:
     for shot in shots:
         lines = rows(shot, height=height)
         labels = [line.split()[0] if line[:1].strip() else "" for line in lines]
-        places.add(
-            (len(lines), *(labels.index(name) for name in ("time", "vehicles", "common", "frames", "events")))
-        )
+        places.add((len(lines), *map(labels.index, ("time", "vehicles", "common", "frames", "events"))))
     assert len(places) == 1

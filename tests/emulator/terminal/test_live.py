@@ -19,7 +19,6 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
-from emulator.scenario.scenario import Scenario
 from emulator.terminal.live import MOST_WAITING, LivePicture, SafeConsole
 from tests.support.command_line import app
 from tests.support.recorded import recorded
@@ -53,9 +52,8 @@ def test_control_characters_are_shown_in_whatever_holds_them() -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scenario = Scenario.model_validate(
-        {"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "program": {"entry": "agents.beacon:main"}}
-    )
+    network, program = {"vehicles": 3}, {"entry": "agents.beacon:main"}
+    scenario = {"run": {"duration_s": 1.0}, "network": network, "program": program}
     return recorded(scenario, tmp_path_factory.mktemp("safe") / "run")
 
 

@@ -45,9 +45,7 @@ def test_the_first_line_that_is_no_mere_note_is_shown(tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     says = ["log('quiet')", "log('first', 'warning')", "log('second', 'error')"]
     Path("loud.py").write_text("async def main(node):\n" + "".join(f"    node.{each}\n" for each in says))
-    done = CliRunner().invoke(
-        app, ["simulate", "twelve", "--program", "loud.py", "--no-report", "--duration", "0.1"]
-    )
+    done = CliRunner().invoke(app, ["simulate", "twelve", "--program", "loud.py", "--no-report", "--duration=0.1"])
     (line,) = [line for line in done.output.splitlines() if line.startswith("log ")]
     assert "v01: first" in line
     assert "24 warnings" in line

@@ -34,14 +34,17 @@ pytestmark = pytest.mark.slow
 pytest_plugins = "pytester"
 
 
-def planted(program: str) -> Scenario:
-    return Scenario.model_validate(
-        {
-            "run": {"name": "planted", "duration_s": 2.0, "settle_s": 0.5},
-            "network": {"vehicles": 4},
-            "program": {"entry": f"tests.emulator.testing.programs:{program}"},
-        }
-    )
+def planted(program: str, vehicles: int = 4, **changes: Any) -> Scenario:
+    run: dict[str, Any] = {"name": "planted", "duration_s": 2.0, "settle_s": 0.5, **changes}
+    entry = f"tests.emulator.testing.programs:{program}"
+    return Scenario.model_validate({"run": run, "network": {"vehicles": vehicles}, "program": {"entry": entry}})
+
+
+def failure_of(plan: Plan, folder: Path) -> dict[str, Any]:
+    """The row of the only run of a campaign, which fails."""
+    assert run(plan, folder)[0] == 1
+    (row,) = results_of(folder)
+    return row
 
 
 def results_of(folder: Path) -> list[dict[str, Any]]:
@@ -105,9 +108,7 @@ def test_a_campaign_finds_a_nondeterministic_program_if_asked(tmp_path: Path) ->
     status, _ = run(Plan.of(planted("sends_a_set"), "none", 1, seed=1), tmp_path / "unasked")
     assert status == 0
     plan = Plan.of(planted("sends_a_set"), "none", 1, seed=1, shrink_steps=3, check_determinism=True)
-    status, _ = run(plan, folder)
-    assert status == 1
-    (row,) = results_of(folder)
+    row = failure_of(plan, folder)
     assert list(row["failed"]) == ["replay"]
     assert "programs.py:" in row["failed"]["replay"]
     test = (Path(row["folder"]) / TEST_FILE).read_text()
@@ -130,19 +131,14 @@ def test_on_an_executor_a_campaign_finds_the_same(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
         there = run_campaign(plan, tmp_path / "there", quiet, executor)
     assert here == there == 1
-    told = [
-        [{**row, "wall_s": 0, "folder": ""} for row in results_of(tmp_path / name)] for name in ("here", "there")
-    ]
+    told = [[{**row, "wall_s": 0, "folder": ""} for row in results_of(tmp_path / n)] for n in ("here", "there")]
     assert told[0] == told[1]
     kept = next(row for row in results_of(tmp_path / "there") if "failed" in row)
     assert (Path(kept["folder"]) / "verdict.json").exists(), "what has failed is kept on this machine"
 
 
 def test_a_fatal_signal_is_the_death_of_its_vehicle(tmp_path: Path) -> None:
-    plan = Plan.of(planted("faulty"), "none", 1, seed=1, shrink_steps=3)
-    status, _ = run(plan, tmp_path / "campaign")
-    (row,) = results_of(tmp_path / "campaign")
-    assert status == 1
+    row = failure_of(Plan.of(planted("faulty"), "none", 1, seed=1, shrink_steps=3), tmp_path / "campaign")
     assert list(row["failed"]) == ["agents_alive"]
     assert "SIGSEGV" in row["failed"]["agents_alive"]
     verdict = json.loads((Path(row["folder"]) / "verdict.json").read_text())
@@ -194,9 +190,7 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
     )
     checks = [f"{tmp_path}/own_campaign_checks.py:{function}" for function in ("paused", "broken")]
     scenario = make_scenario(planted("proud"), {"program": "agents.beacon:main"})
-    status, said = run(
-        Plan.of(make_scenario(scenario, {"checks": checks}), "pause", 1, seed=1), tmp_path / "paused"
-    )
+    status, said = run(Plan.of(make_scenario(scenario, {"checks": checks}), "pause", 1, 1), tmp_path / "paused")
     assert status == 1
     (row,) = results_of(tmp_path / "paused")
     assert row["failed"] == {"own:unpaused": "1 pauses"}
@@ -207,10 +201,8 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
 
 
 def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path, pytester: pytest.Pytester) -> None:
-    folder = tmp_path / "campaign"
     plan = Plan.of(planted("stubborn"), "kill", 1, seed=1, limit_s=1.0, shrink_steps=0)
-    assert run(plan, folder)[0] == 1
-    (row,) = results_of(folder)
+    row = failure_of(plan, tmp_path / "campaign")
     assert row["failed"] == {"hung": "not over within 1 s of wall clock; logs/stacks.txt says where it stood"}
     assert load_scenario(Path(row["folder"]) / "scenario.toml").fault
     assert "hung" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)
@@ -232,9 +224,7 @@ def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path, pytester:
     plan = Plan.of(planted("proud"), "partition,block", 3, seed=1, shrink_steps=4)
     run(plan, tmp_path / "proud")
     assert any("finite" in row.get("failed", {}) for row in results_of(tmp_path / "proud"))
-    status, _ = run(Plan.of(planted("growing"), "loss", 1, seed=1, shrink_steps=2), tmp_path / "growing")
-    assert status == 1
-    (row,) = results_of(tmp_path / "growing")
+    row = failure_of(Plan.of(planted("growing"), "loss", 1, seed=1, shrink_steps=2), tmp_path / "growing")
     assert list(row["failed"]) == ["growth"]
     assert row["shrunk"] == "", "it grows without any fault"
     assert "growth" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)

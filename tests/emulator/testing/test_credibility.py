@@ -57,10 +57,7 @@ def test_a_campaign_is_compared_with_the_one_before_the_fix() -> None:
 
 
 def test_a_fault_s_own_checks_count_together_and_a_foreign_row_counts_nothing() -> None:
-    found: list[dict[str, object]] = [
-        {"checks": {"effect:kill-0": "invalid", "effect:kill-1": "invalid"}},
-        {"checks": 3},
-        {},
-    ]
+    kills = dict.fromkeys(["effect:kill-0", "effect:kill-1"], "invalid")
+    found: list[dict[str, object]] = [{"checks": kills}, {"checks": 3}, {}]
     (line,) = after_a_fix(found)
     assert "in 1 of 3 runs" in line

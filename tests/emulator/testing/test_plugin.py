@@ -3,7 +3,7 @@
 import json
 import os
 import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,19 @@ BEACON = ROOT / "scenarios" / "beacon.toml"
 TWELVE = ROOT / "scenarios" / "twelve.toml"
 
 
-def run_tests(pytester: pytest.Pytester, code: str, *options: str) -> pytest.RunResult:
+RunTests = Callable[[str], pytest.RunResult]
+
+
+@pytest.fixture
+def run_tests(pytester: pytest.Pytester) -> RunTests:
     """Run a test module in a session of its own."""
-    header = f"import pytest\nBEACON = {str(BEACON)!r}\nTWELVE = {str(TWELVE)!r}\n"
-    pytester.makepyfile(header + code)
-    return pytester.runpytest(*options)
+
+    def run_code(code: str) -> pytest.RunResult:
+        header = f"import pytest\nBEACON = {str(BEACON)!r}\nTWELVE = {str(TWELVE)!r}\n"
+        pytester.makepyfile(header + code)
+        return pytester.runpytest()
+
+    return run_code
 
 
 def session_of_its_own(pytester: pytest.Pytester, *options: str) -> subprocess.CompletedProcess[str]:
@@ -37,10 +45,8 @@ def verdict_of(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "verdict.json").read_text())
 
 
-def test_a_coroutine_test_steps_a_run_and_checks_it(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_a_coroutine_test_steps_a_run_and_checks_it(run_tests: RunTests) -> None:
+    run_tests("""
 async def test_steps(vnet_emulation):
     async with vnet_emulation(BEACON, vehicles=4, duration=3) as emu:
         assert emu.nodes == ["v01", "v02", "v03", "v04"]
@@ -55,29 +61,24 @@ async def test_steps(vnet_emulation):
         assert sorted(first + second) == emu.nodes and len(first) == len(second)
         judgement = emu.check("conservation", "loss_rate")
         assert judgement.trace_sha256
-""",
-    )
-    result.assert_outcomes(passed=1)
+""").assert_outcomes(passed=1)
 
 
 @pytest.mark.parametrize("options", [["-p", "no:xdist"], ["-n", "2"], ["-s", "-p", "no:faulthandler"]])
 def test_a_fatal_signal_ends_pytest_and_the_vehicle_is_named(pytester: pytest.Pytester, options: list[str]) -> None:
-    pytester.makepyfile(
-        f"""
+    pytester.makepyfile(f"""
 async def test_fatal(vnet_emulation):
     changes = dict(duration=2, settle=0.5, program="tests.emulator.testing.programs:faulty")
     async with vnet_emulation({str(BEACON)!r}, vehicles=3, **changes) as emu:
         await emu.run_until(1.0)
-"""
-    )
+""")
     done = session_of_its_own(pytester, *options)
     assert done.returncode != 0, done.stdout
     assert "vnet: pytest's process ended while the program of v01 ran" in done.stderr.splitlines()
 
 
 def test_a_session_that_ends_as_it_should_says_nothing(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(
-        f"""
+    pytester.makepyfile(f"""
 import os
 async def test_leaves_in_the_midst(vnet_emulation):
     async with vnet_emulation({str(BEACON)!r}, vehicles=2, duration=2, settle=0.5) as emu:
@@ -86,16 +87,13 @@ async def test_leaves_in_the_midst(vnet_emulation):
     if not pid:
         os._exit(0)
     os.waitpid(pid, 0)
-"""
-    )
+""")
     done = session_of_its_own(pytester)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_failed_check_names_the_folder_and_the_command(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_a_failed_check_names_the_folder_and_the_command(run_tests: RunTests) -> None:
+    result = run_tests("""
 async def test_fails(vnet_emulation):
     changes = dict(duration=2, settle=0.5, program="tests.emulator.testing.programs:impatient")
     async with vnet_emulation(BEACON, vehicles=3, **changes) as emu:
@@ -104,8 +102,7 @@ async def test_fails(vnet_emulation):
             await emu.run_for(0.5)
         await emu.run_until(2.0)
         emu.check()
-""",
-    )
+""")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         [
@@ -142,7 +139,7 @@ WRONG_SCENARIOS = {
 }
 
 
-def test_what_cannot_be_is_said(pytester: pytest.Pytester) -> None:
+def test_what_cannot_be_is_said(run_tests: RunTests) -> None:
     steps = [
         f"""
 async def test_step_{number}(vnet_emulation):
@@ -160,30 +157,26 @@ async def test_scenario_{number}(vnet_emulation):
 """
         for number, arguments in enumerate(WRONG_SCENARIOS)
     ]
-    result = run_tests(pytester, "".join(steps + scenarios))
+    result = run_tests("".join(steps + scenarios))
     result.assert_outcomes(failed=len(WRONG_STEPS) + len(WRONG_SCENARIOS))
     result.stdout.fnmatch_lines([*WRONG_STEPS.values(), *WRONG_SCENARIOS.values()])
 
 
-def test_a_program_that_crashes_the_test_itself_leaves_a_judged_run(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_a_program_that_crashes_the_test_itself_leaves_a_judged_run(
+    pytester: pytest.Pytester, run_tests: RunTests
+) -> None:
+    run_tests("""
 async def test_stops(vnet_emulation):
     async with vnet_emulation(BEACON, vehicles=2, duration=9) as emu:
         await emu.run_until(0.5)
         assert emu.figures.reporting == 99
-""",
-    )
-    result.assert_outcomes(failed=1)
+""").assert_outcomes(failed=1)
     (folder,) = (pytester.path.parent / "basetemp").glob("**/vnet-1")
     assert verdict_of(folder)["emulated_s"] == 0.5
 
 
-def test_a_crash_fails_a_test_that_has_not_judged_it(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_a_crash_fails_a_test_that_has_not_judged_it(run_tests: RunTests) -> None:
+    result = run_tests("""
 CRASHED = dict(program="tests.emulator.testing.programs:impatient", vehicles=2, duration=3, settle=1)
 
 def expects(emu):
@@ -199,16 +192,13 @@ async def test_crash(vnet_emulation, judge):
         await emu.run_for(0.5)
         if judge:
             judge(emu)
-""",
-    )
+""")
     result.assert_outcomes(passed=2, failed=2)
     result.stdout.fnmatch_lines(["*agents_alive is invalid: v01 crashed*"])
 
 
-def test_plain_tests_may_use_the_fixture_and_leave_others_alone(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_plain_tests_may_use_the_fixture_and_leave_others_alone(run_tests: RunTests) -> None:
+    result = run_tests("""
 import asyncio
 
 def test_plain(vnet_emulation):
@@ -225,16 +215,13 @@ def test_never_started(vnet_emulation):
 
 async def test_of_nobody():
     pass
-""",
-    )
+""")
     result.assert_outcomes(passed=2, failed=1)
     result.stdout.fnmatch_lines(["*async def functions are not natively supported*"])
 
 
-def test_a_step_that_was_cancelled_goes_on_and_the_next_waits_for_it(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_a_step_that_was_cancelled_goes_on_and_the_next_waits_for_it(run_tests: RunTests) -> None:
+    run_tests("""
 import asyncio
 
 async def test_cancelled(vnet_emulation):
@@ -254,15 +241,11 @@ async def test_left_on_its_way(vnet_emulation):
         step.cancel()
     assert emu.end().trace_sha256
     assert emu.now_s == 0.5
-""",
-    )
-    result.assert_outcomes(passed=2)
+""").assert_outcomes(passed=2)
 
 
-def test_faults_of_all_vehicles_from_the_beginning_on_end_no_run(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_faults_of_all_vehicles_from_the_beginning_on_end_no_run(run_tests: RunTests) -> None:
+    run_tests("""
 @pytest.mark.parametrize("live", [False, True])
 @pytest.mark.parametrize("kind", ["kill", "pause"])
 async def test_all(vnet_emulation, kind, live):
@@ -272,15 +255,11 @@ async def test_all(vnet_emulation, kind, live):
             await emu.run_for(0.25)
         await emu.run_until(2.0)
         assert emu.figures.period == 19
-""",
-    )
-    result.assert_outcomes(passed=4)
+""").assert_outcomes(passed=4)
 
 
-def test_a_block_that_an_error_leaves_ends_its_run_where_it_stands(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_a_block_that_an_error_leaves_ends_its_run_where_it_stands(run_tests: RunTests) -> None:
+    run_tests("""
 import asyncio
 
 @pytest.mark.parametrize("live", [False, True])
@@ -294,15 +273,11 @@ async def test_left(vnet_emulation, live):
                 raise KeyError
     assert 0 < emu.now_s < 800
     assert emu.end().verdict != "invalid"
-""",
-    )
-    result.assert_outcomes(passed=2)
+""").assert_outcomes(passed=2)
 
 
-def test_hypothesis_calls_a_coroutine_test_again_and_again(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_hypothesis_calls_a_coroutine_test_again_and_again(run_tests: RunTests) -> None:
+    result = run_tests("""
 from hypothesis import HealthCheck, given, settings, strategies
 
 @given(at_s=strategies.integers(1, 20))
@@ -313,8 +288,7 @@ async def test_many(vnet_emulation, at_s):
     async with vnet_emulation(BEACON, vehicles=2, duration=3) as emu:
         await emu.run_until(at_s / 10)
         assert at_s < 7
-""",
-    )
+""")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*at_s=7*"])
 
@@ -337,9 +311,9 @@ async def test_both(vnet_emulation, live):
 """
 
 
-def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester) -> None:
+def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester, run_tests: RunTests) -> None:
     """Check that everything the test did, instant by instant, is in the scenario that it leaves."""
-    run_tests(pytester, LIVE_OR_NOT).assert_outcomes(passed=2)
+    run_tests(LIVE_OR_NOT).assert_outcomes(passed=2)
     folders = sorted((pytester.path.parent / "basetemp").glob("**/vnet-1"))
     again = pytester.path / "again"
     command = [*VNET, "simulate", str(folders[0] / "scenario.toml")]
@@ -391,18 +365,14 @@ async def test_it(vnet_emulation, again):
     assert {verdict["verdict"] for verdict in verdicts} == {"valid"}
 
 
-def test_an_order_is_the_same_when_it_is_reproduced(pytester: pytest.Pytester) -> None:
-    result = run_tests(
-        pytester,
-        """
+def test_an_order_is_the_same_when_it_is_reproduced(pytester: pytest.Pytester, run_tests: RunTests) -> None:
+    run_tests("""
 async def test_order(vnet_emulation):
     changes = {"run.order": "pct", "run.order_depth": 5, "radio.delivery_tick_us": 1000}
     changes["program"] = "tests.support.window_programs:improvises"
     async with vnet_emulation(TWELVE, vehicles=4, duration=1, **changes) as emu:
         await emu.run_until(0.5)
-""",
-    )
-    result.assert_outcomes(passed=1)
+""").assert_outcomes(passed=1)
     (folder,) = (pytester.path.parent / "basetemp").glob("**/vnet-1")
     again = pytester.path / "again"
     command = [*VNET, "simulate", str(folder / "scenario.toml")]
@@ -414,38 +384,24 @@ async def test_order(vnet_emulation):
 
 
 def test_a_live_run_whose_program_cannot_be_imported_is_refused_before_it_starts(
-    pytester: pytest.Pytester,
+    pytester: pytest.Pytester, run_tests: RunTests
 ) -> None:
-    result = run_tests(
-        pytester,
-        """
+    result = run_tests("""
 async def test_live(vnet_emulation):
     async with vnet_emulation(BEACON, vehicles=2, program="nothing:main", live=True):
         pass
-""",
-    )
+""")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*ProgramError: program.entry = 'nothing:main': cannot import*"])
     assert not list((pytester.path.parent / "basetemp").glob("**/vnet-1"))
 
 
-def test_the_plugin_imports_nothing_heavy() -> None:
-    """It is loaded into every session of the environment."""
-    code = (
-        "import sys, emulator.testing.plugin; print([m for m in ('numpy', 'zenoh', 'pyarrow') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_a_program_that_ends_the_process_late_does_not_make_it_a_success(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(
-        f"""
+    pytester.makepyfile(f"""
 import atexit, os
 async def test_ends(vnet_emulation):
     async with vnet_emulation({str(BEACON)!r}, vehicles=2, duration=2, settle=0.5) as emu:
         await emu.run_until(1.0)
     atexit.register(os._exit, 0)
-"""
-    )
+""")
     assert session_of_its_own(pytester, "-p", "no:xdist").returncode == 71

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from emulator.records.tape import tape_lines
-from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import FAILURE_PAGE, PARTING_FILE, TEST_FILE, run_campaign
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.trial import fewest, order_text
-from tests.emulator.testing.test_campaign import said_by_pytest
+from tests.emulator.testing.test_campaign import planted, said_by_pytest
 from vnet.transport.wire import Deviation
 
 pytestmark = pytest.mark.slow
@@ -35,13 +34,7 @@ def test_what_fails_together_is_left(needed: set[int]) -> None:
 
 @pytest.mark.parametrize("most", [0, 1, 2, 5])
 def test_a_campaign_shrinks_with_no_more_runs_than_it_is_allowed(tmp_path: Path, most: int) -> None:
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": 1.0, "settle_s": 0.0, "order": "shuffle"},
-            "network": {"vehicles": 2},
-            "program": {"entry": "tests.emulator.testing.programs:tells_before_it_measures"},
-        }
-    )
+    scenario = planted("tells_before_it_measures", 2, duration_s=1.0, settle_s=0.0, order="shuffle")
     plan = Plan.of(scenario, "none", 1, 1, shrink_steps=most, jobs=1)
     assert run_campaign(plan, tmp_path / "campaign", Console(file=io.StringIO())) == 1
     (row,) = json.loads((tmp_path / "campaign" / "campaign.json").read_text())["results"]
@@ -69,13 +62,7 @@ def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(
     tmp_path: Path, pytester: pytest.Pytester
 ) -> None:
     """One deviation of hundreds is left; FIFO does not fail; the test that was written fails, and says why."""
-    scenario = Scenario.model_validate(
-        {
-            "run": {"name": "planted", "duration_s": 2.0, "settle_s": 0.0, "order": "shuffle"},
-            "network": {"vehicles": 3},
-            "program": {"entry": "tests.emulator.testing.programs:tells_before_it_measures"},
-        }
-    )
+    scenario = planted("tells_before_it_measures", 3, settle_s=0.0, order="shuffle")
     folder = tmp_path / "campaign"
     said = io.StringIO()
     status = run_campaign(Plan.of(scenario, "none", 2, 1), folder, Console(file=said, width=200))

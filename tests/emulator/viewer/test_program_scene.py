@@ -6,13 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.drivers.observers import Messages
-from emulator.drivers.simulate import simulate
-from emulator.scenario.scenario import Scenario
-from emulator.viewer.recorder import Recorder
-from emulator.viewer.sinks import Sinks
-from tests.emulator.viewer.test_recorder import views
-from tests.support.recorded import prepared
+from tests.emulator.test_playback import watch
+from tests.emulator.viewer.test_recorder import views, write
 from tests.support.recordings import Entity, read_back
 from vnet import Node
 
@@ -34,19 +29,9 @@ async def program(node: Node) -> None:
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recording of a run of one second."""
     folder = tmp_path_factory.mktemp("run")
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": 1.0, "settle_s": 0.1},
-            "network": {"vehicles": 4, "layout": "dense"},
-            "program": {"entry": f"{__name__}:program"},
-        }
-    )
-    emulation = prepared(scenario, folder / "run")
-    messages = Messages(emulation)
-    with Recorder(Sinks(save=folder / "recording.rrd", vehicle="v02"), "run") as recorder:
-        recorder.take("scene", messages.scene())
-        emulation.watch(lambda view: recorder.take("period", messages.period(view)))
-        simulate(emulation)
+    run, network = {"duration_s": 1.0, "settle_s": 0.1}, {"vehicles": 4, "layout": "dense"}
+    scenario = {"run": run, "network": network, "program": {"entry": f"{__name__}:program"}}
+    write(watch(scenario, folder / "run").told, folder / "recording.rrd", "v02")
     return folder / "recording.rrd"
 
 
@@ -76,12 +61,7 @@ def test_no_view_is_laid_out_for_what_the_program_does_not_do(path: Path) -> Non
         origins
     )
     estimates = {
-        "common",
-        "position",
-        "peers/weight",
-        "figures/common-error",
-        "figures/position",
-        "figures/consensus",
-    }
+        "common", "position", "peers/weight", "figures/common-error", "figures/position", "figures/consensus",
+    }  # fmt: skip
     assert not estimates & set(origins)
     assert not {"vehicle/position", "vehicle/common", "vehicle/errors", "radio/busy"} & set(origins)

@@ -7,23 +7,14 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from emulator.drivers.observers import Messages
-from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
-from emulator.scenario.scenario import Scenario
-from emulator.viewer.drawing import (
-    OUTCOME_COLOURS,
-    PeriodArrays,
-    ellipses,
-    link_states,
-)
+from emulator.viewer.drawing import OUTCOME_COLOURS, PeriodArrays, ellipses, link_states
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.scenes import STROKES
 from emulator.viewer.sinks import Sinks, is_closed
-from tests.support.recorded import prepared
+from tests.emulator.test_playback import watch
 from tests.support.recordings import Entity, read_back, rrd
 from vnet.errors import VnetError
-from vnet.transport import wire
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("strict")]
 
@@ -33,26 +24,17 @@ Told = list[tuple[str, dict[str, Any]]]
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> Told:
     """Messages of a simulated run with faults, having crossed the wire."""
-    scenario = Scenario.model_validate(
-        {
-            "run": {"duration_s": 3.0, "name": "told", "settle_s": 0.5},
-            "network": {"vehicles": 6},
-            "radio": {"loss": 0.2, "max_peers": 3, "range_m": 1e5},
-            "program": {"entry": "agents.cooperative:main", "options": {"particles": 50}},
-            "fault": [
-                {"kind": "kill", "at_s": 1.0, "duration_s": 1.0, "nodes": {"ids": ["v02"]}},
-                {"kind": "partition", "at_s": 1.2, "duration_s": 0.6, "groups": "halves"},
-            ],
-        }
-    )
-    folder = tmp_path_factory.mktemp("told") / "run"
-    emulation = prepared(scenario, folder)
-    messages = Messages(emulation)
-    told = [("scene", messages.scene())]
-    emulation.watch(lambda view: told.append(("period", messages.period(view))))
-    simulate(emulation)
-    told.append(("end", messages.end()))
-    return [(stream, wire.decode_observation(wire.encode_observation(message))) for stream, message in told]
+    scenario = {
+        "run": {"duration_s": 3.0, "name": "told", "settle_s": 0.5},
+        "network": {"vehicles": 6},
+        "radio": {"loss": 0.2, "max_peers": 3, "range_m": 1e5},
+        "program": {"entry": "agents.cooperative:main", "options": {"particles": 50}},
+        "fault": [
+            {"kind": "kill", "at_s": 1.0, "duration_s": 1.0, "nodes": {"ids": ["v02"]}},
+            {"kind": "partition", "at_s": 1.2, "duration_s": 0.6, "groups": "halves"},
+        ],
+    }
+    return watch(scenario, tmp_path_factory.mktemp("told") / "run").told
 
 
 def write(told: Told, path: Path, vehicle: str | None = None) -> Recorder:

@@ -6,11 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.drivers.observers import Messages
-from emulator.drivers.simulate import simulate
-from emulator.scenario.scenario import Scenario
 from emulator.viewer.scenes import DrawnReference
-from tests.support.recorded import prepared
+from tests.emulator.test_playback import watch
 from vnet.node import Node
 
 pytestmark = pytest.mark.slow
@@ -31,13 +28,7 @@ def tell(folder: Path, program: str, **sections: dict[str, Any]) -> list[dict[st
         "radio": {"range_m": 1e5},
         **sections,
     }
-    scenario = Scenario.model_validate(data)
-    emulation = prepared(scenario, folder)
-    messages = Messages(emulation)
-    told = [messages.scene()]
-    emulation.watch(lambda view: told.append(messages.period(view)))
-    simulate(emulation)
-    return told
+    return [message for stream, message in watch(data, folder).told if stream != "end"]
 
 
 @pytest.fixture(scope="module")

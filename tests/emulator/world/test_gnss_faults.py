@@ -141,9 +141,7 @@ def test_a_healed_receiver_is_right_from_then_on_and_the_past_stays() -> None:
 
 
 def test_the_truth_and_the_instant_that_observers_see_agree_with_the_fixes() -> None:
-    gnss, world, _ = receivers(
-        fault("gnss_jump", offset_m=(3.0, 4.0)), fault("gnss_freeze", nodes={"ids": ["v02"]})
-    )
+    gnss, world, _ = receivers(fault("gnss_jump", offset_m=(3, 4)), fault("gnss_freeze", nodes={"ids": ["v02"]}))
     for period in (10, 30):
         seen, truth = gnss.at(period), world.at(period)
         assert np.array_equal(seen.position_m, truth.position_m)

@@ -71,3 +71,10 @@ def test_messages_are_those_that_were_read(tmp_path: Path) -> None:
     assert len(shown) > 80
     (tmp_path / "input_files.txt").write_text("\n".join(shown), encoding="utf-8")
     assert "\n".join(shown) == golden, f"read {tmp_path}/input_files.txt; if it is right, keep it"
+
+
+@pytest.mark.parametrize("kind", ["network", "links"])
+def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path, kind: str) -> None:
+    assert said_of(kind, tmp_path / "no.csv").startswith("cannot be read: No such file")
+    (tmp_path / "bytes.csv").write_bytes(b"id,x_m,y_m,heading_rad\n\xff,0,0,0\n")
+    assert said_of(kind, tmp_path / "bytes.csv").startswith("not a CSV file")

@@ -46,14 +46,6 @@ def test_a_matrix_in_the_scenario_is_that_matrix() -> None:
     assert links.tolist() == CHAIN
 
 
-def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"no\.csv: cannot be read: No such file"):
-        links_of(tmp_path / "no.csv")
-    (tmp_path / "bytes.csv").write_bytes(b"\xff\n")
-    with pytest.raises(ScenarioError, match=r"bytes\.csv: not a CSV file"):
-        links_of(tmp_path / "bytes.csv")
-
-
 def test_a_matrix_of_another_size_than_the_network_is_refused_with_the_world() -> None:
     scenario = Scenario.model_validate({"network": {"vehicles": 3}, "radio": {"links": [[0, 1], [1, 0]]}})
     with pytest.raises(ScenarioError, match=r"radio\.links is 2×2, but the network has 3 vehicles") as caught:

@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 
 from emulator.scenario.scenario import Scenario
-from emulator.world.neighbours import Links, links_within
+from emulator.world.neighbours import Links, components_of_links, links_within
 from emulator.world.world import World, build_world, components
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import LaneMap
+from vnet.types import Mask
 
 HALF_WIDTH_M = 0.85
 
@@ -254,7 +256,6 @@ def test_components_of_a_chain_and_its_gap() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(
     cells=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=25),
     range_m=st.sampled_from([0.5, 1.0, 1.5, 3.0]),
@@ -286,3 +287,57 @@ def test_an_exception_for_a_vehicle_that_is_not_there_is_refused() -> None:
 
 def test_the_name_of_a_vehicle_is_one_object_in_the_run_and_at_its_program() -> None:
     assert build_world(scenario()).node_ids[0] is sys.intern("v01")
+
+
+def numbered(linked: Mask) -> list[int]:
+    sender, receiver = np.nonzero(linked)
+    return components_of_links(sender, receiver, len(linked)).tolist()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_components_of_random_graphs(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 60))
+    linked = rng.random((count, count)) < rng.choice([0.0, 0.5, 1.0, 2.0]) / count
+    assert numbered(linked) == connected_components(linked, directed=False)[1].tolist()
+
+
+def test_no_nodes_have_no_components() -> None:
+    assert numbered(np.zeros((0, 0), dtype=bool)) == []
+
+
+def test_a_link_in_one_direction_connects() -> None:
+    linked = np.zeros((4, 4), dtype=bool)
+    linked[2, 0] = linked[3, 2] = True
+    assert numbered(linked) == [0, 1, 0, 0]
+
+
+UNITS: list[dict[str, Any]] = [{"position_m": [10.0, -20.0]}, {"position_m": [900.0, 5.0], "id": "gate"}]
+
+
+def world_of(network: dict[str, Any], units: list[dict[str, Any]]) -> World:
+    run = {"duration_s": 2.0, "settle_s": 0.0}
+    return build_world(Scenario.model_validate({"run": run, "network": network, "roadside": units}))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "network", [{"vehicles": 4}, {"kind": "city", "vehicles": 3}, {"kind": "driven", "vehicles": 3}]
+)
+def test_units_are_the_last_nodes_and_leave_vehicles_as_they_were(network: dict[str, Any]) -> None:
+    alone, world = world_of(network, []), world_of(network, UNITS)
+    vehicles = len(alone.node_ids)
+    assert world.node_ids == (*alone.node_ids, "rsu01", "gate")
+    with_units, without = world.at(0), alone.at(0)
+    assert np.array_equal(with_units.position_m[:vehicles], without.position_m)
+    assert np.array_equal(with_units.fix_m[:vehicles], without.fix_m)
+    assert with_units.position_m[vehicles:].tolist() == [[10.0, -20.0], [900.0, 5.0]]
+    fix = world.fix(0, vehicles)
+    assert fix.heading_rad is None and fix.speed_m_s is not None and fix.speed_m_s < 1
+    error_m = fix.position_m - with_units.position_m[vehicles] - with_units.common_error_m
+    assert 0 < np.linalg.norm(error_m) < 6
+
+
+def test_a_unit_has_no_vehicles_name() -> None:
+    with pytest.raises(ScenarioError, match=r"roadside.0.id = 'v01': a vehicle has this name"):
+        world_of({"vehicles": 2}, [{"position_m": [0, 0], "id": "v01"}])

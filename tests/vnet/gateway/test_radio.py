@@ -9,6 +9,8 @@ import pytest
 from tests.vnet.gateway.conftest import Drive, events, log
 from vnet.errors import ScenarioError
 
+pytestmark = pytest.mark.slow
+
 TALK = """
     import sys, time, zenoh
     session = zenoh.open(zenoh.Config.from_env())
@@ -22,7 +24,6 @@ TALK = """
     """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("order", ["fifo", "shuffle"])
 def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive, order: str) -> None:
     first, again = (drive(TALK, vehicles=3, loss=0.3, run={"order": order}) for _ in range(2))
@@ -36,11 +37,9 @@ def test_receivers_are_given_what_the_radio_delivers_and_it_replays(drive: Drive
     assert any("SampleKind.DELETE" in line for line in log(first))
 
 
-@pytest.mark.slow
 def test_what_one_program_puts_arrives_in_that_order(drive: Drive) -> None:
     """Puts and deletes of any size, with queries among them, do: Zenoh promises it of each publisher."""
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         session = zenoh.open(zenoh.Config())
         session.declare_subscriber("k/**", lambda s: print(s.key_expr, s.kind))
@@ -52,19 +51,16 @@ def test_what_one_program_puts_arrives_in_that_order(drive: Drive) -> None:
                 session.delete(f"k/{n}")
                 session.get(f"q/{n}", lambda reply: None)
         time.sleep(1.5)
-        """,
-        vehicles=2,
-    )
+        """
+    run = drive(text, vehicles=2)
     kinds = ("SampleKind.PUT", "SampleKind.DELETE", "query")
     expected = [f"{'q' if kind == 'query' else 'k'}/{n} {kind}" for n in range(12) for kind in kinds]
     assert log(run, "v02")[: len(expected)] == expected
 
 
-@pytest.mark.slow
 def test_what_crosses_has_a_timestamp_of_its_vehicles_router(drive: Drive) -> None:
     """Also a delete, which has none in its own vehicle: the routers of receivers would give it theirs."""
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         session, other = zenoh.open(zenoh.Config()), zenoh.open(zenoh.Config())
         other.declare_subscriber("k", lambda s: print(s.kind, s.timestamp and str(s.timestamp.get_id())))
@@ -73,19 +69,16 @@ def test_what_crosses_has_a_timestamp_of_its_vehicles_router(drive: Drive) -> No
             session.put("k", "x")
             session.delete("k")
         time.sleep(0.5)
-        """,
-        vehicles=2,
-    )
+        """
+    run = drive(text, vehicles=2)
     (router, *own), (_, *heard) = log(run, "v01"), log(run, "v02")
     assert own[:2] == [f"SampleKind.PUT {router}", "SampleKind.DELETE None"]
     assert heard[:2] == [f"SampleKind.PUT {router}", f"SampleKind.DELETE {router}"]
 
 
-@pytest.mark.slow
 def test_replies_of_others_have_the_querys_priority_and_a_replier(drive: Drive) -> None:
     """Only a queryable of the asking session says itself whether its reply is express, as with Zenoh."""
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         me, session = sys.argv[1], zenoh.open(zenoh.Config())
 
@@ -102,10 +95,8 @@ def test_replies_of_others_have_the_querys_priority_and_a_replier(drive: Drive) 
                     own = replier == queryable.id
                     print(sample.payload.to_string(), sample.express, sample.priority, own, replier.eid)
         time.sleep(3.0)
-        """,
-        vehicles=2,
-        duration_s=4.0,
-    )
+        """
+    run = drive(text, vehicles=2, duration_s=4.0)
     assert log(run)[:4] == [
         "v01 True Priority.DATA True 1",
         "v02 False Priority.DATA False 0",
@@ -114,11 +105,9 @@ def test_replies_of_others_have_the_querys_priority_and_a_replier(drive: Drive) 
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("history", "told"), [(True, ["live/v02"]), (False, [])])
 def test_a_token_that_was_heard_before_is_history(drive: Drive, history: bool, told: list[str]) -> None:
-    run = drive(
-        f"""
+    text = f"""
         import sys, time, zenoh
         session = zenoh.open(zenoh.Config())
         if sys.argv[1] == "v02":
@@ -129,21 +118,17 @@ def test_a_token_that_was_heard_before_is_history(drive: Drive, history: bool, t
             hear = lambda sample: print(sample.key_expr)
             session.liveliness().declare_subscriber("live/**", hear, history={history})
         time.sleep(2)
-        """,
-        vehicles=2,
-        duration_s=1.5,
-    )
+        """
+    run = drive(text, vehicles=2, duration_s=1.5)
     assert log(run) == ["listens", *told]
 
 
-@pytest.mark.slow
 def test_without_any_key_nothing_crosses(drive: Drive) -> None:
     run = drive(TALK, vehicles=2, radio={"keys": []})
     assert run.trace.num_rows == 0
     assert not any("car/v02" in line for line in log(run, "v01"))
 
 
-@pytest.mark.slow
 def test_replies_go_to_the_asker_alone(drive: Drive) -> None:
     """Queries of two vehicles have the same number."""
     text = """
@@ -165,10 +150,8 @@ def test_replies_go_to_the_asker_alone(drive: Drive) -> None:
     assert [log(run, node)[0] for node in ("v02", "v03")] == ["['v02']", "['v03']"]
 
 
-@pytest.mark.slow
 def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         session = zenoh.open(zenoh.Config())
         session.declare_subscriber("**", lambda s: print("heard", s.key_expr))
@@ -177,7 +160,9 @@ def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(
             for key in ("pose/a", "lidar/a", "vnet/own"):
                 session.put(key, b"x")
         time.sleep(0.5)
-        """,
+        """
+    run = drive(
+        text,
         """
         import time, zenoh
         with zenoh.open(zenoh.Config()) as session, session.declare_subscriber("*/*") as subscriber:
@@ -194,10 +179,8 @@ def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(
     assert len(run.trace) == 1
 
 
-@pytest.mark.slow
 def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         me, session = sys.argv[1], zenoh.open(zenoh.Config())
 
@@ -225,25 +208,17 @@ def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
         else:
             queryable = session.declare_queryable("state/*", answer)
             time.sleep(1.5)
-        """,
-        vehicles=3,
-        program={"zenoh": {"query_s": 0.5}},
-        duration_s=3.0,
-    )
+        """
+    run = drive(text, vehicles=3, program={"zenoh": {"query_s": 0.5}}, duration_s=3.0)
     lines = log(run)
-    assert sorted(lines[:3]) == [
-        "error v03: x=1",
-        "state/gone SampleKind.DELETE  zenoh/bytes",
-        "state/v02 SampleKind.PUT asked text/plain",
-    ]
+    samples = ["state/gone SampleKind.DELETE  zenoh/bytes", "state/v02 SampleKind.PUT asked text/plain"]
+    assert sorted(lines[:3]) == ["error v03: x=1", *samples]
     assert lines[3].startswith("over 0.5")
     assert lines[4].startswith("v0") or lines[4] == "Timeout"
 
 
-@pytest.mark.slow
 def test_a_reply_to_a_query_of_a_killed_program_is_none_to_one_of_its_next_life(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         session = zenoh.open(zenoh.Config())
         if sys.argv[1] == "v02":
@@ -257,7 +232,9 @@ def test_a_reply_to_a_query_of_a_killed_program_is_none_to_one_of_its_next_life(
             for reply in session.get("k", payload=asked, timeout=1.9, consolidation=every):
                 print(asked, reply.ok.payload.to_string())
         time.sleep(9)
-        """,
+        """
+    run = drive(
+        text,
         vehicles=2,
         duration_s=4.0,
         fault=[{"kind": "kill", "at_s": 0.4, "duration_s": 0.2, "nodes": ["v01"]}],
@@ -265,7 +242,6 @@ def test_a_reply_to_a_query_of_a_killed_program_is_none_to_one_of_its_next_life(
     assert log(run)[:1] == ["0.6 0.6"]
 
 
-@pytest.mark.slow
 def test_a_query_crosses_beside_complete_queryables_of_the_own_vehicle(drive: Drive) -> None:
     """Zenoh's router asks the nearest complete queryable, and one of its own, as a gateway has."""
     serve = """
@@ -285,18 +261,18 @@ def test_a_query_crosses_beside_complete_queryables_of_the_own_vehicle(drive: Dr
     assert log(run)[:1] == ["['v01', 'v02']"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("offset_ms", [2500.0, -60000.0])
 def test_a_clock_fault_changes_no_token(drive: Drive, offset_ms: float) -> None:
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         session = zenoh.open(zenoh.Config())
         token = session.liveliness().declare_token(f"alive/{sys.argv[1]}")
         tell = lambda token: print(token.key_expr, token.kind)
         session.liveliness().declare_subscriber("alive/v03", tell, history=True)
         time.sleep(99)
-        """,
+        """
+    run = drive(
+        text,
         vehicles=3,
         duration_s=9.0,
         fault=[
@@ -307,10 +283,8 @@ def test_a_clock_fault_changes_no_token(drive: Drive, offset_ms: float) -> None:
     assert log(run, "v02")[:3] == log(run, "v01")[:3] == ["alive/v03 SampleKind.PUT", "alive/v03 SampleKind.DELETE"]
 
 
-@pytest.mark.slow
 def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         me, session = sys.argv[1], zenoh.open(zenoh.Config())
         if me == "v01":
@@ -324,7 +298,9 @@ def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Dr
             time.sleep(2.0)
             token.undeclare()
             time.sleep(5)
-        """,
+        """
+    run = drive(
+        text,
         vehicles=3,
         duration_s=5.0,
         program={"zenoh": {"liveliness_s": 0.2}},
@@ -339,10 +315,8 @@ def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Dr
     ]
 
 
-@pytest.mark.slow
 def test_large_sample_crosses_in_fragments(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import sys, time, zenoh
         session = zenoh.open(zenoh.Config())
         with session.declare_subscriber("big", zenoh.handlers.RingChannel(1)) as subscriber:
@@ -351,9 +325,8 @@ def test_large_sample_crosses_in_fragments(drive: Drive) -> None:
                 session.put("big", bytes(range(256)) * 40)
             sample = subscriber.recv()
             print(len(sample.payload), sample.payload.to_bytes() == bytes(range(256)) * 40)
-        """,
-        vehicles=2,
-    )
+        """
+    run = drive(text, vehicles=2)
     assert log(run, "v02")[0] == "10240 True"
     assert len(run.trace) > 6
 
@@ -384,7 +357,6 @@ RECOVER = """
     """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("recovery", ["heartbeat=True", "periodic_queries=timedelta(seconds=0.2)"])
 def test_advanced_subscriber_recovers_most_of_what_the_radio_loses_in_order(drive: Drive, recovery: str) -> None:
     # Zenoh gives up what lies before a query's end: queries over the radio must end before the next begins.
@@ -401,7 +373,6 @@ def test_advanced_subscriber_recovers_most_of_what_the_radio_loses_in_order(driv
     assert heard[0] < 5, "the history is there, up to what its frames have lost"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("recovery", ["", "heartbeat=True"])
 def test_history_is_whole_although_queries_stay_open(drive: Drive, recovery: str) -> None:
     """A vehicle that is restarted hears of a token while it asks all caches, and then asks that one by itself."""
@@ -415,7 +386,6 @@ def test_history_is_whole_although_queries_stay_open(drive: Drive, recovery: str
         assert heard == [str(number) for number in range(40)]
 
 
-@pytest.mark.slow
 def test_sample_miss_listener_reports_exactly_what_the_radio_has_lost(drive: Drive) -> None:
     run = drive(RECOVER.format(history=False, recovery=""), vehicles=2, loss=0.3, duration_s=4.0)
     heard = [int(line.split()[2]) for line in log(run, "v02") if line.startswith("heard")]
@@ -423,38 +393,18 @@ def test_sample_miss_listener_reports_exactly_what_the_radio_has_lost(drive: Dri
     assert missed == heard[-1] - heard[0] + 1 - len(heard) > 0
 
 
-@pytest.mark.slow
 def test_fixes_and_reports_go_by_own_keys(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import msgpack, zenoh
         session = zenoh.open(zenoh.Config())
         subscriber = session.declare_subscriber("vnet/fix")
         for sample in subscriber:
             fix = msgpack.unpackb(sample.payload.to_bytes())
             session.put("vnet/report", msgpack.packb({"estimate_m": fix["position_m"], "seen": 1}))
-        """
-    )
+        """)
     assert run.verdict == "valid"
     assert (run.reported("seen")[1:] == 1).all()
     assert len(run.trace) == 0
-
-
-@pytest.mark.slow
-def test_callback_that_fails_is_told_and_zenoh_goes_on(drive: Drive) -> None:
-    run = drive(
-        """
-        import time, zenoh
-        session = zenoh.open(zenoh.Config())
-        session.declare_subscriber("a", lambda sample: print(1 / int(sample.payload.to_string())))
-        for number in ("1", "0", "2"):
-            session.put("a", number)
-        time.sleep(0.1)
-        """
-    )
-    (told,) = events(run, "exception")
-    assert ("ZeroDivisionError" in told["error"], "in a callback of Zenoh" in told["place"]) == (True, True)
-    assert {"1.0", "0.5"} <= set(log(run))
 
 
 def test_command_that_is_no_python_and_keys_that_overlap_are_refused_by_name(drive: Drive) -> None:
@@ -491,7 +441,6 @@ ALL_KINDS = """
     """
 
 
-@pytest.mark.slow
 def test_nothing_is_raised_where_vehicles_are_killed_or_the_run_ends_in_the_middle(
     drive: Drive, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -505,7 +454,6 @@ def test_nothing_is_raised_where_vehicles_are_killed_or_the_run_ends_in_the_midd
     assert not re.search("ignored|Traceback|never", capfd.readouterr().err)
 
 
-@pytest.mark.slow
 def test_frames_that_a_fault_has_changed_are_dropped(drive: Drive) -> None:
     fault = {"kind": "corrupt", "at_s": 0.0, "duration_s": 2.0, "probability": 0.7}
     run = drive(ALL_KINDS, vehicles=2, fault=[fault])
@@ -513,7 +461,6 @@ def test_frames_that_a_fault_has_changed_are_dropped(drive: Drive) -> None:
     assert any("is no sample" in event["text"] for event in events(run, "log"))
 
 
-@pytest.mark.slow
 def test_a_sample_that_cannot_arrive_is_told(drive: Drive) -> None:
     program = """
         import time, zenoh
@@ -524,7 +471,6 @@ def test_a_sample_that_cannot_arrive_is_told(drive: Drive) -> None:
     assert "which cannot arrive: radio.queue_frames = 64" in log(drive(program))[0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keys", "key", "told"),
     [(["car/**"], "car/@v0/x", True), (["car/@v0/**"], "car/@v0/x", False), (["car/**"], "bus/@v0/x", False)],

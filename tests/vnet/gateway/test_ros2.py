@@ -293,9 +293,7 @@ def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(d
         if channel.message_encoding == "cdr":
             told: Any = STORE.deserialize_cdr(message.data, "std_msgs/msg/String")
             assert told.data == "hello from "
-            schemas[channel.topic] = (
-                None if schema is None else (schema.name, schema.encoding, schema.data.decode())
-            )
+            schemas[channel.topic] = schema and (schema.name, schema.encoding, schema.data.decode())
     known = ("std_msgs/msg/String", "ros2msg", "string data\n")
     assert schemas == {"/v01/chatter": known, "/v01/old": known, "/v01/odd": None}
 

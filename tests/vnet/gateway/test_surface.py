@@ -17,10 +17,7 @@ from tests.vnet.gateway.conftest import Drive, events, log, printed
 from vnet.gateway.emulated import REFUSED, zenoh_modules
 
 MOST_REFUSED = 0.15
-MODULES = zenoh_modules(
-    cast(Any, SimpleNamespace(due=None)),
-    cast(Any, SimpleNamespace(threads=None, environ={})),
-)
+MODULES = zenoh_modules(cast(Any, SimpleNamespace(due=None)), cast(Any, SimpleNamespace(threads=None, environ={})))
 
 
 def declared(module: str) -> Iterator[ast.stmt]:
@@ -216,8 +213,7 @@ def test_arguments_are_refused_as_by_zenoh_itself(drive: Drive) -> None:
 
 @pytest.mark.slow
 def test_an_option_that_is_refused_is_refused_by_its_name(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import zenoh
         session = zenoh.open(zenoh.Config())
         points = zenoh.TimestampInstrumentationBuilder().set_send(True).build()
@@ -225,8 +221,7 @@ def test_an_option_that_is_refused_is_refused_by_its_name(drive: Drive) -> None:
             session.put("a", b"", timestamp_instrumentation=points)
         except zenoh.ZError as error:
             print(error)
-        """
-    )
+        """)
     assert log(run)[0].startswith("timestamp_instrumentation is not available on virtual time")
 
 

@@ -14,8 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_threads_wait_on_emulated_time_for_queues_locks_events_and_each_other(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import queue, threading, time
         started = time.monotonic()
         items, lock, over = queue.Queue(maxsize=1), threading.RLock(), threading.Event()
@@ -41,25 +40,17 @@ def test_threads_wait_on_emulated_time_for_queues_locks_events_and_each_other(dr
         for thread in threads:
             thread.join()
         print("joined", f"{time.monotonic() - started:.2f}", threading.active_count())
-        """
-    )
+        """)
     assert run.verdict == "valid"
     assert printed(run) == [
-        "['MainThread', 'produce', 'consume']",
-        "nothing 0.20",
-        "0 0.25",
-        "nothing 0.45",
-        "1 0.50",
-        "nothing 0.70",
-        "2 0.75",
-        "joined 0.75 1",
-    ]
+        "['MainThread', 'produce', 'consume']", "nothing 0.20", "0 0.25", "nothing 0.45", "1 0.50",
+        "nothing 0.70", "2 0.75", "joined 0.75 1",
+    ]  # fmt: skip
     assert "finished" in log(run)[-1]
 
 
 def test_conditions_barriers_semaphores_timers_locals_and_pools_work(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import concurrent.futures, threading, time
         barrier, condition, local = threading.Barrier(3), threading.Condition(), threading.local()
         slots, order = threading.BoundedSemaphore(2), []
@@ -82,15 +73,13 @@ def test_conditions_barriers_semaphores_timers_locals_and_pools_work(drive: Driv
         print(list(concurrent.futures.ThreadPoolExecutor().map(work, range(3))), round(time.perf_counter(), 3))
         timer = threading.Timer(0.3, print, ["timer"])
         timer.start()
-        """
-    )
+        """)
     assert printed(run) == ["[0, 1, 2] [0, 1, 4] False", "[0, 1, 4] 0.4", "timer"]
 
 
 def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -> None:
     before = signal.getsignal(signal.SIGINT)
-    run = drive(
-        """
+    run = drive("""
         import asyncio, signal, time
 
         async def tick(name, period):
@@ -126,28 +115,17 @@ def test_asyncio_program_runs_with_threads_timeouts_and_executor(drive: Drive) -
             asyncio.get_running_loop()
         except RuntimeError as error:
             print(error)
-        """
-    )
+        """)
     assert signal.getsignal(signal.SIGINT) is before, "signals of the process are not the program's"
     assert printed(run) == [
-        "slept 0.05",
-        "a 0 0.1",
-        "b 0 0.15",
-        "a 1 0.2",
-        "b 1 0.3",
-        "put",
-        "timeout 0.8",
-        "2",
-        "True 0.9",
-        "slept",
-        "no running event loop",
-    ]
+        "slept 0.05", "a 0 0.1", "b 0 0.15", "a 1 0.2", "b 1 0.3", "put", "timeout 0.8", "2", "True 0.9",
+        "slept", "no running event loop",
+    ]  # fmt: skip
 
 
 def test_asyncio_is_pythons_own(drive: Drive) -> None:
     """A coroutine that blocks holds up its loop, which closes generators and takes signals."""
-    run = drive(
-        """
+    run = drive("""
         import asyncio, os, signal, threading, time
 
         async def numbers():
@@ -186,8 +164,7 @@ def test_asyncio_is_pythons_own(drive: Drive) -> None:
             1 / 0
 
         asyncio.run(main())
-        """
-    )
+        """)
     assert log(run)[:4] == ["tick 0.5", "True", "closed 0.6", "told 0.8 True"]
     assert "refused" in log(run)
     (told,) = events(run, "exception")
@@ -195,8 +172,7 @@ def test_asyncio_is_pythons_own(drive: Drive) -> None:
 
 
 def test_joinable_threads_of_later_pythons_work(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import _thread, time
         handles = [_thread.start_joinable_thread(lambda: time.sleep(0.2), daemon=False) for _ in range(2)]
         handles[0].join(0.1)
@@ -206,8 +182,7 @@ def test_joinable_threads_of_later_pythons_work(drive: Drive) -> None:
         _thread.start_joinable_thread(lambda: time.sleep(0.3), daemon=False)
         _thread._shutdown()
         print(round(time.monotonic(), 2), _thread._make_thread_handle(7).ident, _thread._get_main_thread_ident())
-        """
-    )
+        """)
     assert printed(run) == ["False 0.1", "True True 0.2", "0.5 7 1"]
 
 
@@ -247,16 +222,14 @@ def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path:
         "@dataclasses.dataclass\nclass Wheel:\n    size: int\n    kind: ClassVar[str] = 'round'\n"
         "def wait():\n    time.sleep(0.5)\n    return get_type_hints(Wheel)['size']\n"
     )
-    run = drive(
-        """
+    text = """
         import importlib, sys
         import cars.parts
         assert cars.name is None
         cars.name = sys.argv[1]
         print(cars.wait(), importlib.import_module("cars").name, cars.Wheel(3), "cars.parts" in sys.modules)
-        """,
-        vehicles=2,
-    )
+        """
+    run = drive(text, vehicles=2)
     assert log(run)[0] == "<class 'int'> v01 Wheel(size=3) True"
     assert log(run, "v02")[0] == "<class 'int'> v02 Wheel(size=3) True"
 
@@ -268,8 +241,7 @@ def test_modules_that_import_each_other_get_the_programs_own(drive: Drive, tmp_p
     (package / "one.py").write_text("from . import two\n")
     (package / "two.py").write_text("from . import one\n")
     (package / "broken.py").write_text("import missing\n")
-    run = drive(
-        """
+    run = drive("""
         import asyncio.tasks, sys, types
         import round.one
         for _ in range(2):
@@ -280,8 +252,7 @@ def test_modules_that_import_each_other_get_the_programs_own(drive: Drive, tmp_p
         print(type(round.two.one) is types.ModuleType, round.two.one is sys.modules["round.one"])
         timeouts = sys.modules["asyncio.timeouts"]
         print(timeouts.tasks is asyncio.tasks)
-        """
-    )
+        """)
     assert log(run)[:4] == ["No module named 'missing' False"] * 2 + ["True True", "True"]
 
 
@@ -318,14 +289,12 @@ def test_crash_of_main_is_a_crash_of_its_vehicle_with_its_line(drive: Drive) -> 
 
 
 def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import threading, time
         threading.Thread(target=lambda: 1 / 0).start()
         time.sleep(0.5)
         print("goes on")
-        """
-    )
+        """)
     (told,) = events(run, "exception")
     assert "ZeroDivisionError" in told["error"]
     assert "in a thread" in told["place"]
@@ -334,8 +303,7 @@ def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None
 
 
 def test_deadlock_of_threads_is_found_with_their_lines(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import threading, time
         locks = threading.Lock(), threading.Lock()
 
@@ -350,16 +318,14 @@ def test_deadlock_of_threads_is_found_with_their_lines(drive: Drive) -> None:
             thread.start()
         for thread in threads:
             thread.join()
-        """
-    )
+        """)
     (told,) = events(run, "exception")
     assert "DeadlockError" in told["error"]
     assert "program0.py:8" in told["place"]
 
 
 def test_program_that_does_not_let_time_advance_is_ended(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import queue, threading
 
         def play(take, give):
@@ -370,14 +336,12 @@ def test_program_that_does_not_let_time_advance_is_ended(drive: Drive) -> None:
         threading.Thread(target=play, args=(here, there), daemon=True).start()
         here.put("ball")
         play(there, here)
-        """
-    )
+        """)
     assert [event["node"] for event in events(run, "spun")] == ["v01"]
 
 
 def test_end_of_the_run_leaves_with_blocks_and_runs_finally(drive: Drive) -> None:
-    run = drive(
-        """
+    run = drive("""
         import threading, time, zenoh
 
         def wait():
@@ -400,8 +364,7 @@ def test_end_of_the_run_leaves_with_blocks_and_runs_finally(drive: Drive) -> Non
             finally:
                 print("main over")
                 thread.join()
-        """
-    )
+        """)
     assert run.verdict == "valid"
     assert log(run) == ["thread over", "main over"] or log(run) == ["main over", "thread over"]
 
@@ -492,8 +455,7 @@ def test_a_module_of_a_program_is_loaded_again(drive: Drive, tmp_path: Path) -> 
 
 def test_a_program_that_puts_without_a_pause_comes_to_the_end_of_the_run(drive: Drive) -> None:
     """As Zenoh's `z_pub_thr`; its own subscriber hears all, and other vehicles what the radio's queue takes."""
-    run = drive(
-        """
+    text = """
         import zenoh
         session, heard = zenoh.open(zenoh.Config()), []
         subscriber = session.declare_subscriber("**", lambda sample: heard.append(sample.payload.to_string()))
@@ -503,16 +465,14 @@ def test_a_program_that_puts_without_a_pause_comes_to_the_end_of_the_run(drive: 
                 publisher.put(str(len(heard)))
         finally:
             print(len(heard) // 1000)
-        """,
-        duration_s=0.02,
-    )
+        """
+    run = drive(text, duration_s=0.02)
     assert run.verdict != "invalid"
     assert log(run)[0] in ("19", "20")
 
 
 def test_pools_of_multiprocessing_are_threads_on_emulated_time(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import multiprocessing, multiprocessing.dummy, threading, time
         from multiprocessing.pool import Pool, ThreadPool
         def work(number, wait_s=0.1):
@@ -534,9 +494,8 @@ def test_pools_of_multiprocessing_are_threads_on_emulated_time(drive: Drive) -> 
         left = ThreadPool(2)
         left.apply_async(work, (1, 60.0))
         print(round(time.monotonic(), 3), len(multiprocessing.active_children()))
-        """,
-        vehicles=2,
-    )
+        """
+    run = drive(text, vehicles=2)
     for node in ("v01", "v02"):
         lines = log(run, node)
         assert lines[:3] == ["[0, 1, 4, 9, 16, 25] 0.2", "[4, 1, 0]", "late 9"]
@@ -573,8 +532,7 @@ def test_results_of_pools_and_compressed_bytes_replay(drive: Drive) -> None:
 def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Drive, tmp_path: Path) -> None:
     (tmp_path / "plugin.py").write_text("import datetime\ndef year():\n    return datetime.datetime.now().year\n")
     (tmp_path / "script.py").write_text("import time\nyear = time.gmtime().tm_year\n")
-    run = drive(
-        """
+    text = """
         import importlib.machinery, importlib.metadata, importlib.util, pkgutil, pydoc, runpy, sys, time, types
         from pathlib import Path
         from unittest import mock
@@ -597,9 +555,8 @@ def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Dri
             print(error)
         with mock.patch("plugin.year", lambda: "patched"), mock.patch("time.time", lambda: "patched"):
             print(__import__("plugin").year(), time.time())
-        """,
-        vehicles=2,
-    )
+        """
+    run = drive(text, vehicles=2)
     for node in ("v01", "v02"):
         assert log(run, node)[:6] == [
             "2025 plugin True",
@@ -612,8 +569,7 @@ def test_modules_that_the_standard_library_loads_are_the_programs_own(drive: Dri
 
 
 def test_what_is_left_is_finalized_at_the_end_of_a_program(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import weakref
         class Thing: pass
         thing = Thing()
@@ -622,16 +578,14 @@ def test_what_is_left_is_finalized_at_the_end_of_a_program(drive: Drive) -> None
             input("sure? ")
         except EOFError:
             print("nobody")
-        """,
-        vehicles=2,
-    )
+        """
+    run = drive(text, vehicles=2)
     for node in ("v01", "v02"):
         assert log(run, node)[:2] == ["sure? nobody", "finalized"]
 
 
 def test_a_server_that_nobody_asks_lets_time_go_on(drive: Drive) -> None:
-    run = drive(
-        """
+    text = """
         import http.server, threading, time, wsgiref.simple_server, xmlrpc.server
         for kind in http.server.ThreadingHTTPServer, wsgiref.simple_server.WSGIServer:
             server = kind(("127.0.0.1", 0), None)
@@ -642,16 +596,14 @@ def test_a_server_that_nobody_asks_lets_time_go_on(drive: Drive) -> None:
             thread.join()
             print(round(time.monotonic(), 1))
             server.server_close()
-        """,
-        duration_s=4.0,
-    )
+        """
+    run = drive(text, duration_s=4.0)
     assert log(run)[:2] == ["1.5", "3.0"]
 
 
 def test_other_event_loops_are_refused_or_stood_for(drive: Drive, tmp_path: Path) -> None:
     (tmp_path / "uvloop.py").write_text("raise ImportError('the loop in C')")
-    run = drive(
-        """
+    run = drive("""
         import asyncio, time
         try:
             import trio
@@ -663,15 +615,13 @@ def test_other_event_loops_are_refused_or_stood_for(drive: Drive, tmp_path: Path
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(asyncio.sleep(0.5))
         print(time.monotonic())
-        """
-    )
+        """)
     assert log(run)[:2] == ["trio is not available on virtual time, whose event loops are those of asyncio", "1.0"]
 
 
 def test_a_module_that_is_not_the_programs_own_opens_no_session_of_zenoh_itself(drive: Drive) -> None:
     """It would talk past the radio, and in the time of the machine."""
-    run = drive(
-        """
+    run = drive("""
         import sys, zenoh
         outside = {}
         exec("import zenoh", {"__builtins__": __import__("types").__builtins__}, outside)
@@ -681,8 +631,7 @@ def test_a_module_that_is_not_the_programs_own_opens_no_session_of_zenoh_itself(
             print(error)
         vars(__import__("os").environ)
         print(sys.stdin.read(), sys.stdin.fileno() > 2)
-        """
-    )
+        """)
     assert log(run)[:2] == ["this module is not the program's own: its Zenoh is outside of the emulation", " True"]
 
 
@@ -704,8 +653,7 @@ def test_orders_name_threads_as_the_program_does(drive: Drive) -> None:
 
 def test_each_thread_has_the_context_that_python_gives_it(drive: Drive) -> None:
     """An empty one: they once shared decimal's, so that the precision of one was that of all."""
-    run = drive(
-        """
+    run = drive("""
         import asyncio, contextvars, decimal, threading, time, zenoh
         from concurrent.futures import ThreadPoolExecutor
         told = contextvars.ContextVar("told", default="nothing")
@@ -739,8 +687,7 @@ def test_each_thread_has_the_context_that_python_gives_it(drive: Drive) -> None:
 
         asyncio.run(asks())
         session.close()
-        """
-    )
+        """)
     threads = [("callback", 3), ("job", 7), *((f"thread {digits}", digits) for digits in (4, 5)), ("timer", 6)]
     seen = [f"{who} nothing 28 {who} {digits}" for who, digits in threads]
     assert sorted(printed(run)) == sorted([*seen, "main main 10", "loop nothing"])
@@ -748,8 +695,7 @@ def test_each_thread_has_the_context_that_python_gives_it(drive: Drive) -> None:
 
 def test_a_thread_that_any_exception_ends_is_told(drive: Drive) -> None:
     """`asyncio.run` in a thread raises CancelledError, which is no Exception."""
-    run = drive(
-        """
+    run = drive("""
         import asyncio, threading, zenoh
 
         async def awaits():
@@ -762,7 +708,6 @@ def test_a_thread_that_any_exception_ends_is_told(drive: Drive) -> None:
         thread.start()
         thread.join()
         session.close()
-        """
-    )
+        """)
     (told,) = events(run, "exception")
     assert told["error"].startswith("CancelledError")

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vnet.roads.road_map import HEADING_TOLERANCE_RAD, INDEX_STEP_M, RoadMap, touch_box
@@ -64,7 +64,6 @@ def by_hand(roads: RoadMap, position_m: Any, heading_rad: float, reach_m: float)
     longest_m=st.sampled_from([1.0, 40.0, 300.0, 2000.0]),
 )
 @example(seed=1, count=40, vehicles=5, longest_m=2000.0)
-@settings(deadline=None)
 def test_near_finds_what_looking_at_each_segment_finds(
     seed: int, count: int, vehicles: int, longest_m: float
 ) -> None:
@@ -118,7 +117,6 @@ def test_who_is_nowhere_has_no_lane_near() -> None:
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 2**32), side_m=st.floats(0.1, 300), east_m=st.floats(-300, 300))
-@settings(deadline=None)
 def test_a_part_holds_what_touches_the_box(seed: int, side_m: float, east_m: float) -> None:
     roads = scattered(seed, 30)
     low, high = np.array([east_m, -side_m / 2]), np.array([east_m + side_m, side_m / 2])

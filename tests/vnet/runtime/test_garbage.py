@@ -229,8 +229,7 @@ def test_what_is_found_of_a_paused_vehicle_is_said_when_its_pause_is_over() -> N
         while True:
             await asyncio.sleep(0.1)
 
-    world = Pauses("v1", "v2")
-    world.run(program)
+    world = Pauses("v1", "v2").run(program)
     assert [report.time_ns for report in world.reports] == [1_500_000_000]
     assert [note.time_ns for note in world.notes] == [1_500_000_000] * 2
 

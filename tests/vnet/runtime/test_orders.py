@@ -256,7 +256,7 @@ PRIMITIVES = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", PRIMITIVES, ids=lambda program: program.__name__)
+@pytest.mark.parametrize("program", PRIMITIVES)
 def test_asyncio_s_primitives_hold_in_every_order(program: Callable[[Node], Awaitable[None]]) -> None:
     """Without an alarm. In CI there are 626 shuffles and 626 times PCT of each of eight programs: 10 016 orders."""
     different = set()
@@ -374,12 +374,7 @@ def test_shuffle_takes_all_options_about_as_often() -> None:
 
 
 def test_a_tape_is_followed_where_it_fits() -> None:
-    tape = Taped(
-        [
-            Deviation("v01", 0, 5, 1, "timer of a", "fix"),
-            Deviation("v01", 0, 6, 0, "timer of z", "fix"),
-        ]
-    )
+    tape = Taped([Deviation("v01", 0, 5, 1, "timer of a", "fix"), Deviation("v01", 0, 6, 0, "timer of z", "fix")])
     assert tape.choose(5, 0, OPTIONS) == 0
     assert tape.choose(5, 1, OPTIONS) == 1
     assert tape.choose(6, 0, OPTIONS) == 0, "there is no such timer"

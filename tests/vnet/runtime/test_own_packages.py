@@ -16,13 +16,15 @@ from vnet.runtime.programs import load_program, search_programs_in
 PROGRAM = "async def main(node):\n    pass\n"
 
 
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.mark.parametrize("package", ["agents", "emulator"])
-def test_a_program_in_a_file_that_vnet_s_own_package_hides(
-    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_in_a_file_that_vnet_s_own_package_hides(package: str, tmp_path: Path) -> None:
     file = tmp_path / f"{package}.py"
     file.write_text(PROGRAM)
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(ProgramError) as caught:
         load_program(f"{package}:main")
     assert str(caught.value) == (
@@ -34,11 +36,8 @@ def test_a_program_in_a_file_that_vnet_s_own_package_hides(
 @pytest.mark.parametrize(
     ("module", "found"), [("colorsys", "colorsys is found at "), ("time", "time is a module of Python's own")]
 )
-def test_a_program_in_a_file_that_a_module_of_python_s_hides(
-    module: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_in_a_file_that_a_module_of_python_s_hides(module: str, found: str, tmp_path: Path) -> None:
     (tmp_path / f"{module}.py").write_text(PROGRAM)
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(ProgramError) as caught:
         load_program(f"{module}:main")
     where = "built into Python" if module == "time" else colorsys.__file__
@@ -47,22 +46,18 @@ def test_a_program_in_a_file_that_a_module_of_python_s_hides(
     assert str(caught.value).endswith(f": rename {tmp_path}/{module}.py")
 
 
-def test_a_module_that_the_program_imports_and_another_hides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_module_that_the_program_imports_and_another_hides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "random.py").touch()
     (tmp_path / "imports_random.py").write_text("from random import my_own\n")
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
     with pytest.raises(ProgramError, match=rf"random is found at .*random\.py: rename {tmp_path}/random\.py$"):
         load_program("imports_random:main")
 
 
-def test_a_module_of_a_package_that_vnet_s_own_hides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_of_a_package_that_vnet_s_own_hides(tmp_path: Path) -> None:
     (tmp_path / "agents").mkdir()
     (tmp_path / "agents" / "__init__.py").touch()
     (tmp_path / "agents" / "mine.py").write_text(PROGRAM)
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(ProgramError, match=f"rename {tmp_path}/agents/__init__.py$"):
         load_program("agents.mine:main")
 
@@ -70,7 +65,6 @@ def test_a_module_of_a_package_that_vnet_s_own_hides(tmp_path: Path, monkeypatch
 def test_a_program_of_another_folder_with_the_name_of_one_before_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "same_name.py").write_text("async def main(node): ...\n")
@@ -83,12 +77,11 @@ def test_a_program_of_another_folder_with_the_name_of_one_before_is_refused(
     del sys.modules["same_name"]
 
 
-def test_without_such_a_file_nothing_is_said_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_such_a_file_nothing_is_said_of_it(tmp_path: Path) -> None:
     assert name_clash("agents.none", tmp_path) == name_clash("mine", tmp_path) == ""
     (tmp_path / "mine.py").touch()
     assert name_clash("mine.none", tmp_path) == ""
     assert name_clash("agents.none", ROOT) == "", "vnet's own"
-    monkeypatch.chdir(tmp_path)
     assert load_program("agents.beacon:main") is not None
 
 

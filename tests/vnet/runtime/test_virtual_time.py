@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vnet.errors import VirtualTimeError
@@ -51,10 +51,8 @@ def test_a_fork_that_comes_back_to_the_loop_ends(loop: VirtualTimeLoop, capfd: p
 
     _, status = os.waitpid(run(loop, program), 0)
     assert os.waitstatus_to_exitcode(status) == 70
-    assert (
-        capfd.readouterr().err
-        == "vnet: a process that a program forked came back to the event loop; it ends here\n"
-    )
+    said = "vnet: a process that a program forked came back to the event loop; it ends here\n"
+    assert capfd.readouterr().err == said
 
 
 def test_sleep_takes_exactly_the_time_asked_for(loop: VirtualTimeLoop) -> None:
@@ -100,7 +98,6 @@ def test_tasks_queues_and_locks_work_as_ever(loop: VirtualTimeLoop) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(min_value=0, max_value=10**12), min_size=1, max_size=20))
 def test_timers_fire_in_order_at_their_nanosecond(delays_ns: list[int]) -> None:
     loop = VirtualTimeLoop(lambda timer: timer if timer is not None else pytest.fail("deadlock"))
@@ -198,7 +195,6 @@ def test_spinning_at_one_instant_is_an_error(loop: VirtualTimeLoop, step_s: floa
 
 
 @pytest.mark.parametrize("ways", ["sleep", "call_at"])
-@settings(max_examples=60, deadline=None)
 @given(start_s=st.floats(0, 1e4), for_s=st.floats(0, 2))
 def test_who_waits_for_the_rest_of_a_time_comes_to_its_end(ways: str, start_s: float, for_s: float) -> None:
     """Deadlines are waited for like this by programs, rate limiters and anyio; times are whole nanoseconds."""

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vnet.errors import WireError
@@ -24,12 +24,7 @@ clocks = st.lists(
 )
 busy = st.lists(st.builds(wire.BusyRatios, times, st.lists(st.floats(0, 1), max_size=3)), max_size=2)
 fixes = st.builds(
-    wire.WireFix,
-    names,
-    times,
-    st.tuples(reals, reals),
-    st.tuples(reals, reals, reals, reals),
-    st.none() | reals,
+    wire.WireFix, names, times, st.tuples(reals, reals), st.tuples(reals, reals, reals, reals), st.none() | reals
 )
 reports = st.builds(
     Report,
@@ -131,20 +126,17 @@ emulator_messages = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(agent_messages)
 def test_what_agents_say_comes_back(message: wire.AgentMessage) -> None:
     assert wire.decode_tx(wire.encode(message)) == message
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(emulator_messages)
 def test_what_the_emulator_says_comes_back(message: wire.EmulatorMessage) -> None:
     assert wire.decode_rx(wire.encode(message)) == message
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=200))
 def test_arbitrary_bytes_never_do_harm(data: bytes) -> None:
     for decode in (wire.decode_tx, wire.decode_rx, wire.decode_sent, wire.decode_observation):
@@ -155,7 +147,6 @@ def test_arbitrary_bytes_never_do_harm(data: bytes) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(agent_messages, st.data())
 def test_damaged_messages_never_do_harm(message: wire.AgentMessage, data: st.DataObject) -> None:
     encoded = bytearray(wire.encode(message))
@@ -215,7 +206,6 @@ def test_lateness_bins_have_an_edge_at_the_limit() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(emulator_messages)
 def test_batches_are_told_from_their_first_bytes(message: wire.EmulatorMessage) -> None:
     assert wire.is_batch(wire.encode(message)) == isinstance(message, wire.Batch)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,25 +19,14 @@ from vnet.types import Array
 EAST, NORTH = 0.0, np.pi / 2
 
 
-def road_map(
-    lanes: list[tuple[float, float, float, float]], half_width_m: float = 0.85, sigma_m: float = 0.0
-) -> RoadMap:
+def road_map(lanes: Sequence[tuple[float, float, float, float]], sigma_m: float = 0.0) -> RoadMap:
     """Lanes of one segment each: x, y where it begins, heading, length."""
-    x, y, heading, length = np.array(lanes, dtype=float).T
     count = len(lanes)
-    number = np.arange(count, dtype=np.int32)
-    return RoadMap(
-        np.column_stack([x, y]),
-        heading,
-        length,
-        np.full(count, half_width_m),
-        np.zeros(count, dtype=np.uint8),
-        np.ones(count, dtype=np.bool_),
-        number,
-        number,
-        ("road",),
-        sigma_m,
-    )
+    x, y, heading, length = np.reshape(np.array(lanes, dtype=float), (count, 4)).T
+    ones, number = np.ones(count), np.arange(count, dtype=np.int32)
+    kind, one_way = np.zeros(count, dtype=np.uint8), np.ones(count, dtype=np.bool_)
+    place = np.column_stack([x, y])
+    return RoadMap(place, heading, length, 0.85 * ones, kind, one_way, number, number, ("road",), sigma_m)
 
 
 CROSSING = road_map([(-500, 0, EAST, 1000), (0, -500, NORTH, 1000)])
@@ -68,10 +59,7 @@ def test_of_a_winding_lane_only_the_nearest_piece_is_a_candidate() -> None:
 @pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
-    st.lists(st.floats(-60, 60), min_size=1, max_size=6),
-    st.floats(0.05, 5),
-    st.floats(0, 4),
-    st.floats(0.001, 0.9),
+    st.lists(st.floats(-60, 60), min_size=1, max_size=6), st.floats(0.05, 5), st.floats(0, 4), st.floats(0.001, 0.9)
 )
 def test_hypotheses_add_up(offsets: list[float], sigma_m: float, map_sigma_m: float, off_road: float) -> None:
     roads = road_map([(-500, 3.5 * k, EAST, 1000) for k in range(3)], sigma_m=map_sigma_m)

@@ -34,7 +34,6 @@ def test_a_change_of_the_log_weights_changes_the_weights() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(0.05, 0.5), min_size=1, max_size=40), st.floats(0.0, 1.2))
 def test_c_of_the_past_is_remembered_as_long_as_it_should_be(steps_s: list[float], age_s: float) -> None:
     """c is the time itself, so that each remembered one says of which time it is."""

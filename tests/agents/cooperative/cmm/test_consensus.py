@@ -39,7 +39,7 @@ class Net:
             said = {}
             for i, node in self.nodes.items():
                 heard = {
-                    f"n{j:02d}": share for j, share in self.said.items() if j != i and self.hears(self.round, j, i)
+                    f"n{j:02d}": one for j, one in self.said.items() if j != i and self.hears(self.round, j, i)
                 }
                 said[i] = node.round(self.inputs[i], heard)
             self.said = said

@@ -72,9 +72,7 @@ def test_plain_moments_are_those_of_arrays(information: Five) -> None:
 
 @pytest.mark.slow
 @given(said(), covariances(), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
-def test_a_deviation_is_that_of_matrices(
-    information: Five, covariance_m2: Array, mean: tuple[float, float]
-) -> None:
+def test_deviation_is_that_of_matrices(information: Five, covariance_m2: Array, mean: tuple[float, float]) -> None:
     matrix, vector = Information(information).matrix, Information(information).vector
     total = matrix + matrix @ covariance_m2 @ matrix
     total += (1e-4 * np.trace(total) + 1e-9) * np.eye(2)
@@ -149,9 +147,8 @@ def test_deviation_is_the_mahalanobis_distance_of_a_fix() -> None:
     off = np.array([22.0, -11.0])
     expected = _share_at(float(off @ np.linalg.solve(covariance_m2 + noise_m2 * np.eye(2), off)))
     assert expected < 0.5
-    assert _share_of_first(increment, (mean_m.tolist(), _entries(covariance_m2))) == pytest.approx(
-        expected, rel=1e-3
-    )
+    found = _share_of_first(increment, (mean_m.tolist(), _entries(covariance_m2)))
+    assert found == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_lane_that_says_nothing_along_itself_may_not_move_c_along_it() -> None:

@@ -88,12 +88,9 @@ def _filters(heading_rad: Array, kinds: list[int]) -> list[LaneFilter]:
     ]
 
 
-def _sums(increments: list[Five]) -> dict[int, Five]:
-    return summed((kind_of_increment(each), information_of(each)) for each in increments)
-
-
 def _take(memory: CommonMemory, increments: list[Five], is_before: bool = False) -> None:
-    for kind, information in _sums(increments).items():
+    sums = summed((kind_of_increment(each), information_of(each)) for each in increments)
+    for kind, information in sums.items():
         assert memory.follow(kind)
         memory.take(kind, information, is_before)
 

@@ -54,20 +54,13 @@ def test_the_first_update_counts_in_full() -> None:
     assert tracks.map_log_likelihood[0] == pytest.approx(log_likelihood(NORTH_M))
 
 
-def test_the_same_again_counts_by_the_share_that_is_new() -> None:
+@pytest.mark.parametrize(("elapsed_s", "share"), [(2.0, 2.0 / TAU_S), (3 * TAU_S, 1)])
+def test_the_same_again_counts_by_the_share_that_is_new(elapsed_s: float, share: float) -> None:
     evidence, tracks, particles = scene()
     evidence.update(tracks, particles, np.array([0]))
-    tracks.advance(2.0)
+    tracks.advance(elapsed_s)
     evidence.update(tracks, particles, np.array([0]))
-    assert particles.log_weight == pytest.approx((1 + 2.0 / TAU_S) * log_likelihood(NORTH_M))
-
-
-def test_after_the_correlation_time_all_is_new() -> None:
-    evidence, tracks, particles = scene()
-    evidence.update(tracks, particles, np.array([0]))
-    tracks.advance(3 * TAU_S)
-    evidence.update(tracks, particles, np.array([0]))
-    assert particles.log_weight == pytest.approx(2 * log_likelihood(NORTH_M))
+    assert particles.log_weight == pytest.approx((1 + share) * log_likelihood(NORTH_M))
 
 
 def test_a_vehicle_that_has_moved_in_its_lane_replaces_what_it_said() -> None:

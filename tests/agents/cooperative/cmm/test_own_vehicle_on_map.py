@@ -11,31 +11,18 @@ from numpy.testing import assert_allclose
 from agents.cooperative.cmm.information import NOTHING, Information
 from agents.cooperative.cmm.own_vehicle_on_map import OFF_ROAD, OwnVehicleOnMap
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
+from tests.agents.cooperative.cmm.test_city_roads import EAST, NORTH, road_map
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
-EAST, NORTH = 0.0, np.pi / 2
 COMMON_M = np.array([2.0, -1.5])
 STEADY = RbpfConfig(common_tau_s=1e9, off_road=0.001)
 """Constants of a common error that stays, and of vehicles that are on the road."""
 
 
-def roads(*lanes: tuple[float, float, float], sigma_m: float = 1.0, half_width_m: float = 0.85) -> RoadMap:
+def roads(*lanes: tuple[float, float, float], sigma_m: float = 1.0) -> RoadMap:
     """A map of lanes of 2 km that begin at (x, y) in metres, with a heading."""
-    count = len(lanes)
-    x_m, y_m, heading_rad = np.reshape(lanes, (-1, 3)).T
-    return RoadMap(
-        point_m=np.column_stack([x_m, y_m]),
-        heading_rad=heading_rad,
-        length_m=np.full(count, 2000.0),
-        half_width_m=np.full(count, half_width_m),
-        kind=np.zeros(count, dtype=np.uint8),
-        one_way=np.ones(count, dtype=np.bool_),
-        road=np.arange(count, dtype=np.int32),
-        lane=np.arange(count, dtype=np.int32),
-        classes=("road",),
-        sigma_m=sigma_m,
-    )
+    return road_map([(*lane, 2000.0) for lane in lanes], sigma_m)
 
 
 def fixes(position_m: Iterable[Array], heading_rad: float, seed: int = 1) -> list[Observation]:

@@ -120,7 +120,6 @@ TestTracks.settings = settings(max_examples=30, stateful_step_count=30, deadline
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(st.floats(0.01, 5), st.floats(0.01, 5))
 def test_two_transitions_are_one_over_both_times(first_s: float, second_s: float) -> None:
     both = transition(np.array([second_s])) @ transition(np.array([first_s]))

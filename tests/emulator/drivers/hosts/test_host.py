@@ -153,10 +153,8 @@ def test_whoever_is_asked_for_stacks_does_not_keep_the_yields_of_others(
     monkeypatch.setattr(host_module, "STACKS_WRITTEN_S", 0.0)
     ask = orders(("to_node", "v03", b"stacks", False), ("signal", "v03", signal.SIGUSR1))
     bundles = play.work(grant("v01", "v03"), ("message", "v01", YIELD), ask)
-    assert [item for bundle in bundles for item in bundle] == [
-        ("message", "v01", YIELD),
-        ("log_tail", "v03", "the log of v03"),
-    ]
+    items = [item for bundle in bundles for item in bundle]
+    assert items == [("message", "v01", YIELD), ("log_tail", "v03", "the log of v03")]
     assert ("SIGUSR1", "v03") in play.launcher.done
 
 
@@ -200,9 +198,7 @@ def test_orders_of_another_and_nonsense_change_nothing(play: Play, capsys: pytes
     assert "a message of the emulator is dropped" in capsys.readouterr().err
 
 
-def test_without_the_emulator_agents_learn_it_and_the_host_ends(
-    play: Play, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_emulator_agents_learn_it_and_the_host_ends(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host_module, "SHUT_DOWN_S", 0.0)
     with pytest.raises(TransportError, match="host a: the emulator has been gone for"):
         play.work(("emulator", "", False))

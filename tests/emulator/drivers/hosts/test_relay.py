@@ -29,11 +29,8 @@ def test_what_a_unit_sends_over_the_backbone_goes_with_the_yield_that_refers_to_
     host.take("rsu01", YIELD)
     assert host.take_bundle() == []
     host.take("v01", YIELD)
-    assert host.take_bundle() == [
-        ("backbone", "rsu01", b"message"),
-        ("message", "rsu01", YIELD),
-        ("message", "v01", YIELD),
-    ]
+    yields = [("message", node, YIELD) for node in ("rsu01", "v01")]
+    assert host.take_bundle() == [("backbone", "rsu01", b"message"), *yields]
     host.take_unit("rsu01", b"late")
     assert host.take_bundle() == [("backbone", "rsu01", b"late")]
 

@@ -203,3 +203,10 @@ class Stage:
     def events(self, *kinds: str) -> list[tuple[str, str | None]]:
         """The events of these kinds, and of which node."""
         return [(event.kind, event.node) for event in self.emulation.folder.events if event.kind in kinds]
+
+
+def joined(processes: Sequence[Sequence[str]] = ALONE, **stage: Any) -> Stage:
+    """A stage whose processes have joined, and whose run has begun."""
+    made = Stage(processes, **stage)
+    made.join()
+    return made

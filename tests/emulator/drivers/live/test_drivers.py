@@ -10,7 +10,9 @@ from msgspec.structs import replace
 from emulator.drivers.lockstep import Lockstep, run_in_lockstep
 from emulator.drivers.processes import Stalled
 from emulator.drivers.realtime import RealTime, run_in_real_time
+from emulator.records.events import Event
 from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
+from tests.support.multi_loop_driver import fault
 from vnet.radio import SentFrame
 from vnet.transport import wire
 from vnet.transport.wire import MessageRef, Sent, SentMessage
@@ -53,6 +55,17 @@ class Play:
     def hear(self, what: str, name: str, payload: bytes) -> None:
         self.live.hear(what, name, payload)
 
+    async def stalls(self) -> list[Event]:
+        """The events of a run that ends because processes have stalled."""
+        with pytest.raises(Stalled):
+            await self.run()
+        return [event for event in self.stage.emulation.folder.events if event.kind == "stalled"]
+
+    def hear_last_words(self, node: str, **traffic: Any) -> None:
+        seq = sum(1 for each, _ in self.sent(wire.Batch) if each == node)
+        last = wire.Frames(b"1", seq, seq, [], wire.Traffic(**traffic), final=True)
+        self.hear("message", node, wire.encode(last))
+
     def sent(self, kind: type) -> list[tuple[str, Any]]:
         return [(node, message) for node, message in self.stage.attachment.sent if isinstance(message, kind)]
 
@@ -66,11 +79,6 @@ def yields(node: str, message: Any, nonce: bytes = b"1") -> wire.AgentMessage | 
     frames = [SentFrame(node, b"x")] if node == "v01" else []
     steps = [wire.Step(message.time_ns, wire.Traffic(frames))]
     return wire.Yield(nonce, message.seq, message.time_ns + 100 * MS, (), (), steps, 1)
-
-
-def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
-    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
-    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
 
 
 @in_virtual_time
@@ -138,9 +146,7 @@ async def test_in_lockstep_a_killed_process_is_awaited_before_time_goes_on() -> 
 @in_virtual_time
 async def test_in_lockstep_a_process_that_does_not_come_back_ends_the_run() -> None:
     play = Play("lockstep", yields, faults=[fault("restart", 0.15, 0.2, "v02")])
-    with pytest.raises(Stalled):
-        await play.run()
-    (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
+    (stalled,) = await play.stalls()
     assert (stalled.node, stalled.details["error"]) == ("v02", "has not come back within 1 s")
     assert play.sent(wire.End) == [("v02", wire.End(None, "restarted by a fault", time_ns=150_000_000))]
 
@@ -152,11 +158,8 @@ async def test_in_lockstep_a_process_that_does_not_yield_ends_the_run_with_its_s
         return None if stuck and node in ("v02", "v03") else yields(node, message)
 
     play = Play("lockstep", answer)
-    with pytest.raises(Stalled):
-        await play.run()
-    assert play.stage.events("stalled") == [("stalled", "v02"), ("stalled", "v03")]
-    where = {e.node: e.details["where"] for e in play.stage.emulation.folder.events if e.kind == "stalled"}
-    assert where == {"v02": "v02 is here", "v03": "v03 is here"}
+    where = [(event.node, event.details["where"]) for event in await play.stalls()]
+    assert where == [("v02", "v02 is here"), ("v03", "v03 is here")]
     assert play.stage.launcher.done == [("stack", "v02"), ("stack", "v03")]
 
 
@@ -169,9 +172,7 @@ async def test_in_lockstep_a_refused_yield_is_told_with_its_reason() -> None:
         return said
 
     play = Play("lockstep", answer)
-    with pytest.raises(Stalled):
-        await play.run()
-    (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
+    (stalled,) = await play.stalls()
     (refused,) = [event for event in play.stage.emulation.folder.events if event.kind == "refused"]
     assert stalled.node == refused.node == "v02"
     assert stalled.details["refused"] == refused.details["reason"]
@@ -212,10 +213,8 @@ async def test_in_lockstep_a_process_that_stays_at_its_instant_has_stalled() -> 
         return None if stuck else yields(node, message)
 
     play = Play("lockstep", answer)
-    with pytest.raises(Stalled):
-        await play.run()
+    assert [event.node for event in await play.stalls()] == ["v02"]
     assert asked == ["v02", "v02"], "once more, as it had come from 200 ms to 201 ms"
-    assert play.stage.events("stalled") == [("stalled", "v02")]
 
 
 @in_virtual_time
@@ -233,9 +232,7 @@ async def test_in_lockstep_only_those_have_stalled_whose_yields_their_host_does_
         return yields(node, message)
 
     play = Play("lockstep", answer)
-    with pytest.raises(Stalled):
-        await play.run()
-    assert play.stage.events("stalled") == [("stalled", "v02")]
+    assert [event.node for event in await play.stalls()] == ["v02"]
 
 
 @in_virtual_time
@@ -326,9 +323,7 @@ async def test_a_message_of_the_backbone_that_never_comes_is_named(unit: str, no
         return wire.Yield(b"1", message.seq, None, (), (), [step], 1)
 
     play = Play("lockstep", answer, **UNITS)
-    with pytest.raises(Stalled):
-        await play.run()
-    (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
+    (stalled,) = await play.stalls()
     expected = "yield 0 without 1 message of v03 on the backbone, to which it refers, within 1 s"
     assert stalled.node == "v03" and stalled.details["error"].startswith(expected)
     reasons = [e.details["reason"] for e in play.stage.emulation.folder.events if e.kind == "refused"]
@@ -392,9 +387,7 @@ async def test_in_real_time_a_death_is_told_at_once_and_nobody_waits_for_last_wo
     assert play.stage.events("died") == [("died", "v02")]
     assert not play.stage.emulation.up["v02"]
     for node in ("v01", "v03", "v04"):
-        seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
-        last = wire.Frames(b"1", seq, seq, [], wire.Traffic(), None, final=True)
-        play.hear("message", node, wire.encode(last))
+        play.hear_last_words(node)
     before_ns = play.pacing.now_ns
     await play.finish(3600.0)
     assert play.pacing.now_ns == before_ns
@@ -415,17 +408,11 @@ async def test_in_real_time_processes_that_end_when_they_are_told_to_have_not_di
     await play.run()
     supervisor, loop = play.stage.supervisor, asyncio.get_running_loop()
     supervisor.all_told_to_end()
-
-    def final(node: str) -> None:
-        seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
-        last = wire.Frames(b"1", seq, seq, [], wire.Traffic(), None, final=True)
-        play.hear("message", node, wire.encode(last))
-
     for node in IDS[:2]:
-        final(node)
+        play.hear_last_words(node)
         play.stage.launcher.ends_as_told(supervisor, node)
     play.stage.launcher.ends_as_told(supervisor, "v03")  # without a last message
-    loop.call_later(2.0, final, "v04")
+    loop.call_later(2.0, play.hear_last_words, "v04")
     before_ns = play.pacing.now_ns
     await play.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 5.0)
     assert play.stage.events("died") == []
@@ -460,10 +447,7 @@ async def test_in_real_time_a_message_of_the_backbone_may_come_after_the_last_fr
     if ended:
         await play.run()
     for node in IDS:
-        refs = [MessageRef(node, 0)] if node == "v03" else []
-        seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
-        last = wire.Frames(b"1", seq, seq, [], wire.Traffic(messages=refs), final=True)
-        play.hear("message", node, wire.encode(last))
+        play.hear_last_words(node, messages=[MessageRef(node, 0)] if node == "v03" else [])
     if not ended:
         content = wire.encode(Sent(b"1", 0, None, b"x"))
         asyncio.get_running_loop().call_later(0.1, play.hear, "backbone", "v03", content)

@@ -2,7 +2,6 @@
 
 import asyncio
 import signal
-from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
@@ -13,7 +12,7 @@ from emulator.drivers.launch import Exit
 from emulator.drivers.live.fleet import ANSWER_PATIENCE_S, Fleet
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ChangeSignal
 from emulator.records.code_digest import vnet_digest
-from tests.emulator.drivers.live.fakes import in_virtual_time
+from tests.emulator.drivers.live.fakes import in_virtual_time, on_a_loop
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import VnetError
 from vnet.transport import wire
@@ -72,11 +71,12 @@ class Play:
         return [event.details["reason"] for event in self.emulation.folder.events if event.kind == "refused"]
 
 
-def run(main: Callable[[Play], Coroutine[Any, Any, None]]) -> None:
-    async def started() -> None:
-        await main(Play())
-
-    asyncio.run(started())
+async def joined() -> Play:
+    """A play whose hosts have joined, and have all that this sends."""
+    play = Play()
+    play.join()
+    await play.bundles()
+    return play
 
 
 def test_the_processes_are_shared_in_the_order_of_their_numbers() -> None:
@@ -87,42 +87,37 @@ def test_the_processes_are_shared_in_the_order_of_their_numbers() -> None:
     ]
 
 
-def test_grants_of_a_barrier_are_one_bundle_a_host() -> None:
-    async def main(play: Play) -> None:
-        play.join()
-        await play.bundles()
-        for process_id in ("v01", "v03", "v04"):
-            play.fleet.send(process_id, GRANT)
-        grants = {node: ("to_node", node, wire.encode(GRANT), True) for node in ("v01", "v03", "v04")}
-        assert await play.bundles() == [("a", [grants["v01"]]), ("b", [grants["v03"], grants["v04"]])]
-        play.fleet.send("v03", wire.StackRequest())
-        assert await play.bundles() == [("b", [("to_node", "v03", wire.encode(wire.StackRequest()), False)])]
-
-    run(main)
+@on_a_loop
+async def test_grants_of_a_barrier_are_one_bundle_a_host() -> None:
+    play = await joined()
+    for process_id in ("v01", "v03", "v04"):
+        play.fleet.send(process_id, GRANT)
+    grants = {node: ("to_node", node, wire.encode(GRANT), True) for node in ("v01", "v03", "v04")}
+    assert await play.bundles() == [("a", [grants["v01"]]), ("b", [grants["v03"], grants["v04"]])]
+    play.fleet.send("v03", wire.StackRequest())
+    assert await play.bundles() == [("b", [("to_node", "v03", wire.encode(wire.StackRequest()), False)])]
 
 
-def test_agents_are_started_once_all_hosts_are_there() -> None:
-    async def main(play: Play) -> None:
-        play.fleet.take("a", hello("a"))
-        assert not play.fleet.is_prepared() and play.fleet.missing == ["host a", "host b"]
-        ((host, welcome),) = play.sent
-        assert host == "a" and isinstance(welcome, HostWelcome)
-        assert welcome.processes == [["v01", "v02"]]
-        play.join()
-        assert play.fleet.is_prepared() and play.fleet.missing == []
-        starts = await play.bundles()
-        assert starts == [("a", [("start", ["v01"], [1], 0)]), ("b", [("start", ["v03", "v04"], [2, 3], 0)])]
+@on_a_loop
+async def test_agents_are_started_once_all_hosts_are_there() -> None:
+    play = Play()
+    play.fleet.take("a", hello("a"))
+    assert not play.fleet.is_prepared() and play.fleet.missing == ["host a", "host b"]
+    ((host, welcome),) = play.sent
+    assert host == "a" and isinstance(welcome, HostWelcome)
+    assert welcome.processes == [["v01", "v02"]]
+    play.join()
+    assert play.fleet.is_prepared() and play.fleet.missing == []
+    starts = await play.bundles()
+    assert starts == [("a", [("start", ["v01"], [1], 0)]), ("b", [("start", ["v03", "v04"], [2, 3], 0)])]
 
-    run(main)
 
-
-def test_a_host_that_cannot_start_agents_says_why() -> None:
-    async def main(play: Play) -> None:
-        play.fleet.take("b", hello("b", failure="no module named x"))
-        with pytest.raises(VnetError, match="host b: no module named x"):
-            play.fleet.is_prepared()
-
-    run(main)
+@on_a_loop
+async def test_a_host_that_cannot_start_agents_says_why() -> None:
+    play = Play()
+    play.fleet.take("b", hello("b", failure="no module named x"))
+    with pytest.raises(VnetError, match="host b: no module named x"):
+        play.fleet.is_prepared()
 
 
 @pytest.mark.parametrize(
@@ -138,61 +133,49 @@ def test_a_host_that_cannot_start_agents_says_why() -> None:
         (messages.encode(Calls(b"1", [("ended", "v03", 2, 0, "", None)])), "'v03' is not on host a"),
     ],
 )
-def test_what_a_host_may_not_say_is_refused(payload: bytes, reason: str) -> None:
-    async def main(play: Play) -> None:
-        play.join()
-        play.fleet.take("a", payload)
-        assert play.came == []
-        assert [said[: len(reason)] for said in play.refused] == [reason]
-        if reason.startswith(("host a is", "its vnet")):
-            assert isinstance(play.sent[-1][1], HostRefusal)
-
-    run(main)
+@on_a_loop
+async def test_what_a_host_may_not_say_is_refused(payload: bytes, reason: str) -> None:
+    play = await joined()
+    play.fleet.take("a", payload)
+    assert play.came == []
+    assert [said[: len(reason)] for said in play.refused] == [reason]
+    if reason.startswith(("host a is", "its vnet")):
+        assert isinstance(play.sent[-1][1], HostRefusal)
 
 
-def test_one_wrong_item_does_not_take_the_others_with_it() -> None:
-    async def main(play: Play) -> None:
-        play.join()
-        play.news("a", ("message", "v01", b"1"), ("message", "v03", b"2"), ("message", "v02", b"3"))
-        assert play.came == [("v01", b"1"), ("v02", b"3")]
-
-    run(main)
+@on_a_loop
+async def test_one_wrong_item_does_not_take_the_others_with_it() -> None:
+    play = await joined()
+    play.news("a", ("message", "v01", b"1"), ("message", "v03", b"2"), ("message", "v02", b"3"))
+    assert play.came == [("v01", b"1"), ("v02", b"3")]
 
 
-def test_the_end_of_a_process_that_has_been_replaced_is_old_news() -> None:
-    async def main(play: Play) -> None:
-        play.join()
-        play.fleet.kill("v03")
-        play.fleet.start_agents("", play.access, [["v03"]])
-        play.news("b", ("ended", "v03", 2, -9, "", None))
-        assert play.came == [] and play.fleet.pids["v03"] == 4
-        play.news("b", ("ended", "v03", 4, 1, "its last line", None))
-        assert play.came == [("v03", Exit(1, "its last line"))]
-        assert "v03" not in play.fleet.pids
-        (_, (_, orders)) = await play.bundles()
-        assert orders[1:] == [("kill", "v03"), ("start", ["v03"], [4], 0)]
-
-    run(main)
+@on_a_loop
+async def test_the_end_of_a_process_that_has_been_replaced_is_old_news() -> None:
+    play = await joined()
+    play.fleet.kill("v03")
+    play.fleet.start_agents("", play.access, [["v03"]])
+    play.news("b", ("ended", "v03", 2, -9, "", None))
+    assert play.came == [] and play.fleet.pids["v03"] == 4
+    play.news("b", ("ended", "v03", 4, 1, "its last line", None))
+    assert play.came == [("v03", Exit(1, "its last line"))]
+    assert "v03" not in play.fleet.pids
+    assert await play.bundles() == [("b", [("kill", "v03"), ("start", ["v03"], [4], 0)])]
 
 
-def test_nothing_is_said_to_a_process_that_is_not_there() -> None:
-    async def main(play: Play) -> None:
-        play.join()
-        await play.bundles()
-        play.fleet.detach("v04")(1.0)
-        await play.bundles()
-        play.fleet.kill("v04")
-        play.fleet.signal("v04", signal.SIGSTOP)
-        assert await play.bundles() == []
-
-    run(main)
+@on_a_loop
+async def test_nothing_is_said_to_a_process_that_is_not_there() -> None:
+    play = await joined()
+    play.fleet.detach("v04")(1.0)
+    await play.bundles()
+    play.fleet.kill("v04")
+    play.fleet.signal("v04", signal.SIGSTOP)
+    assert await play.bundles() == []
 
 
 @in_virtual_time
 async def test_a_host_that_is_gone_takes_its_processes_along() -> None:
-    play = Play()
-    play.join()
-    await play.bundles()
+    play = await joined()
     play.fleet.take_token("b", False)
     assert play.came == [], "its last messages may still arrive"
     await asyncio.sleep(DEATH_GRACE_S + 0.1)
@@ -211,9 +194,7 @@ async def test_a_host_that_is_gone_takes_its_processes_along() -> None:
 
 @in_virtual_time
 async def test_the_end_waits_for_what_is_handed_in_and_not_for_the_silent() -> None:
-    play = Play()
-    play.join()
-    await play.bundles()
+    play = await joined()
     ending = asyncio.ensure_future(play.fleet.hand_in(1.0))
     assert [host for host, _ in await play.bundles()] == ["a", "b"]
     play.news("a", ("handing_in",))

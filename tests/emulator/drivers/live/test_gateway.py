@@ -118,140 +118,143 @@ def watch(session: zenoh.Session, key: str) -> asyncio.Queue[tuple[str, bool]]:
     return seen
 
 
-def two(
-    test: Callable[[list[Vehicle], list[zenoh.Session]], Coroutine[Any, Any, None]],
-    keys: tuple[str, ...] = ("**",),
-    max_payload: int = 2000,
-    inside: tuple[str, ...] | None = None,
-) -> None:
+def two_vehicles(
+    keys: tuple[str, ...] = ("**",), max_payload: int = 2000, inside: tuple[str, ...] | None = None
+) -> Callable[[Callable[[list[Vehicle], list[zenoh.Session]], Coroutine[Any, Any, None]]], Callable[[], None]]:
     """Run a test with two vehicles in range, and a client of each; in ROS 2 if topics are `inside`."""
 
-    async def run() -> None:
-        rules = {name: None if inside is None else Ros2(name, inside, 0) for name in ("v01", "v02")}
-        first, second = vehicles = [Vehicle(name, keys, max_payload, ros2) for name, ros2 in rules.items()]
-        first.others, second.others = [second], [first]
-        try:
-            endpoints = [await asyncio.to_thread(each.gateway.open, QUIET.listen) for each in vehicles]
-            with connected(endpoints[0]) as one, connected(endpoints[1]) as other:
-                await asyncio.wait_for(test(vehicles, [one, other]), PATIENCE_S)
-        finally:
-            for vehicle in vehicles:
-                await vehicle.gateway.close()
+    def of(test: Callable[[list[Vehicle], list[zenoh.Session]], Coroutine[Any, Any, None]]) -> Callable[[], None]:
+        async def main() -> None:
+            rules = {name: None if inside is None else Ros2(name, inside, 0) for name in ("v01", "v02")}
+            first, second = vehicles = [Vehicle(name, keys, max_payload, ros2) for name, ros2 in rules.items()]
+            first.others, second.others = [second], [first]
+            try:
+                endpoints = [await asyncio.to_thread(each.gateway.open, QUIET.listen) for each in vehicles]
+                with connected(endpoints[0]) as one, connected(endpoints[1]) as other:
+                    await asyncio.wait_for(test(vehicles, [one, other]), PATIENCE_S)
+            finally:
+                for vehicle in vehicles:
+                    await vehicle.gateway.close()
 
-    asyncio.run(run())
+        return lambda: asyncio.run(main())
 
-
-def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        own, heard = listen(sessions[0], "**"), listen(sessions[1], "**")
-        stamp = sessions[0].new_timestamp()
-        for number in range(3):
-            sessions[0].put(
-                f"car/{number}",
-                b"here",
-                encoding=zenoh.Encoding.APPLICATION_JSON,
-                attachment=b"extra",
-                timestamp=stamp,
-                priority=zenoh.Priority.REAL_TIME,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                express=True,
-            )
-        sessions[0].delete("car/0")
-        samples = [await heard.get() for _ in range(4)]
-        assert [str(each.key_expr) for each in samples] == ["car/0", "car/1", "car/2", "car/0"]
-        assert [each.kind for each in samples] == [zenoh.SampleKind.PUT] * 3 + [zenoh.SampleKind.DELETE]
-        stamped = samples[3].timestamp
-        assert stamped is not None and str(stamped.get_id()) == str(sessions[0].info.routers_zid()[0])
-        put = samples[0]
-        assert (put.payload.to_bytes(), put.encoding) == (b"here", zenoh.Encoding.APPLICATION_JSON)
-        assert put.attachment is not None and put.attachment.to_bytes() == b"extra"
-        assert (put.timestamp, put.priority, put.express) == (stamp, zenoh.Priority.REAL_TIME, True)
-        assert put.congestion_control == zenoh.CongestionControl.BLOCK
-        assert len(vehicles[0].frames) == 4
-        assert vehicles[1].frames == []
-        assert [(await own.get()).kind for _ in range(4)] == [each.kind for each in samples]
-        assert own.empty()  # past the radio, and not again by it
-
-    two(test)
+    return of
 
 
-def test_a_sample_larger_than_a_frame_is_put_together_or_lost_by_one_of_its_frames() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        heard = listen(sessions[1], "**")
-        vehicles[0].is_lost = lambda number: number == 4
-        contents = [bytes([number]) * 1000 for number in range(3)]
-        for content in contents:
-            sessions[0].put("large", content)
-        assert (await heard.get()).payload.to_bytes() == contents[0]
-        assert (await heard.get()).payload.to_bytes() == contents[2]
-        assert len(vehicles[0].frames) % 3 == 0
-        assert all(len(frame) <= 300 for frame in vehicles[0].frames)
-
-    two(test, max_payload=300)
-
-
-def test_only_radio_keys_cross_and_none_of_vnet() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        heard = listen(sessions[1], "**")
-        for key in ("lidar/points", FIX_KEY, "radio/a"):
-            sessions[0].put(key, b"x")
-        assert str((await heard.get()).key_expr) == "radio/a"
-        assert len(vehicles[0].frames) == 1
-
-    two(test, keys=("radio/**", "vnet/**"))
-
-
-def test_an_advanced_subscriber_finds_exactly_the_samples_that_the_radio_has_lost() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        loop, missed = asyncio.get_running_loop(), asyncio.Queue[int]()
-        heard: asyncio.Queue[bytes] = asyncio.Queue()
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            sessions[1],
-            "pose",
-            lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample.payload.to_bytes()),
+@two_vehicles()
+async def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    own, heard = listen(sessions[0], "**"), listen(sessions[1], "**")
+    stamp = sessions[0].new_timestamp()
+    for number in range(3):
+        sessions[0].put(
+            f"car/{number}",
+            b"here",
+            encoding=zenoh.Encoding.APPLICATION_JSON,
+            attachment=b"extra",
+            timestamp=stamp,
+            priority=zenoh.Priority.REAL_TIME,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
         )
-        subscriber.sample_miss_listener(lambda miss: loop.call_soon_threadsafe(missed.put_nowait, miss.nb))
-        listen(sessions[1], "other")
-        vehicles[0].is_lost = lambda number: number in (2, 5, 6)
-        publisher = zenoh.ext.declare_advanced_publisher(
-            sessions[0],
-            "pose",
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
-        )
-        for number in range(10):
-            publisher.put(bytes([number]))
-        assert [(await heard.get())[0] for _ in range(7)] == [0, 1, 3, 4, 7, 8, 9]
-        assert [await missed.get() for _ in range(2)] == [1, 2]
-
-    two(test)
-
-
-def test_an_advanced_subscriber_recovers_what_the_radio_has_lost_from_the_publishers_cache() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        loop, heard = asyncio.get_running_loop(), asyncio.Queue[int]()
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            sessions[1],
-            "pose",
-            lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample.payload.to_bytes()[0]),
-            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-        )
-        listen(sessions[1], "other")
-        vehicles[0].is_lost = lambda number: number in (2, 5, 6)
-        publisher = zenoh.ext.declare_advanced_publisher(
-            sessions[0],
-            "pose",
-            cache=zenoh.ext.CacheConfig(10),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None),
-        )
-        for number in range(10):
-            publisher.put(bytes([number]))
-        assert [await heard.get() for _ in range(10)] == list(range(10))
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
-
-    two(test, keys=RADIO_KEYS)
+    sessions[0].delete("car/0")
+    samples = [await heard.get() for _ in range(4)]
+    assert [str(each.key_expr) for each in samples] == ["car/0", "car/1", "car/2", "car/0"]
+    assert [each.kind for each in samples] == [zenoh.SampleKind.PUT] * 3 + [zenoh.SampleKind.DELETE]
+    stamped = samples[3].timestamp
+    assert stamped is not None and str(stamped.get_id()) == str(sessions[0].info.routers_zid()[0])
+    put = samples[0]
+    assert (put.payload.to_bytes(), put.encoding) == (b"here", zenoh.Encoding.APPLICATION_JSON)
+    assert put.attachment is not None and put.attachment.to_bytes() == b"extra"
+    assert (put.timestamp, put.priority, put.express) == (stamp, zenoh.Priority.REAL_TIME, True)
+    assert put.congestion_control == zenoh.CongestionControl.BLOCK
+    assert len(vehicles[0].frames) == 4
+    assert vehicles[1].frames == []
+    assert [(await own.get()).kind for _ in range(4)] == [each.kind for each in samples]
+    assert own.empty()  # past the radio, and not again by it
 
 
-def test_a_query_is_answered_by_the_programs_of_another_vehicle_with_samples_and_errors() -> None:
+@two_vehicles(max_payload=300)
+async def test_a_sample_larger_than_a_frame_is_put_together_or_lost_by_one_of_its_frames(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    heard = listen(sessions[1], "**")
+    vehicles[0].is_lost = lambda number: number == 4
+    contents = [bytes([number]) * 1000 for number in range(3)]
+    for content in contents:
+        sessions[0].put("large", content)
+    assert (await heard.get()).payload.to_bytes() == contents[0]
+    assert (await heard.get()).payload.to_bytes() == contents[2]
+    assert len(vehicles[0].frames) % 3 == 0
+    assert all(len(frame) <= 300 for frame in vehicles[0].frames)
+
+
+@two_vehicles(keys=("radio/**", "vnet/**"))
+async def test_only_radio_keys_cross_and_none_of_vnet(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    heard = listen(sessions[1], "**")
+    for key in ("lidar/points", FIX_KEY, "radio/a"):
+        sessions[0].put(key, b"x")
+    assert str((await heard.get()).key_expr) == "radio/a"
+    assert len(vehicles[0].frames) == 1
+
+
+@two_vehicles()
+async def test_an_advanced_subscriber_finds_exactly_the_samples_that_the_radio_has_lost(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    loop, missed = asyncio.get_running_loop(), asyncio.Queue[int]()
+    heard: asyncio.Queue[bytes] = asyncio.Queue()
+    subscriber = zenoh.ext.declare_advanced_subscriber(
+        sessions[1],
+        "pose",
+        lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample.payload.to_bytes()),
+    )
+    subscriber.sample_miss_listener(lambda miss: loop.call_soon_threadsafe(missed.put_nowait, miss.nb))
+    listen(sessions[1], "other")
+    vehicles[0].is_lost = lambda number: number in (2, 5, 6)
+    publisher = zenoh.ext.declare_advanced_publisher(
+        sessions[0],
+        "pose",
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+    )
+    for number in range(10):
+        publisher.put(bytes([number]))
+    assert [(await heard.get())[0] for _ in range(7)] == [0, 1, 3, 4, 7, 8, 9]
+    assert [await missed.get() for _ in range(2)] == [1, 2]
+
+
+@two_vehicles(keys=RADIO_KEYS)
+async def test_an_advanced_subscriber_recovers_what_the_radio_has_lost_from_the_publishers_cache(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    loop, heard = asyncio.get_running_loop(), asyncio.Queue[int]()
+    subscriber = zenoh.ext.declare_advanced_subscriber(
+        sessions[1],
+        "pose",
+        lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample.payload.to_bytes()[0]),
+        recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+    )
+    listen(sessions[1], "other")
+    vehicles[0].is_lost = lambda number: number in (2, 5, 6)
+    publisher = zenoh.ext.declare_advanced_publisher(
+        sessions[0],
+        "pose",
+        cache=zenoh.ext.CacheConfig(10),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None),
+    )
+    for number in range(10):
+        publisher.put(bytes([number]))
+    assert [await heard.get() for _ in range(10)] == list(range(10))
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+@two_vehicles()
+async def test_a_query_is_answered_by_the_programs_of_another_vehicle_with_samples_and_errors(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
     def reply(query: zenoh.Query) -> None:
         with query:
             asked = b"" if query.payload is None else query.payload.to_bytes()
@@ -260,140 +263,139 @@ def test_a_query_is_answered_by_the_programs_of_another_vehicle_with_samples_and
             else:
                 query.reply(query.key_expr, asked + b"!", attachment=b"extra", encoding="text/plain")
 
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        sessions[1].declare_queryable("service", reply)
-        listen(sessions[1], "other")
-        answers = await asyncio.to_thread(lambda: list(sessions[0].get("service", payload=b"hello")))
-        ok = answers[0].ok
-        assert ok is not None and ok.attachment is not None
-        assert (ok.payload.to_bytes(), ok.attachment.to_bytes()) == (b"hello!", b"extra")
-        assert len(answers) == 1
-        answers = await asyncio.to_thread(lambda: list(sessions[0].get("service?fails=1")))
-        assert answers[0].err is not None and answers[0].err.payload.to_bytes() == b"no"
-        assert len(vehicles[0].frames) == len(vehicles[1].frames) == 2
-
-    two(test)
+    sessions[1].declare_queryable("service", reply)
+    listen(sessions[1], "other")
+    answers = await asyncio.to_thread(lambda: list(sessions[0].get("service", payload=b"hello")))
+    ok = answers[0].ok
+    assert ok is not None and ok.attachment is not None
+    assert (ok.payload.to_bytes(), ok.attachment.to_bytes()) == (b"hello!", b"extra")
+    assert len(answers) == 1
+    answers = await asyncio.to_thread(lambda: list(sessions[0].get("service?fails=1")))
+    assert answers[0].err is not None and answers[0].err.payload.to_bytes() == b"no"
+    assert len(vehicles[0].frames) == len(vehicles[1].frames) == 2
 
 
-def test_tokens_of_a_vehicle_are_seen_by_those_in_range_late_ones_too_and_are_gone_without_word() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        first, second = vehicles
-        token = sessions[0].liveliness().declare_token("car/a")
-        while not first.frames:
-            await first.told.get()
-        early = watch(sessions[1], "car/*")
-        assert await early.get() == ("car/a", True)
-        late = watch(sessions[1], "car/*")  # history
-        assert await late.get() == ("car/a", True)
-        second.time_ns = 4 * NS_PER_S  # nothing was heard for longer than three times liveliness_s
-        second.gateway.forget_tokens(second.time_ns)
-        assert await early.get() == ("car/a", False)
-        told = first.gateway.tokens()
-        assert told == CrossingTokens(("car/a",))
-        for payload in Fragments(2000).of(told):
-            first.broadcast(payload)
-        assert await early.get() == ("car/a", True)
-        token.undeclare()  # type: ignore[no-untyped-call]
-        assert await early.get() == ("car/a", False)
-        assert second.frames == [], "an echo of another vehicle's token is no token of this one"
-        assert first.gateway.tokens() is None
-
-    two(test)
-
-
-def test_a_token_that_two_vehicles_have_is_there_until_both_are_gone() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        first, second = vehicles
-        tokens = [sessions[0].liveliness().declare_token("leader")]
-        seen = [watch(session, "leader") for session in sessions]
-        assert [await each.get() for each in seen] == [("leader", True)] * 2
-        tokens.append(sessions[1].liveliness().declare_token("leader"))
-        settle(sessions[1])
-        told = second.gateway.tokens()
-        assert told == CrossingTokens(("leader",)), "Zenoh has told of the other's alone"
-        for payload in Fragments(2000).of(told):
-            second.broadcast(payload)
-        tokens[0].undeclare()  # type: ignore[no-untyped-call]
-        while first.gateway.tokens():
-            await first.told.get()
-        for session in sessions:
-            settle(session)
-        tokens[1].undeclare()  # type: ignore[no-untyped-call]
-        assert [await each.get() for each in seen] == [("leader", False)] * 2
-        assert second.gateway.tokens() is None
-        tokens[1] = sessions[1].liveliness().declare_token("leader")  # as soon as the other's is gone
-        assert [await each.get() for each in seen] == [("leader", True)] * 2
-
-    two(test)
+@two_vehicles()
+async def test_tokens_of_a_vehicle_are_seen_by_those_in_range_late_ones_too_and_are_gone_without_word(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    first, second = vehicles
+    token = sessions[0].liveliness().declare_token("car/a")
+    while not first.frames:
+        await first.told.get()
+    early = watch(sessions[1], "car/*")
+    assert await early.get() == ("car/a", True)
+    late = watch(sessions[1], "car/*")  # history
+    assert await late.get() == ("car/a", True)
+    second.time_ns = 4 * NS_PER_S  # nothing was heard for longer than three times liveliness_s
+    second.gateway.forget_tokens(second.time_ns)
+    assert await early.get() == ("car/a", False)
+    told = first.gateway.tokens()
+    assert told == CrossingTokens(("car/a",))
+    for payload in Fragments(2000).of(told):
+        first.broadcast(payload)
+    assert await early.get() == ("car/a", True)
+    token.undeclare()  # type: ignore[no-untyped-call]
+    assert await early.get() == ("car/a", False)
+    assert second.frames == [], "an echo of another vehicle's token is no token of this one"
+    assert first.gateway.tokens() is None
 
 
-def test_a_router_that_goes_takes_tokens_and_sessions_along() -> None:
+@two_vehicles()
+async def test_a_token_that_two_vehicles_have_is_there_until_both_are_gone(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    first, second = vehicles
+    tokens = [sessions[0].liveliness().declare_token("leader")]
+    seen = [watch(session, "leader") for session in sessions]
+    assert [await each.get() for each in seen] == [("leader", True)] * 2
+    tokens.append(sessions[1].liveliness().declare_token("leader"))
+    settle(sessions[1])
+    told = second.gateway.tokens()
+    assert told == CrossingTokens(("leader",)), "Zenoh has told of the other's alone"
+    for payload in Fragments(2000).of(told):
+        second.broadcast(payload)
+    tokens[0].undeclare()  # type: ignore[no-untyped-call]
+    while first.gateway.tokens():
+        await first.told.get()
+    for session in sessions:
+        settle(session)
+    tokens[1].undeclare()  # type: ignore[no-untyped-call]
+    assert [await each.get() for each in seen] == [("leader", False)] * 2
+    assert second.gateway.tokens() is None
+    tokens[1] = sessions[1].liveliness().declare_token("leader")  # as soon as the other's is gone
+    assert [await each.get() for each in seen] == [("leader", True)] * 2
+
+
+@two_vehicles()
+async def test_a_router_that_goes_takes_tokens_and_sessions_along(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
     """Nobody tells of those that end before there is one again."""
-
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        gateway, token = vehicles[0].gateway, sessions[0].liveliness().declare_token("car/a")
-        while not (gateway.tokens() and gateway.sessions):
-            await vehicles[0].told.get()
-        await gateway.close()
-        assert not (gateway.tokens() or gateway.sessions)
-        del token
-
-    two(test)
+    gateway, token = vehicles[0].gateway, sessions[0].liveliness().declare_token("car/a")
+    while not (gateway.tokens() and gateway.sessions):
+        await vehicles[0].told.get()
+    await gateway.close()
+    assert not (gateway.tokens() or gateway.sessions)
+    del token
 
 
-def test_bytes_that_a_fault_has_changed_harm_nobody() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        heard = listen(sessions[1], "last")
-        first = listen(sessions[1], "car")
-        sessions[0].put("car", b"here", attachment=b"extra", timestamp=sessions[0].new_timestamp())
-        await first.get()
-        frame = vehicles[0].frames[0]
-        for content in (b"", b"\xc1", msgspec.msgpack.encode([0, 0, 1, b"\x90"])):
-            vehicles[0].broadcast(content)
-        for place in range(len(frame)):
-            for change in (0x01, 0x40, 0x80, 0xFF):
-                changed = bytearray(frame)
-                changed[place] ^= change
-                vehicles[0].broadcast(bytes(changed))
-        sessions[0].put("last", b"x")
-        assert str((await heard.get()).key_expr) == "last"
-        assert len(vehicles[1].unread) > len(frame)
+@two_vehicles()
+async def test_bytes_that_a_fault_has_changed_harm_nobody(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    heard = listen(sessions[1], "last")
+    first = listen(sessions[1], "car")
+    sessions[0].put("car", b"here", attachment=b"extra", timestamp=sessions[0].new_timestamp())
+    await first.get()
+    frame = vehicles[0].frames[0]
+    for content in (b"", b"\xc1", msgspec.msgpack.encode([0, 0, 1, b"\x90"])):
+        vehicles[0].broadcast(content)
+    for place in range(len(frame)):
+        for change in (0x01, 0x40, 0x80, 0xFF):
+            changed = bytearray(frame)
+            changed[place] ^= change
+            vehicles[0].broadcast(bytes(changed))
+    sessions[0].put("last", b"x")
+    assert str((await heard.get()).key_expr) == "last"
+    assert len(vehicles[1].unread) > len(frame)
 
-    two(test)
 
-
-def test_a_reply_without_content_is_an_error_without_content() -> None:
+@two_vehicles()
+async def test_a_reply_without_content_is_an_error_without_content(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
     """As a fault may make one of the bytes of another."""
 
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        replies = sessions[0].get("asked")
-        while not vehicles[0].frames:
-            await asyncio.sleep(0)
-        for payload in Fragments(2000).of(CrossingReply("v01", 0, None)):
-            vehicles[1].broadcast(payload)
-        error = (await asyncio.to_thread(replies.recv)).err
-        assert error is not None and error.payload.to_bytes() == b""
-
-    two(test)
+    replies = sessions[0].get("asked")
+    while not vehicles[0].frames:
+        await asyncio.sleep(0)
+    for payload in Fragments(2000).of(CrossingReply("v01", 0, None)):
+        vehicles[1].broadcast(payload)
+    error = (await asyncio.to_thread(replies.recv)).err
+    assert error is not None and error.payload.to_bytes() == b""
 
 
-def test_a_program_hears_its_fixes_and_reports_by_keys_of_vnet() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        fixes = listen(sessions[0], FIX_KEY)
-        vehicles[0].gateway.show_fix(FIX)
-        fix = msgspec.msgpack.decode((await fixes.get()).payload.to_bytes())
-        assert (fix["position_m"], fix["covariance_m2"], fix["speed_m_s"]) == ([1, 2], [[1, 0], [0, 1]], 3)
-        content = msgspec.msgpack.encode({"speed": 3.0})
-        sessions[0].put(REPORT_KEY, content)
-        while (told := await vehicles[0].told.get())[0] != "report":
-            pass
-        assert told == ("report", content)
-        assert vehicles[0].frames == []
+@two_vehicles()
+async def test_a_program_hears_its_fixes_and_reports_by_keys_of_vnet(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    fixes = listen(sessions[0], FIX_KEY)
+    vehicles[0].gateway.show_fix(FIX)
+    fix = msgspec.msgpack.decode((await fixes.get()).payload.to_bytes())
+    assert (fix["position_m"], fix["covariance_m2"], fix["speed_m_s"]) == ([1, 2], [[1, 0], [0, 1]], 3)
+    content = msgspec.msgpack.encode({"speed": 3.0})
+    sessions[0].put(REPORT_KEY, content)
+    while (told := await vehicles[0].told.get())[0] != "report":
+        pass
+    assert told == ("report", content)
+    assert vehicles[0].frames == []
 
-    two(test)
 
-
-def test_topics_services_and_tokens_of_ros_2_cross_or_stay_inside_with_each_other() -> None:
+@two_vehicles(keys=ROS2_KEYS, inside=("/inside/**",))
+async def test_topics_services_and_tokens_of_ros_2_cross_or_stay_inside_with_each_other(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
     def key(topic: str) -> str:
         return f"0/{topic}/std_msgs::msg::dds_::String_/TypeHashNotSupported"
 
@@ -402,51 +404,44 @@ def test_topics_services_and_tokens_of_ros_2_cross_or_stay_inside_with_each_othe
             f"@ros2_lv/0/ab/0/1/MP/%/%/node/%{topic}/std_msgs::msg::dds_::String_/TypeHashNotSupported/::,:,:,:,,"
         )
 
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        heard, own = listen(sessions[1], "0/**"), listen(sessions[0], "0/vnet/**")
-        seen = watch(sessions[1], "@ros2_lv/**")
-        told = {await seen.get() for _ in range(3)}
-        assert all("%vnet/gateway" in each for each, _ in told), "vnet's own node, and no other vehicle's"
-        queryables = [
-            sessions[1].declare_queryable(
-                key(name), lambda query: query.reply(query.key_expr, b"yes"), complete=True
-            )
-            for name in ("add", "inside/add")
-        ]
-        settle(sessions[1])
-        tokens = []
-        for name in ("inside/a", "chatter"):
-            tokens.append(sessions[0].liveliness().declare_token(token(name.replace("/", "%"))))
-            sessions[0].put(key(name), b"x", attachment=bytes(33))
-        sample = await heard.get()
-        assert str(sample.key_expr) == key("chatter")
-        assert sample.attachment is not None and sample.attachment.to_bytes() == bytes(33)
-        assert await seen.get() == (token("chatter"), True)
-        for name, count in (("add", 1), ("inside/add", 0)):
-            target = zenoh.QueryTarget.ALL_COMPLETE
-            answers = await asyncio.to_thread(lambda: list(sessions[0].get(key(name), target=target)))  # noqa: B023
-            assert len(answers) == count
-        vehicles[0].gateway.show_clock(5)
-        vehicles[0].gateway.show_fix(FIX)
-        assert str((await own.get()).key_expr).startswith("0/vnet/fix/")
-        assert seen.empty() and heard.empty()
-        assert len(vehicles[0].frames) == 3  # message, token, query
-        assert queryables
-
-    two(test, keys=ROS2_KEYS, inside=("/inside/**",))
+    heard, own = listen(sessions[1], "0/**"), listen(sessions[0], "0/vnet/**")
+    seen = watch(sessions[1], "@ros2_lv/**")
+    told = {await seen.get() for _ in range(3)}
+    assert all("%vnet/gateway" in each for each, _ in told), "vnet's own node, and no other vehicle's"
+    queryables = [
+        sessions[1].declare_queryable(key(name), lambda query: query.reply(query.key_expr, b"yes"), complete=True)
+        for name in ("add", "inside/add")
+    ]
+    settle(sessions[1])
+    tokens = []
+    for name in ("inside/a", "chatter"):
+        tokens.append(sessions[0].liveliness().declare_token(token(name.replace("/", "%"))))
+        sessions[0].put(key(name), b"x", attachment=bytes(33))
+    sample = await heard.get()
+    assert str(sample.key_expr) == key("chatter")
+    assert sample.attachment is not None and sample.attachment.to_bytes() == bytes(33)
+    assert await seen.get() == (token("chatter"), True)
+    for name, count in (("add", 1), ("inside/add", 0)):
+        target = zenoh.QueryTarget.ALL_COMPLETE
+        answers = await asyncio.to_thread(lambda: list(sessions[0].get(key(name), target=target)))  # noqa: B023
+        assert len(answers) == count
+    vehicles[0].gateway.show_clock(5)
+    vehicles[0].gateway.show_fix(FIX)
+    assert str((await own.get()).key_expr).startswith("0/vnet/fix/")
+    assert seen.empty() and heard.empty()
+    assert len(vehicles[0].frames) == 3  # message, token, query
+    assert queryables
 
 
-def test_sessions_are_counted_by_who_they_are() -> None:
-    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-        gateway = vehicles[0].gateway
-        while len(gateway.sessions) < 1:
-            await vehicles[0].told.get()
-        assert gateway.sessions == {f"{sessions[0].zid()} (client)"}
-        sessions[0].close()  # type: ignore[no-untyped-call]
-        while gateway.sessions:
-            await vehicles[0].told.get()
-
-    two(test)
+@two_vehicles()
+async def test_sessions_are_counted_by_who_they_are(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+    gateway = vehicles[0].gateway
+    while len(gateway.sessions) < 1:
+        await vehicles[0].told.get()
+    assert gateway.sessions == {f"{sessions[0].zid()} (client)"}
+    sessions[0].close()  # type: ignore[no-untyped-call]
+    while gateway.sessions:
+        await vehicles[0].told.get()
 
 
 @pytest.mark.parametrize(
@@ -554,9 +549,7 @@ def test_a_certificate_that_names_its_host_is_trusted(tmp_path: Path, listen: st
         ("tea\xe9:secret", "cannot be read"),
     ],
 )
-def test_a_file_that_has_not_user_and_password_in_each_line_is_named(
-    tmp_path: Path, content: str, says: str
-) -> None:
+def test_file_that_has_not_user_and_password_in_each_line_is_named(tmp_path: Path, content: str, says: str) -> None:
     path = tmp_path / "users"
     path.write_text(content, encoding="latin-1")
     with pytest.raises(ProgramError, match=f"program.zenoh.users = '{path}': {says}"):

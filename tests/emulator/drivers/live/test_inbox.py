@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.processes import Heard
-from tests.emulator.drivers.live.fakes import Stage, hello, on_a_loop
+from tests.emulator.drivers.live.fakes import Stage, hello, joined, on_a_loop
 from vnet.transport import wire
 
 
@@ -148,9 +148,24 @@ async def test_once_closed_nothing_is_handled_any_more() -> None:
 
 @on_a_loop
 async def test_an_exception_of_a_callback_ends_the_run() -> None:
-    stage = Stage(pacing="realtime")
-    stage.join()
+    stage = joined(pacing="realtime")
     stage.live.begin(stage.members.processes(), lambda: 0)
     stage.live.hear("message", "v01", None)  # which no transport gives
     with pytest.raises(TypeError):
         await stage.live.receive(60.0)
+
+
+@pytest.mark.parametrize("version", [1, wire.VERSION + 1])
+@on_a_loop
+async def test_an_agent_of_another_version_is_refused_in_one_line(version: int) -> None:
+    stage = Stage()
+    stage.live.take("message", "v01", wire.encode(hello("v01", version=version)))
+    reason = (
+        f"the agent speaks version {version} of the messages, this emulator version {wire.VERSION}: "
+        "use the same version of vnet"
+    )
+    assert stage.attachment.sent == [("v01", wire.End(b"1", reason, refused=True))]
+    assert [(e.kind, e.details["reason"]) for e in stage.emulation.folder.events] == [("refused", reason)]
+    stage.live.take("message", "v01", wire.encode(hello("v01", ready=False)))
+    ((_, welcome),) = stage.attachment.sent[1:]
+    assert isinstance(welcome, wire.Welcome) and welcome.version == wire.VERSION

@@ -7,12 +7,12 @@ import sys
 from typing import Any
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from emulator.drivers.launch import Exit
 from emulator.drivers.live.supervisor import ProcessState
-from tests.emulator.drivers.live.fakes import ALONE, IDS, Stage, on_a_loop
+from tests.emulator.drivers.live.fakes import ALONE, IDS, Stage, joined, on_a_loop
 from vnet.errors import VnetError
 from vnet.transport import wire
 
@@ -25,16 +25,14 @@ def states(stage: Stage) -> list[ProcessState]:
 
 @on_a_loop
 async def test_after_the_start_every_process_runs_but_those_that_come_later() -> None:
-    stage = Stage(later=["v03"])
-    stage.join()
+    stage = joined(later=["v03"])
     assert states(stage) == [RUNNING, RUNNING, AWAY, RUNNING]
     assert stage.supervisor.processes_in(AWAY) == ["v03"]
 
 
 @on_a_loop
 async def test_a_killed_process_is_gone_at_once_and_comes_back_as_a_new_one() -> None:
-    stage = Stage()
-    stage.join()
+    stage = joined()
     await stage.supervisor.end("v02", killed=True, reason="killed by a fault")
     assert stage.launcher.done == [("kill", "v02")]
     assert stage.attachment.sent == [], "it is told nothing"
@@ -52,24 +50,20 @@ async def test_a_killed_process_is_gone_at_once_and_comes_back_as_a_new_one() ->
 
 
 @pytest.mark.parametrize("pacing", ["lockstep", "realtime"])
-def test_a_process_that_is_restarted_is_told_to_end_and_waited_for(pacing: str) -> None:
-    async def run() -> None:
-        stage = Stage(pacing=pacing)
-        stage.join()
-        await stage.supervisor.end("v02", killed=False, reason="restarted by a fault")
-        assert stage.attachment.sent == [("v02", wire.End(None, "restarted by a fault"))]
-        if pacing == "lockstep":
-            assert stage.launcher.done == [("wait for", "v02")]
-        await stage.supervisor.all_ended()
+@on_a_loop
+async def test_a_process_that_is_restarted_is_told_to_end_and_waited_for(pacing: str) -> None:
+    stage = joined(pacing=pacing)
+    await stage.supervisor.end("v02", killed=False, reason="restarted by a fault")
+    assert stage.attachment.sent == [("v02", wire.End(None, "restarted by a fault"))]
+    if pacing == "lockstep":
         assert stage.launcher.done == [("wait for", "v02")]
-
-    asyncio.run(run())
+    await stage.supervisor.all_ended()
+    assert stage.launcher.done == [("wait for", "v02")]
 
 
 @on_a_loop
 async def test_a_process_started_by_hand_is_told_to_go_whatever_ends_it() -> None:
-    stage = Stage(launch=False)
-    stage.join()
+    stage = joined(launch=False)
     await stage.supervisor.end("v02", killed=True, reason="killed by a fault")
     assert stage.attachment.sent == [("v02", wire.End(None, "killed by a fault"))]
     stage.supervisor.begin_again(["v02"])
@@ -80,8 +74,7 @@ async def test_a_process_started_by_hand_is_told_to_go_whatever_ends_it() -> Non
 
 @on_a_loop
 async def test_a_vehicle_that_enters_has_its_process_started_unless_it_is_there_already() -> None:
-    stage = Stage(later=["v02", "v03"])
-    stage.join()
+    stage = joined(later=["v02", "v03"])
     stage.hello("v03", b"1")
     stage.supervisor.begin_again(["v02", "v03"])
     assert stage.launcher.done == [("start", "v02")]
@@ -90,8 +83,7 @@ async def test_a_vehicle_that_enters_has_its_process_started_unless_it_is_there_
 
 @on_a_loop
 async def test_in_real_time_a_paused_process_is_stopped_and_continued() -> None:
-    stage = Stage(pacing="realtime")
-    stage.join()
+    stage = joined(pacing="realtime")
     stage.supervisor.pause({"v02", "v03"})
     stage.supervisor.pause({"v03", "v04"})
     assert states(stage) == [RUNNING, RUNNING, PAUSED, PAUSED]
@@ -108,8 +100,7 @@ async def test_in_real_time_a_paused_process_is_stopped_and_continued() -> None:
 
 @on_a_loop
 async def test_in_lockstep_a_paused_process_is_given_no_grant_and_no_signal() -> None:
-    stage = Stage()
-    stage.join()
+    stage = joined()
     stage.supervisor.pause({"v02"})
     assert states(stage) == [RUNNING, PAUSED, RUNNING, RUNNING]
     assert stage.launcher.done == []
@@ -117,8 +108,7 @@ async def test_in_lockstep_a_paused_process_is_given_no_grant_and_no_signal() ->
 
 @on_a_loop
 async def test_a_paused_process_is_continued_before_it_is_told_to_end() -> None:
-    stage = Stage(pacing="realtime")
-    stage.join()
+    stage = joined(pacing="realtime")
     stage.supervisor.pause({"v02"})
     await stage.supervisor.end("v02", killed=False, reason="it has left")
     assert stage.launcher.done[:2] == [("SIGSTOP", "v02"), ("SIGCONT", "v02")]
@@ -127,8 +117,7 @@ async def test_a_paused_process_is_continued_before_it_is_told_to_end() -> None:
 
 @on_a_loop
 async def test_a_process_that_returns_within_a_pause_is_paused_when_it_has_joined() -> None:
-    stage = Stage(pacing="realtime")
-    stage.join()
+    stage = joined(pacing="realtime")
     await stage.supervisor.end("v02", killed=True, reason="killed by a fault")
     stage.supervisor.pause({"v02"})
     stage.supervisor.begin_again(["v02"])
@@ -145,8 +134,7 @@ async def test_a_process_that_returns_within_a_pause_is_paused_when_it_has_joine
 
 @on_a_loop
 async def test_a_death_is_told_once_with_how_it_came() -> None:
-    stage = Stage([["v01", "v02"], ["v03"], ["v04"]])
-    stage.join()
+    stage = joined([["v01", "v02"], ["v03"], ["v04"]])
     stage.launcher.dies(stage.supervisor, "v01")
     assert stage.supervisor.take_deaths() == {"v01": {"how": "SIGSEGV", "log_tail": "its last line"}}
     assert states(stage) == [DEAD, RUNNING, RUNNING]
@@ -156,8 +144,7 @@ async def test_a_death_is_told_once_with_how_it_came() -> None:
 
 @on_a_loop
 async def test_deaths_wait_until_they_are_taken() -> None:
-    stage = Stage()
-    stage.join()
+    stage = joined()
     for process_id in ("v03", "v02"):
         stage.launcher.dies(stage.supervisor, process_id)
     assert list(stage.supervisor.take_deaths({"v03", "v04"})) == ["v03"]
@@ -167,8 +154,7 @@ async def test_deaths_wait_until_they_are_taken() -> None:
 
 @on_a_loop
 async def test_a_fault_that_is_faster_than_the_news_of_a_death_takes_its_place() -> None:
-    stage = Stage()
-    stage.join()
+    stage = joined()
     stage.launcher.dies(stage.supervisor, "v02")
     await stage.supervisor.end("v02", killed=True, reason="killed by a fault")
     assert stage.supervisor.take_deaths() == {}
@@ -179,8 +165,7 @@ async def test_a_fault_that_is_faster_than_the_news_of_a_death_takes_its_place()
 
 @on_a_loop
 async def test_late_news_that_a_process_died_is_not_taken_for_the_next_one_of_that_name() -> None:
-    stage = Stage()
-    stage.join()
+    stage = joined()
     await stage.supervisor.end("v02", killed=True, reason="killed by a fault")
     stage.supervisor.begin_again(["v02"])
     stage.supervisor.child_ended("v02", Exit(-11, "the last line of the one before"))
@@ -194,8 +179,7 @@ async def test_late_news_that_a_process_died_is_not_taken_for_the_next_one_of_th
 
 @on_a_loop
 async def test_a_process_that_dies_while_it_starts_is_no_longer_awaited() -> None:
-    stage = Stage()
-    stage.join()
+    stage = joined()
     await stage.supervisor.end("v02", killed=True, reason="killed by a fault")
     stage.supervisor.begin_again(["v02"])
     stage.launcher.dies(stage.supervisor, "v02", status=1)
@@ -222,8 +206,7 @@ async def test_a_recorder_that_ends_does_the_run_no_harm() -> None:
 
 @on_a_loop
 async def test_the_end_of_a_process_started_by_hand_is_told_by_its_connection() -> None:
-    stage = Stage([["v01", "v02"], ["v03"], ["v04"]], launch=False)
-    stage.join()
+    stage = joined([["v01", "v02"], ["v03"], ["v04"]], launch=False)
     stage.supervisor.disconnected("v02")  # not the node that speaks for the process
     stage.supervisor.disconnected("v03")
     stage.supervisor.reconnecting = True
@@ -236,37 +219,33 @@ async def test_the_end_of_a_process_started_by_hand_is_told_by_its_connection() 
 
 
 @pytest.mark.parametrize("launch", [True, False])
-def test_who_ends_after_all_were_told_to_has_not_died(launch: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def run() -> None:
-        stage = Stage(launch=launch)
-        stage.join()
-        stage.launcher.pids.clear()
-        ended: dict[str, Exit] = {}
-        monkeypatch.setattr(stage.launcher, "ended", lambda: ended, raising=False)
+@on_a_loop
+async def test_who_ends_after_all_were_told_to_has_not_died(launch: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = joined(launch=launch)
+    stage.launcher.pids.clear()
+    ended: dict[str, Exit] = {}
+    monkeypatch.setattr(stage.launcher, "ended", lambda: ended, raising=False)
 
-        def end(name: str) -> None:
-            if not launch:
-                stage.supervisor.disconnected(name)
-                return
-            ended.clear()
-            ended[name] = Exit(0, "")
-            stage.supervisor._children_ended()
+    def end(name: str) -> None:
+        if not launch:
+            stage.supervisor.disconnected(name)
+            return
+        ended.clear()
+        ended[name] = Exit(0, "")
+        stage.supervisor._children_ended()
 
-        end("v02")
-        stage.supervisor.all_told_to_end()
-        end("v03")
-        while RUNNING in states(stage)[1:3]:
-            await stage.changes.wait(10)
-        assert states(stage) == [RUNNING, DEAD, AWAY, RUNNING]
-        assert list(stage.supervisor.take_deaths()) == ["v02"]
-
-    asyncio.run(run())
+    end("v02")
+    stage.supervisor.all_told_to_end()
+    end("v03")
+    while RUNNING in states(stage)[1:3]:
+        await stage.changes.wait(10)
+    assert states(stage) == [RUNNING, DEAD, AWAY, RUNNING]
+    assert list(stage.supervisor.take_deaths()) == ["v02"]
 
 
 @on_a_loop
 async def test_a_connection_that_closes_says_nothing_of_a_process_of_the_run_s_own() -> None:
-    stage = Stage()
-    stage.join()
+    stage = joined()
     stage.launcher.pids.clear()  # it has ended, and how will be told by the system
     stage.supervisor.disconnected("v02")
     assert states(stage) == [RUNNING] * 4
@@ -317,14 +296,12 @@ operations = st.lists(
 
 @pytest.mark.slow
 @example(operations=[("pause", "v01"), ("dies", "v01"), ("restart", "v01")], pacing="realtime", launch=True)
-@settings(deadline=None, max_examples=50)
 @given(operations=operations, pacing=st.sampled_from(["lockstep", "realtime"]), launch=st.booleans())
 def test_whatever_happens_in_whatever_order_every_process_has_one_state_and_stops_only_while_paused(
     operations: list[tuple[str, str]], pacing: str, launch: bool
 ) -> None:
     async def run() -> None:
-        stage = Stage(ALONE, launch=launch, pacing=pacing)
-        stage.join()
+        stage = joined(ALONE, launch=launch, pacing=pacing)
         supervisor, paused = stage.supervisor, set[str]()
         for number, (verb, node) in enumerate(operations):
             state = supervisor.state(node)

@@ -246,9 +246,7 @@ def test_routes_in_a_network_of_sumo_need_not_name_the_inside_of_intersections(t
     keys = {"routes": [["lane in_0", "lane out_0"], ["lane in_0", "lane south_0"]], "gap_m": 5.0}
     world = world_on(path, 2, keys)
     assert_allclose(world.vehicles.road.end_m, [200, 198], atol=1.0)
-    assert world.vehicles.gaps(100.0)[0][1] == pytest.approx(5.0), (
-        "both begin on the same road, one behind the other"
-    )
+    assert world.vehicles.gaps(100.0)[0][1] == pytest.approx(5.0), "both begin on the same road"
     drive(world, 70)
     assert_allclose(world.vehicles.place()[0], [[151.75, 0], [100, -43.5]], atol=1.0)
 
@@ -318,16 +316,8 @@ def brute_force_way_m(road: MapRoads, along_m: Any, left_m: Any, number: int, ra
         (9, {"routes": [EAST], "gap_m": 50.0}, "9 vehicles a lane with gap_m = 50 take 490.5 m: route"),
         (1, {"routes": [EAST], "start_m": [500]}, r"start_m: 500: route \['edge 0', 'edge 1'\] has 400 m"),
         (2, {"routes": [EAST], "start_m": [50]}, "start_m: 1 value for 2 vehicles"),
-        (
-            1,
-            {"routes": [EAST], "start_m": [50], "start_lanes": [1]},
-            "start_lanes: 1 for vehicle 1: its road",
-        ),
-        (
-            2,
-            {"routes": [EAST, NORTH], "start_m": [199, 199]},
-            "v0[12] and v0[12] overlap at the start",
-        ),
+        (1, {"routes": [EAST], "start_m": [50], "start_lanes": [1]}, "start_lanes: 1 for vehicle 1: its road"),
+        (2, {"routes": [EAST, NORTH], "start_m": [199, 199]}, "v0[12] and v0[12] overlap at the start"),
         (40, {}, "no room for vehicle .* with gap_m = 30"),
     ],
 )

@@ -20,10 +20,7 @@ from vnet.types import Array
 
 EXAMPLE = ROOT / "docs" / "examples" / "sumo_loop"
 HAS_LIBSUMO = importlib.util.find_spec("libsumo") is not None
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not HAS_LIBSUMO, reason="libsumo is not installed (extra sumo)"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not HAS_LIBSUMO, reason="libsumo is not installed (extra sumo)")]
 NOISELESS = {"world.ranging.sigma_m": 0.0, "world.ranging.rate_sigma_mps": 0.0, "world.gnss.speed_sigma_mps": 0.0}
 
 

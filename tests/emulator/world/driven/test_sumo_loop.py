@@ -20,7 +20,6 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import RunFolder
 from emulator.records.tables import BACKGROUND, DRIVEN, positions_by_time
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
@@ -34,6 +33,7 @@ from emulator.viewer.sinks import Sinks
 from emulator.world.driven.sumo import SumoWorld
 from emulator.world.world import build_world
 from tests.support.multi_loop_driver import run_forked, run_other_ways, run_together
+from tests.support.recorded import prepared
 from tests.support.recordings import read_back
 from tests.support.sumo import install_fake, write_scenario
 from vnet import Node
@@ -88,10 +88,8 @@ def test_programs_drive_their_vehicles_and_the_others_react(tmp_path: Path) -> N
     assert run.verdict == "valid"
     events = [(event.time_ns / 1e9, event.kind, event.node) for event in run.events]
     assert (1.0, "entered", "late") in events
-    assert [event for event in events if event[1] == "drive_limited"] == [
-        (0.5, "drive_limited", "lead-23-1"),
-        (1.5, "drive_limited", "lead-23-1"),
-    ]
+    limited = [event for event in events if event[1] == "drive_limited"]
+    assert limited == [(time_s, "drive_limited", "lead-23-1") for time_s in (0.5, 1.5)]
     speed, command = by_node(run, "speed_m_s"), by_node(run, "command_m_s2")
     assert_allclose(speed["lead-23-1"][[0, 5, 6, 15]], [12.001, 12.001, 11.201, 4.001], atol=1e-9)
     assert_allclose(speed["lead-23-1"][17], 12.001)
@@ -121,7 +119,7 @@ def test_sumo_writes_its_files_in_a_run_in_several_processes(tmp_path: Path) -> 
 def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> None:
     """`behind` and `late` have none; `late` comes after a second."""
     scenario = Scenario.model_validate(write_scenario(tmp_path, network={"sumo": {"nodes": ["lead#1"]}}))
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    emulation = prepared(scenario, tmp_path / "run")
     live, told = Messages(emulation), list[dict[str, Any]]()
     emulation.watch(lambda view: told.append(live.period(view)))
     conclude(emulation, simulate(emulation)[0], "simulate")

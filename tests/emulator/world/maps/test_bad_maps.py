@@ -13,6 +13,7 @@ import pytest
 from emulator.world.maps import roads as roads_module
 from emulator.world.maps.files import CLIPPED, READERS, read_roads, write_roads
 from tests.support import maps
+from tests.support.files import write
 from vnet.errors import ScenarioError
 
 
@@ -23,12 +24,6 @@ def refusal(path: Path, origin_deg: tuple[float, float] | None = None) -> str:
     text = str(refused.value)
     assert text.startswith(f"{path}: ") and text.isprintable()
     return text.removeprefix(f"{path}: ")
-
-
-def write(folder: Path, name: str, content: str | bytes) -> Path:
-    path = folder / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
 
 
 # All kinds.

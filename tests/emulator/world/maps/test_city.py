@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.world.maps.city import city_roads
@@ -24,6 +22,7 @@ from emulator.world.trips.motion import Motion
 from emulator.world.world import build_world
 from tests.support.command_line import app
 from tests.support.paths import ROOT
+from tests.support.recorded import prepared
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
 
@@ -165,10 +164,8 @@ def test_more_than_memory_holds_is_refused(city: Roads) -> None:
 def test_a_run_through_the_city(tmp_path: Path) -> None:
     """Its programs have the map, and find the error that they share."""
     scenario = load_scenario(ROOT / "scenarios" / "city.toml", ["run.duration_s=8", "network.vehicles=10"])
-    folder = RunFolder.create(tmp_path / "run", scenario)
-    world = build_world(scenario)
-    assert isinstance(world.lane_map, RoadMap)
-    emulation = Emulation(scenario, world, folder)
+    emulation = prepared(scenario, tmp_path / "run")
+    assert isinstance(emulation.world.lane_map, RoadMap)
     simulate(emulation)
     first, last = emulation.metrics.rows[2], emulation.metrics.rows[-1]
     assert first.common_error_rmse_m is not None and last.common_error_rmse_m is not None

@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.recorded_world import RecordedWorld
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.loading import dump_scenario, load_scenario
 from emulator.scenario.scenario import Scenario
 from emulator.stream import scene_message, unpack
 from emulator.world.world import build_world
-from tests.support.motion import Course, Stay, along, scenario_of_trips, write_trips
+from tests.support.motion import Course, along, scenario_of_trips, write_trips
 from tests.support.recorded import prepared
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
@@ -48,17 +46,27 @@ def write_cross(path: Path) -> Path:
     return path
 
 
-def driving(folder: Path, program: str = "agents.cooperative:main", seconds: float = 8.0, **map_: Any) -> Scenario:
-    """Four vehicles on the right-hand lanes of the cross."""
-    courses = {
-        "east": along(-150, 12, -RIGHT_M),
-        "west": along(150, -11, RIGHT_M),
-        "north": north(-150, 12, RIGHT_M),
-        "south": north(150, -13, -RIGHT_M),
-    }
-    trips = write_trips(folder / "trips.csv", {name: [(0, seconds, course)] for name, course in courses.items()})
+COURSES = {
+    "east": along(-150, 12, -RIGHT_M),
+    "west": along(150, -11, RIGHT_M),
+    "north": north(-150, 12, RIGHT_M),
+    "south": north(150, -13, -RIGHT_M),
+}
+
+
+def driving(
+    folder: Path,
+    program: str = "agents.cooperative:main",
+    seconds: float = 8.0,
+    stays: dict[str, tuple[float, float]] | None = None,
+    loss: float = 0.1,
+    **map_: Any,
+) -> Scenario:
+    """Four vehicles on the right-hand lanes of the cross; some may come later and leave earlier."""
+    times = dict.fromkeys(COURSES, (0, seconds)) | (stays or {})
+    trips = write_trips(folder / "trips.csv", {name: [(*times[name], course)] for name, course in COURSES.items()})
     section = {"path": str(write_cross(folder / "cross.geojson")), "origin_deg": list(ORIGIN_DEG), **map_}
-    scenario = scenario_of_trips(trips, seconds - 0.2, program, radio={"loss": 0.1})
+    scenario = scenario_of_trips(trips, seconds - 0.2, program, radio={"loss": loss})
     return Scenario.model_validate(scenario.model_dump(mode="json", exclude_none=True) | {"map": section})
 
 
@@ -114,8 +122,7 @@ def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Pat
         scenario = driving(tmp_path / name, seconds=12.0)
         if name == "without":
             scenario = scenario.model_copy(update={"map": None})
-        folder = RunFolder.create(tmp_path / name / "run", scenario)
-        emulation = Emulation(scenario, build_world(scenario), folder)
+        emulation = prepared(scenario, tmp_path / name / "run")
         simulate(emulation)
         figures[name] = emulation.metrics.rows[-1]
         assert figures[name].not_finite == 0
@@ -128,20 +135,12 @@ def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Pat
 @pytest.mark.slow
 def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> None:
     """The next process has run a filter too, and continues; one that starts later does not take over."""
-    courses: dict[str, list[Stay]] = {
-        "a": [(3.0, 12.0, along(-150, 12, -RIGHT_M))],
-        "b": [(0, 8.0, along(150, -11, RIGHT_M))],
-        "c": [(0, 12.0, north(-150, 12, RIGHT_M))],
-        "d": [(0, 12.0, north(150, -13, -RIGHT_M))],
-    }
-    trips = write_trips(tmp_path / "trips.csv", courses)
-    section = {"path": str(write_cross(tmp_path / "cross.geojson")), "origin_deg": list(ORIGIN_DEG)}
-    scenario = scenario_of_trips(trips, 11.8, "agents.centralized:main", radio={"loss": 0.0})
-    scenario = Scenario.model_validate(scenario.model_dump(mode="json", exclude_none=True) | {"map": section})
+    stays = {"east": (3.0, 12.0), "west": (0.0, 8.0)}
+    scenario = driving(tmp_path, "agents.centralized:main", 12.0, stays, loss=0.0)
     emulation = prepared(scenario, tmp_path / "run")
     simulate(emulation)
     error = [row.common_error_rmse_m for row in emulation.metrics.rows]
-    left = 41  # the period after the one in which b leaves
+    left = 41  # the period after the one in which one leaves
     before = error[left - 3]
     assert before is not None and before < 1.5
     after = [value for value in error[left : left + 10] if value is not None]

@@ -15,6 +15,8 @@ from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
+pytestmark = pytest.mark.slow
+
 NS = 1_000_000_000
 
 
@@ -28,7 +30,6 @@ def drive() -> tuple[RoadMap, Motion]:
     return roads.lane_map(), generate_motion("city", roads, 20, 1, 121, NS, RIGHT)
 
 
-@pytest.mark.slow
 def test_a_shift_is_found_and_how_sure_it_is(drive: tuple[RoadMap, Motion]) -> None:
     lanes, motion = drive
     found = calibrate(residuals(moved(lanes, (1.2, -0.7)), motion))
@@ -38,7 +39,6 @@ def test_a_shift_is_found_and_how_sure_it_is(drive: tuple[RoadMap, Motion]) -> N
     assert np.abs(again.datum_m).max() < 0.15, "moved by it, nothing is left"
 
 
-@pytest.mark.slow
 def test_a_third_of_the_vehicles_on_roads_of_their_own_do_not_count(drive: tuple[RoadMap, Motion]) -> None:
     lanes, motion = drive
     position_m = motion.position_m.copy()
@@ -48,7 +48,6 @@ def test_a_third_of_the_vehicles_on_roads_of_their_own_do_not_count(drive: tuple
     assert found.datum_m == pytest.approx([-1.2, 0.7], abs=0.6)
 
 
-@pytest.mark.slow
 def test_whoever_strays_all_along_makes_the_shift_less_sure(drive: tuple[RoadMap, Motion]) -> None:
     lanes, motion = drive
     rng, squares = np.random.default_rng(1), []
@@ -60,7 +59,6 @@ def test_whoever_strays_all_along_makes_the_shift_less_sure(drive: tuple[RoadMap
     assert 0.3 < np.mean(squares) < 4
 
 
-@pytest.mark.slow
 def test_too_few_places_are_refused(drive: tuple[RoadMap, Motion]) -> None:
     lanes, motion = drive
     found = residuals(lanes, motion)

@@ -7,20 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.world.maps.files import read_roads, write_roads
 from emulator.world.maps.roads import NAMES, Roads
 from emulator.world.projection import CoordinateFrame
 from tests.support import maps
+from tests.support.files import write
 from tests.support.maps import NODES, ORIGIN
-
-
-def write(folder: Path, name: str, text: str) -> Path:
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def write_npz(folder: Path, **changes: Any) -> Path:
@@ -242,7 +237,6 @@ def test_what_edges_say_of_themselves(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @given(edges=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7)), min_size=1, max_size=30))
-@settings(deadline=None)
 def test_no_edge_is_lost_and_none_is_added(tmp_path_factory: Any, edges: list[tuple[int, int]]) -> None:
     folder = tmp_path_factory.mktemp("maps")
     edges += [(0, 1)]

@@ -91,16 +91,11 @@ def test_geojson_has_polygons_that_are_buildings(tmp_path: Path) -> None:
     assert rings(found) == [house_m, court_m, court_m, house_m]
 
 
-def polygons(*rows: str) -> str:
-    return (
-        '<?xml version="1.0"?>\n<additional>\n' + "\n".join(f"<poly {row}/>" for row in rows) + "\n</additional>\n"
-    )
-
-
 def test_sumo_has_polygons_in_metres(tmp_path: Path) -> None:
     path = tmp_path / "town.poly.xml"
-    house = 'id="1" type="building.school" color="1,0,0" shape="20,10 50.0,10 50,40,3.5 20,40 20,10"'
-    path.write_text(polygons(house, 'id="2" type="landuse" shape="0,0 1,1 2,0"'))
+    house = '<poly id="1" type="building.school" color="1,0,0" shape="20,10 50.0,10 50,40,3.5 20,40 20,10"/>'
+    lawn = '<poly id="2" type="landuse" shape="0,0 1,1 2,0"/>'
+    path.write_text(f'<?xml version="1.0"?>\n<additional>\n{house}\n{lawn}\n</additional>\n')
     found = read_buildings(path, lambda: pytest.fail("no degrees"))
     assert rings(found) == [[list(p) for p in HOUSE]] and len(found.corner_m) == 4
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.scenario.scenario import Scenario
@@ -16,6 +16,7 @@ from emulator.world.trips import motion as samples_module
 from emulator.world.trips.drive import READERS, write_trips
 from emulator.world.trips.motion import Motion, Samples, Trip
 from emulator.world.world import World, build_world
+from tests.support.files import write
 from vnet.errors import ScenarioError
 
 TWO = "id,time_s,x_m,y_m\na,0,0,0\na,2,20,0\nb,1,0,50\nb,3,0,90\n"
@@ -36,23 +37,14 @@ FCD = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def write(folder: Path, name: str, content: str | bytes) -> Path:
-    path = folder / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
 def read(path: Path, origin_deg: tuple[float, float] | None = None, **options: Any) -> dict[str, Trip]:
     trips = READERS[path.suffix](path, options.get("window_s")).trips(origin_deg)
     return {trip.node_id: trip for trip in trips}
 
 
 def world_of(path: Path, duration_s: float = 2.0, rate_hz: float = 10.0, **network: Any) -> World:
-    data = {
-        "run": {"duration_s": duration_s},
-        "network": {"kind": "trips", "path": str(path), **network},
-        "world": {"gnss": {"rate_hz": rate_hz}},
-    }
+    trips = {"kind": "trips", "path": str(path), **network}
+    data = {"run": {"duration_s": duration_s}, "network": trips, "world": {"gnss": {"rate_hz": rate_hz}}}
     return build_world(Scenario.model_validate(data))
 
 
@@ -165,13 +157,8 @@ def test_ids_of_sumo_are_escaped_so_that_they_can_be_told_apart(tmp_path: Path) 
     rows = "".join(f"{name},{time_s},{9 * number},0\n" for number, name in enumerate(ids) for time_s in (0, 2))
     samples = READERS[".csv"](write(tmp_path, "t.csv", HEADER + rows), None)
     assert [trip.node_id for trip in samples.trips(None)] == [
-        "flow-23-1-3a-0-2f-2",
-        "x-3a-J1_0",
-        "plain-1.0",
-        "a-2d-b-20-c",
-        "x-2d-7",
-        "flow-23-1",
-    ]
+        "flow-23-1-3a-0-2f-2", "x-3a-J1_0", "plain-1.0", "a-2d-b-20-c", "x-2d-7", "flow-23-1",
+    ]  # fmt: skip
     (note,) = samples.notes
     assert "'flow#1:0/2' is flow-23-1-3a-0-2f-2" in note and note.endswith(", … (4)")
 
@@ -232,7 +219,6 @@ def test_a_file_without_end_in_sight_is_bounded(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
 @given(
     rows=st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 8), st.integers(0, 1)), min_size=1, max_size=30),
     batch=st.integers(1, 7),

@@ -193,7 +193,6 @@ def test_real_driving_is_not_taken_for_jumps() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(0.05, 3.0), st.floats(-300, 300)), min_size=2, max_size=40),
     st.floats(5, 100),
@@ -315,7 +314,6 @@ def test_a_given_speed_says_who_stands() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(st.floats(0, 2 * math.pi), st.floats(1, 40), st.integers(0, 30), st.integers(40, 90))
 def test_a_straight_drive_is_straight_wherever_its_samples_are(
     heading: float, speed_mps: float, first: int, last: int
