@@ -195,7 +195,7 @@ class Gateway(RadioSide[zenoh.Query]):
 
     def _end(self, numbers: list[int]) -> None:
         """As `RadioSide._end`, but not in a pause: what was heard meanwhile follows."""
-        if self.is_paused:
+        if self.is_paused and self._session is not None:
             asyncio.get_running_loop().call_later(self._query_s, self._end, numbers)
         else:
             super()._end(numbers)

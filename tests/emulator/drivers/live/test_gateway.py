@@ -362,6 +362,23 @@ async def test_bytes_that_a_fault_has_changed_harm_nobody(
 
 
 @two_vehicles()
+async def test_a_query_does_not_end_in_a_pause(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+    """What was heard meanwhile follows, and a reply may be of that."""
+    first, second = vehicles
+    sessions[1].declare_queryable("asked", lambda query: query.reply("asked", b"late"))
+    settle(sessions[1])
+    second.is_lost = lambda number: True
+    replies = sessions[0].get("asked", consolidation=zenoh.ConsolidationMode.NONE)
+    while not second.frames:
+        await asyncio.sleep(0)
+    first.gateway.is_paused = True
+    first.gateway._end([0])
+    first.gateway.is_paused = False
+    first.gateway.hear("v02", second.frames[0], 0)
+    assert (await asyncio.to_thread(replies.recv)).ok is not None
+
+
+@two_vehicles()
 async def test_a_reply_without_content_is_an_error_without_content(
     vehicles: list[Vehicle], sessions: list[zenoh.Session]
 ) -> None:
