@@ -37,7 +37,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from emulator.checks.own import is_broken
+from emulator.checks.own import PREFIX
 from emulator.pages.page import put_page, render, table
 from emulator.records.disk import DiskError, check_is_free, disk_errors, room_held, write_atomically
 from emulator.records.distributions import lowest_share
@@ -508,10 +508,16 @@ class Campaign:
         return failure_kinds((outcome.label, outcome.texts()) for outcome in self.failures)
 
     @property
-    def broken(self) -> list[FailureKind]:
-        """The ways in which checks of the user's own could not be made."""
+    def unjudged(self) -> list[FailureKind]:
+        """The ways in which runs have not failed but stay unknown, or checks of the user's own do in all runs."""
         runs = sorted(self.outcomes, key=lambda o: o.number)
-        return failure_kinds((o.label, {n: t for n, t in o.trial.texts.items() if is_broken(n)}) for o in runs)
+        judged = {n for o in runs for n, verdict in o.trial.verdicts.items() if verdict is not Verdict.UNKNOWN}
+
+        def is_unjudged(name: str, trial: Trial) -> bool:
+            return (name == "progress" and not trial.failed) or (name.startswith(PREFIX) and name not in judged)
+
+        texts = ({n: t for n, t in o.trial.texts.items() if is_unjudged(n, o.trial)} for o in runs)
+        return failure_kinds(zip((o.label for o in runs), texts, strict=True))
 
     def run(self) -> None:
         """All runs, so many at once as are planned; returns early, with what is there, after Ctrl-C."""
@@ -645,7 +651,7 @@ class Campaign:
             f"{len(self.outcomes)} of {self._plan.runs} runs of {run.duration_s:g} emulated seconds, "
             f"seeds from {self._plan.seed} on; {len(self.failures)} failed.",
             *([self._plan.note + "."] if self._plan.note else []),
-            *(f"{one.check} could not be made in {counted(one.runs, 'run')}: {one.text}" for one in self.broken),
+            *(f"{one.check} was unknown in {counted(one.runs, 'run')}: {one.text}" for one in self.unjudged),
         ]
         matrix = count_verdicts((outcome.kinds, outcome.trial.verdicts) for outcome in self.outcomes)
         failures = [self._described(outcome) for outcome in self.failures]
@@ -747,8 +753,7 @@ def run_campaign(
     the folder of an earlier campaign, by default the last one of the same name: its failures may have been fixed.
     What the disk refuses is left out, and named by a VnetError at the end.
 
-    0 if no run failed, 1 if one did, 3 if none did but a check of the user's own could not be made, 130 if it was
-    interrupted.
+    0 if no run failed, 1 if one did, 3 if none did but some are `unjudged`, 130 if it was interrupted.
     """
     name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
     folder = out or next(path for path in _folders(name) if not path.exists())
@@ -761,7 +766,7 @@ def run_campaign(
         campaign.run()
     if campaign.failures:
         console.print(*campaign.summary(), sep="\n")
-    for kind in campaign.broken:
+    for kind in campaign.unjudged:
         console.print(Text(f"unknown in {counted(kind.runs, 'run')}: {kind.check}: {kind.text}"))
     for line in (*compared_with_before(earlier, campaign.rows), *after_a_fix(campaign.rows)):
         console.print(Text(line))
@@ -776,4 +781,4 @@ def run_campaign(
         return 130
     if campaign.failures:
         return Verdict.INVALID.exit_status
-    return Verdict.UNKNOWN.exit_status if campaign.broken else 0
+    return Verdict.UNKNOWN.exit_status if campaign.unjudged else 0

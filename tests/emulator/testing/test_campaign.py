@@ -208,6 +208,22 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
     assert (status, "1 run, 0 failed" in said) == (3, True)
 
 
+def test_runs_and_checks_of_which_nothing_is_known_are_no_pass(tmp_path: Path) -> None:
+    (tmp_path / "own_seed_check.py").write_text(
+        "def check(run):\n"
+        "    yield 'typo', 'unknown', 'there was nothing to judge'\n"
+        "    yield 'once', 'valid' if run.scenario.run.seed == 1 else 'unknown', 'nothing this time'\n"
+    )
+    scenario = make_scenario(planted("proud"), {"checks": [f"{tmp_path}/own_seed_check.py:check"]})
+    status, said = run(Plan.of(scenario, "none", 2, seed=1), tmp_path / "checks")
+    assert (status, "2 runs, 0 failed" in said) == (3, True)
+    assert "unknown in 2 runs: own:typo: there was nothing to judge" in said and "own:once" not in said
+    assert "own:typo was unknown in 2 runs: there" in (tmp_path / "checks" / "campaign.html").read_text()
+    status, said = run(Plan.of(planted("interrupts"), "none", 2, seed=1), tmp_path / "runs")
+    assert (status, "2 runs, 0 failed" in said) == (3, True)
+    assert "unknown in 2 runs: progress: interrupted at 0.5" in said
+
+
 def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path, pytester: pytest.Pytester) -> None:
     folder = tmp_path / "campaign"
     plan = Plan.of(planted("stubborn"), "kill", 1, seed=1, limit_s=1.0, shrink_steps=0)
