@@ -302,6 +302,8 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
     emulation = session.emulation
     if cell.measure is None:
         _, verdict = session.close()
+        if unkept := session.folder.unkept:  # the disk is to blame: the cell is not finished
+            raise VnetError(unkept[0])
         figures, metrics = judged_figures(verdict), emulation.metrics.metrics_table()
     else:
         _ = emulation.metrics.rows  # figures that fail are an event

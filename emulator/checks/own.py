@@ -111,11 +111,6 @@ def _broken(entry: str) -> str:
     return f"{PREFIX}{entry.replace(':', '.')}"
 
 
-def is_broken(name: str) -> bool:
-    """Return whether a check says that a function of the user's own has failed."""
-    return name.startswith(PREFIX) and "." in name
-
-
 def _unknown(entry: str, error: BaseException) -> CheckResult:
     """Say how a function failed, and where in its own module."""
     if isinstance(error, VnetError) and not isinstance(error, _NonsenseError):

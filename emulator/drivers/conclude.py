@@ -22,6 +22,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
 from emulator.records.costs import run_cost
+from emulator.records.disk import room_held
 from emulator.records.events import EventKind
 from emulator.records.manifest import write_manifest
 from emulator.records.recorded_world import RecordedWorld
@@ -29,6 +30,7 @@ from emulator.records.run import Run
 from emulator.records.run_folder import (
     FORMAT,
     VERDICT_FILE,
+    VERDICT_ROOM_BYTES,
     WORLD_FILE,
     RunFolder,
     collect,
@@ -98,7 +100,7 @@ def conclude(
     folder = emulation.folder
     emulated_s = emulation.emulated_ns / 1e9
     recorded = gather(emulation, wall_s)
-    with folder.room_for_verdict():
+    with room_held(folder.path, VERDICT_ROOM_BYTES):
         _put_tables(emulation, recorded)
     own = _own_findings(recorded, folder)
     judgement = judge(recorded, [*kept(folder.unkept), *own])

@@ -21,13 +21,30 @@ LONGEST_HELD = 10_000
 """Characters that are held back of a line that has no end."""
 
 
+class DiskError(VnetError):
+    """A refusal of the disk."""
+
+
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Raise VnetError, which names `path`, where the disk refuses something in the block."""
+    """Raise DiskError, which names `path`, where the disk refuses something in the block."""
     try:
         yield
     except OSError as error:
-        raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None
+        raise DiskError(f"{path}: cannot write: {error.strerror or error}") from None
+
+
+@contextmanager
+def room_held(folder: Path, size_bytes: int) -> Iterator[None]:
+    """Hold room on the disk during the block: what is written later finds some behind files that fill the disk."""
+    held = folder / ".room"
+    try:
+        with suppress(OSError):
+            held.write_bytes(bytes(size_bytes))
+        yield
+    finally:
+        with suppress(OSError):
+            held.unlink(missing_ok=True)
 
 
 def check_is_free(folder: Path, option: str = "") -> None:

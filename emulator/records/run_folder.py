@@ -10,7 +10,6 @@ folder of their vehicle.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shlex
@@ -209,17 +208,6 @@ class RunFolder:
             except OSError:  # the run goes on, and writes them all at its end
                 self._lacks_events = True
 
-    @contextlib.contextmanager
-    def room_for_verdict(self) -> Iterator[None]:
-        """Hold room on the disk during the block, so that the verdict finds some behind tables that fill it."""
-        held = self.path / ".room"
-        try:
-            with contextlib.suppress(OSError):
-                held.write_bytes(bytes(VERDICT_ROOM_BYTES))
-            yield
-        finally:
-            held.unlink(missing_ok=True)
-
     def complete_events(self) -> None:
         """Write the events that the disk has refused while the run was on."""
         if self._lacks_events:
@@ -255,7 +243,7 @@ def _claim(path: Path) -> Path:
     """Make the first of path, path-2, path-3 … that does not exist; two runs that start at once get two."""
     for number in count(1):
         candidate = path if number == 1 else path.with_name(f"{path.name}-{number}")
-        with contextlib.suppress(FileExistsError):
+        with suppress(FileExistsError):
             candidate.mkdir(parents=True)
             return candidate
     raise AssertionError("count() ends")

@@ -1,7 +1,8 @@
 """A campaign: many runs of one scenario under random faults; failures are shrunk, explained and kept.
 
 Run number i has the seed of the campaign plus i. The seed draws the network (if it is generated), the run and the
-schedule, so that it alone reproduces a failure. No failure stops a campaign; Ctrl-C keeps all finished runs.
+schedule, so that it alone reproduces a failure. No failure stops a campaign, nor does a full disk; Ctrl-C keeps all
+finished runs.
 
 A failure that was seen before may be believed fixed after n green runs. If a run fails with probability p, n runs
 pass by chance with (1 - p)^n. That is at most alpha from n = ln(alpha) / ln(1 - p) on. The earlier campaign gives p
@@ -36,9 +37,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from emulator.checks.own import is_broken
+from emulator.checks.own import PREFIX
 from emulator.pages.page import put_page, render, table
-from emulator.records.disk import check_is_free, write_atomically
+from emulator.records.disk import DiskError, check_is_free, disk_errors, room_held, write_atomically
 from emulator.records.distributions import lowest_share
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -56,6 +57,7 @@ from emulator.testing.trial import (
     MOST_ORDER_STEPS,
     MOST_STEPS,
     REPLAY,
+    UNKNOWN,
     Schedule,
     Trial,
     TrialPool,
@@ -212,6 +214,8 @@ FAILURE_PAGE = "failure.html"
 NS_PER_US = 1000
 FORMAT = 1
 WRITE_EVERY = 20
+RESULT_ROOM_BYTES = 1 << 14
+"""Size of most runs in campaign.json and campaign.html."""
 
 
 def column_of(check: str) -> tuple[str, str | None]:
@@ -490,6 +494,8 @@ class Campaign:
         self._workshop = TrialPool(plan.limit_s, plan.scenario, executor, plan.check_determinism)
         self.outcomes: list[CampaignRun] = []
         self.interrupted = False
+        self.unkept: list[str] = []
+        """A line for each time that the disk has refused something."""
 
     @property
     def failures(self) -> list[CampaignRun]:
@@ -502,15 +508,22 @@ class Campaign:
         return failure_kinds((outcome.label, outcome.texts()) for outcome in self.failures)
 
     @property
-    def broken(self) -> list[FailureKind]:
-        """The ways in which checks of the user's own could not be made."""
+    def unjudged(self) -> list[FailureKind]:
+        """The ways in which runs have not failed but stay unknown, or checks of the user's own do in all runs."""
         runs = sorted(self.outcomes, key=lambda o: o.number)
-        return failure_kinds((o.label, {n: t for n, t in o.trial.texts.items() if is_broken(n)}) for o in runs)
+        judged = {n for o in runs for n, verdict in o.trial.verdicts.items() if verdict is not Verdict.UNKNOWN}
+
+        def is_unjudged(name: str, trial: Trial) -> bool:
+            return (name == "progress" and not trial.failed) or (name.startswith(PREFIX) and name not in judged)
+
+        texts = ({n: t for n, t in o.trial.texts.items() if is_unjudged(n, o.trial)} for o in runs)
+        return failure_kinds(zip((o.label for o in runs), texts, strict=True))
 
     def run(self) -> None:
         """All runs, so many at once as are planned; returns early, with what is there, after Ctrl-C."""
         self._task = self._progress.add_task("campaign", total=self._plan.runs)
-        with ThreadPoolExecutor(self._plan.jobs) as pool:
+        room = room_held(self._folder, self._plan.runs * RESULT_ROOM_BYTES)
+        with room, ThreadPoolExecutor(self._plan.jobs) as pool:
             futures = [pool.submit(self._one, number) for number in range(self._plan.runs)]
             try:
                 for future in as_completed(futures):
@@ -522,15 +535,33 @@ class Campaign:
                 pool.shutdown(cancel_futures=True)
         self._workshop.close()
         self._take_left(futures)
-        self.write()
+        with self._noting():
+            self.write()
+
+    @contextmanager
+    def _noting(self) -> Iterator[None]:
+        """End the block where the disk refuses something, and note that in `unkept`."""
+        try:
+            yield
+        except DiskError as error:
+            self.unkept.append(str(error))
+
+    def _run(self, scenario: Scenario, apart: bool = False) -> Trial:
+        """Return a trial that leaves no files; nothing is known of one that the disk has refused."""
+        with self._noting():
+            return self._workshop.run_anywhere(scenario, apart)
+        return UNKNOWN
 
     def _take(self, outcome: CampaignRun) -> None:
+        if not outcome.trial.verdicts:  # it was given up, or the disk has refused it
+            return
         self.outcomes.append(outcome)
         self._progress.update(
             self._task, advance=1, description=f"campaign: {counted(len(self.failures), 'failure')}"
         )
         if outcome.trial.failed or len(self.outcomes) % WRITE_EVERY == 0:
-            self.write()
+            with suppress(DiskError):  # it is written again at the end
+                self.write()
 
     def _take_left(self, futures: Sequence[Future[CampaignRun]]) -> None:
         """Take the runs that were over, or half shrunk, when the campaign was interrupted."""
@@ -539,12 +570,12 @@ class Campaign:
             if future.cancelled() or future.exception() is not None:
                 continue
             outcome = future.result()
-            if outcome.number not in taken and outcome.trial.verdicts:
+            if outcome.number not in taken:
                 self._take(outcome)
 
     def _one(self, number: int) -> CampaignRun:
         scenario = self._plan.draw(number)
-        trial = self._workshop.run_anywhere(scenario)
+        trial = self._run(scenario)
         outcome = CampaignRun(number + 1, scenario, trial)
         return self._shrink(outcome) if trial.failed else outcome
 
@@ -556,31 +587,36 @@ class Campaign:
         def still_fails(smaller: Scenario) -> bool:
             if self._workshop.closed or time.monotonic() > until_s:
                 return False
-            return bool(wanted & {column_of(name) for name in self._workshop.run_anywhere(smaller, apart).failed})
+            return bool(wanted & {column_of(name) for name in self._run(smaller, apart).failed})
 
         shrunk, steps = self._smallest(outcome, still_fails) if self._plan.shrink_steps else (outcome.scenario, 0)
         folder = self._folder / "failures" / outcome.label
-        again = self._workshop.run(shrunk, folder, apart)
-        folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / SCENARIO_FILE).exists():  # its process has died before
-            (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
-        (folder / "drawn.toml").write_text(schedule_toml(outcome.scenario.fault) + "\n")
-        test = regression_test(folder.name, sorted(outcome.trial.failed), self._plan.limit_s)
-        (folder / TEST_FILE).write_text(test)
-        return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
+        outcome = replace(outcome, shrunk=shrunk, steps=steps, folder=folder)
+        with self._noting(), disk_errors(folder):
+            outcome = replace(outcome, again=self._workshop.run(shrunk, folder, apart))
+            folder.mkdir(parents=True, exist_ok=True)
+            if not (folder / SCENARIO_FILE).exists():  # its process has died before
+                write_atomically(folder / SCENARIO_FILE, dump_scenario(shrunk))
+            write_atomically(folder / "drawn.toml", schedule_toml(outcome.scenario.fault) + "\n")
+            test = regression_test(folder.name, sorted(outcome.trial.failed), self._plan.limit_s)
+            write_atomically(folder / TEST_FILE, test)
+        return outcome
 
     def _explained(self, outcome: CampaignRun) -> CampaignRun:
         """Return a run that has failed with what tells it from one that passes, which is also put in its folder."""
-        if outcome.folder is None or outcome.shrunk is None or self._workshop.closed:
+        folder, shrunk = outcome.folder, outcome.shrunk
+        if folder is None or shrunk is None or outcome.again is None or self._workshop.closed:
             return outcome
         passed = [other for other in self.outcomes if other.passed]
         nearest = min(passed, key=lambda other: _distance(outcome, other), default=None)
         other = nearest.scenario if nearest else None
-        explanation = explain(outcome.shrunk, outcome.folder, other, self._workshop)
-        (outcome.folder / PARTING_FILE).write_text(explanation.text())
         title = f"Failure {outcome.label} of campaign {self._plan.scenario.run.name}"
-        write_failure_page(outcome.folder, title, outcome.texts(), explanation)
-        return replace(outcome, explanation=explanation)
+        with self._noting(), disk_errors(folder):
+            explanation = explain(shrunk, folder, other, self._workshop)
+            outcome = replace(outcome, explanation=explanation)
+            write_atomically(folder / PARTING_FILE, explanation.text())
+            write_failure_page(folder, title, outcome.texts(), explanation)
+        return outcome
 
     def _smallest(self, outcome: CampaignRun, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
         """Return the least run found that still fails, and how many were tried: order, faults, vehicles, time."""
@@ -615,7 +651,7 @@ class Campaign:
             f"{len(self.outcomes)} of {self._plan.runs} runs of {run.duration_s:g} emulated seconds, "
             f"seeds from {self._plan.seed} on; {len(self.failures)} failed.",
             *([self._plan.note + "."] if self._plan.note else []),
-            *(f"{one.check} could not be made in {counted(one.runs, 'run')}: {one.text}" for one in self.broken),
+            *(f"{one.check} was unknown in {counted(one.runs, 'run')}: {one.text}" for one in self.unjudged),
         ]
         matrix = count_verdicts((outcome.kinds, outcome.trial.verdicts) for outcome in self.outcomes)
         failures = [self._described(outcome) for outcome in self.failures]
@@ -715,9 +751,9 @@ def run_campaign(
 
     Its runs are simulated on `executor`, by default on this machine; those that are kept always are. `before` is
     the folder of an earlier campaign, by default the last one of the same name: its failures may have been fixed.
+    What the disk refuses is left out, and named by a VnetError at the end.
 
-    0 if no run failed, 1 if one did, 3 if none did but a check of the user's own could not be made, 130 if it was
-    interrupted.
+    0 if no run failed, 1 if one did, 3 if none did but some are `unjudged`, 130 if it was interrupted.
     """
     name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
     folder = out or next(path for path in _folders(name) if not path.exists())
@@ -728,18 +764,21 @@ def run_campaign(
     with _interrupted_once(), Progress(*columns, console=console) as progress:
         campaign = Campaign(plan, folder, progress, executor)
         campaign.run()
-    if folder.resolve().parent.name == RUNS.name:
-        write_index(folder.resolve().parent)
     if campaign.failures:
         console.print(*campaign.summary(), sep="\n")
-    for kind in campaign.broken:
+    for kind in campaign.unjudged:
         console.print(Text(f"unknown in {counted(kind.runs, 'run')}: {kind.check}: {kind.text}"))
     for line in (*compared_with_before(earlier, campaign.rows), *after_a_fix(campaign.rows)):
         console.print(Text(line))
     failed = f"{counted(len(campaign.outcomes), 'run')}, {len(campaign.failures)} failed"
     console.print(f"{failed}: {folder / CAMPAIGN_PAGE}", highlight=False, soft_wrap=True)
+    if campaign.unkept:
+        more = len(campaign.unkept) - 1
+        raise VnetError(campaign.unkept[0] + (f", and {more} more" if more else ""))
+    if folder.resolve().parent.name == RUNS.name:
+        write_index(folder.resolve().parent)
     if campaign.interrupted:
         return 130
     if campaign.failures:
         return Verdict.INVALID.exit_status
-    return Verdict.UNKNOWN.exit_status if campaign.broken else 0
+    return Verdict.UNKNOWN.exit_status if campaign.unjudged else 0

@@ -34,6 +34,7 @@ from emulator.drivers.determinism import calls_recorded, scattered
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session
 from emulator.drivers.simulate import MOST_APART
+from emulator.records.disk import DiskError
 from emulator.records.period_figures import VECTORS
 from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.records.tape import TapeEntry, described, parse_tape, tape_lines
@@ -280,6 +281,8 @@ def _run(
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:
             return run_trial(scenario, run_folder, twice, apart)
+        except DiskError:
+            raise
         except BaseException as error:
             traceback.print_exc(file=stacks)
             return Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")

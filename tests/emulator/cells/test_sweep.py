@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,22 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
     assert result.exit_code == 0, result.output
     assert "2 runs: 2 valid" in result.output
     assert "runs/sweep-tiny/sweep.html" in result.output
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
+def test_a_run_whose_files_the_disk_refuses_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def put(self: Path, target: Path) -> Path:
+        if target.name == "world.npz":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return replace(self, target)
+
+    replace = Path.replace
+    with monkeypatch.context() as full:
+        full.setattr(Path, "replace", put)
+        with pytest.raises(VnetError, match=r"cell \{'seed': 1\}: .*world.npz: cannot write: No space left"):
+            emulator.sweep(TINY, {}, out=tmp_path)
+    assert [row["verdict"] for row in emulator.sweep(TINY, {}, out=tmp_path).to_pylist()] == ["valid"]
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import asyncio
 import ctypes
 import os
+import signal
 
 from vnet import Node
 
@@ -37,6 +38,14 @@ async def faulty(node: Node) -> None:
         await node.radio.broadcast(b"here")
         if fix.time_ns == 5 * PERIOD_NS and node.id in ("v01", "v02"):
             ctypes.string_at(0)
+
+
+async def interrupts(node: Node) -> None:
+    """A beacon whose first vehicle interrupts the run, as Ctrl-C does."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        if fix.time_ns == 5 * PERIOD_NS and node.id == "v01":
+            os.kill(os.getpid(), signal.SIGINT)
 
 
 async def faulty_in_company(node: Node) -> None:

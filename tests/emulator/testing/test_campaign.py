@@ -1,29 +1,31 @@
 """Campaigns find what is planted, shrink it, keep it, and go on whatever happens."""
 
+import errno
 import io
 import json
 import re
 import signal
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 from rich.console import Console
 
 from emulator.cells.worker import WorkerDiedError, WorkerTimeoutError
 from emulator.checks.judge import Verdict
+from emulator.records.disk import DiskError
 from emulator.scenario.faults import Pause
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.testing import campaign
+from emulator.testing import campaign, trial
 from emulator.testing.campaign import TEST_FILE, column_of, count_verdicts, failures, page, run_campaign
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.scenarios import make_scenario
-from emulator.testing.trial import TrialPool
+from emulator.testing.trial import Trial, TrialPool
 from tests.support import forked_commands
 from tests.support.forked_commands import VNET
 from tests.support.paths import ROOT
@@ -200,6 +202,22 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
     assert (status, "1 run, 0 failed" in said) == (3, True)
 
 
+def test_runs_and_checks_of_which_nothing_is_known_are_no_pass(tmp_path: Path) -> None:
+    (tmp_path / "own_seed_check.py").write_text(
+        "def check(run):\n"
+        "    yield 'typo', 'unknown', 'there was nothing to judge'\n"
+        "    yield 'once', 'valid' if run.scenario.run.seed == 1 else 'unknown', 'nothing this time'\n"
+    )
+    scenario = make_scenario(planted("proud"), {"checks": [f"{tmp_path}/own_seed_check.py:check"]})
+    status, said = run(Plan.of(scenario, "none", 2, seed=1), tmp_path / "checks")
+    assert (status, "2 runs, 0 failed" in said) == (3, True)
+    assert "unknown in 2 runs: own:typo: there was nothing to judge" in said and "own:once" not in said
+    assert "own:typo was unknown in 2 runs: there" in (tmp_path / "checks" / "campaign.html").read_text()
+    status, said = run(Plan.of(planted("interrupts"), "none", 2, seed=1), tmp_path / "runs")
+    assert (status, "2 runs, 0 failed" in said) == (3, True)
+    assert "unknown in 2 runs: progress: interrupted at 0.5" in said
+
+
 def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path, pytester: pytest.Pytester) -> None:
     plan = Plan.of(planted("stubborn"), "kill", 1, seed=1, limit_s=1.0, shrink_steps=0)
     row = failure_of(plan, tmp_path / "campaign")
@@ -263,6 +281,48 @@ def test_an_interrupted_campaign_keeps_what_is_there(tmp_path: Path, monkeypatch
     assert 1 <= len(results) < 40
     assert results[0]["seed"] == 1
     assert f"{len(results)} of 40 runs" in (tmp_path / "campaign" / "campaign.html").read_text()
+
+
+def refuse_what_is_beside_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def put(self: Path, target: Path) -> Path:
+        if target.parent.name in ("001", "002"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return replace(self, target)
+
+    replace = Path.replace
+    monkeypatch.setattr(Path, "replace", put)
+
+
+def refuse_whole_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_in_a_file(pool: TrialPool, scenario: Scenario, folder: Path, apart: bool = False) -> Trial:
+        return run_kept(pool, scenario, Path("/dev/full") / folder.name, apart)
+
+    run_kept = TrialPool.run
+    monkeypatch.setattr(TrialPool, "run", run_in_a_file)
+
+
+@pytest.mark.parametrize("refuse", [refuse_what_is_beside_a_run, refuse_whole_runs])
+def test_a_disk_that_is_full_loses_no_results(
+    refuse: Callable[[pytest.MonkeyPatch], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse(monkeypatch)
+    said, plan = io.StringIO(), Plan.of(planted("growing"), "loss", 2, seed=1, shrink_steps=2)
+    with pytest.raises(VnetError, match=r"00[12].*: cannot write: .*, and \d more$"):
+        run_campaign(plan, tmp_path / "campaign", Console(width=200, file=said))
+    assert "2 runs, 2 failed" in said.getvalue()
+    for row in results_of(tmp_path / "campaign"):
+        assert (list(row["failed"]), row["steps"]) == (["growth"], 2)
+    assert "<h2>Failures: 2</h2>" in (tmp_path / "campaign" / "campaign.html").read_text()
+    assert not (tmp_path / "campaign" / ".room").exists()
+
+
+def test_what_the_disk_refuses_is_no_failure_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> NoReturn:
+        raise DiskError("verdict.json: cannot write")
+
+    monkeypatch.setattr(trial, "run_trial", refuse)
+    with pytest.raises(DiskError):
+        trial._run_unkept(planted("proud"), tmp_path / "run", 60.0, False, False)
 
 
 def test_what_cannot_be_a_campaign_is_refused(tmp_path: Path) -> None:
