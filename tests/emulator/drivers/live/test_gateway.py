@@ -363,7 +363,7 @@ async def test_bytes_that_a_fault_has_changed_harm_nobody(
 
 @two_vehicles()
 async def test_a_query_does_not_end_in_a_pause(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
-    """What was heard meanwhile follows, and a reply may be of that."""
+    """Replies that were heard meanwhile follow."""
     first, second = vehicles
     sessions[1].declare_queryable("asked", lambda query: query.reply("asked", b"late"))
     settle(sessions[1])
