@@ -62,7 +62,7 @@ _SECOND_FADING = np.uint64(0xD1B54A32D192ED03)
 """Odd factor that makes those of its fading: the highest 16 bits of the product, to which all bits contribute."""
 _HIGHEST = np.uint64(48)
 
-DECISION, READY, CHECK = range(3)
+DECISION, READY, SLOWLY_READY, CHECK = range(4)
 """Kinds of events, in the order in which those of one time are processed."""
 
 
@@ -87,8 +87,8 @@ class _Grant:
 class _Station:
     """A sender: its flows by the period that their frames tell (0 for none), and the slots that it has booked.
 
-    `frames` counts those that wait, or will be ready; `ready_ns` is when the last of them is. `used` are the last
-    slots and lengths of its transmissions.
+    `frames` counts those that wait, or will be ready; `ready_ns` is when the last of them is. Those in a throttle's
+    queue do not count. `used` are the last slots and lengths of its transmissions.
     """
 
     node: int
@@ -208,15 +208,19 @@ class Sidelink(Mac):
         ready_ns = frame.sent_ns
         if self._jitter_ns:
             ready_ns += int(self._jitter_ns * sender_draw(sent, JITTER))
-        slow_ns: int | None = ready_ns
         if self._throttle.slows(frame.sender):
-            slow_ns = self._throttle.put(frame, ready_ns, self._limit)
-        if slow_ns is None or station.frames >= self._limit:
+            station.flow(frame.period_ms).sent_ns.append(frame.sent_ns)  # later ones may be ready before it
+            slow_ns = self._throttle.put(frame, max(ready_ns, station.ready_ns), self._limit)
+            if slow_ns is None:
+                self._leave(sent, Outcome.queue_full, frame.sent_ns)
+            else:
+                self._plan(slow_ns, SLOWLY_READY, frame.sender, sent)
+        elif station.frames >= self._limit:
             self._leave(sent, Outcome.queue_full, frame.sent_ns)
-            return
-        station.ready_ns = max(slow_ns, station.ready_ns)
-        station.frames += 1
-        self._plan(station.ready_ns, READY, frame.sender, sent)
+        else:
+            station.frames += 1
+            station.ready_ns = max(ready_ns, station.ready_ns)
+            self._plan(station.ready_ns, READY, frame.sender, sent)
 
     def take_sent(self) -> list[Transmission]:
         """See `Mac`."""
@@ -250,7 +254,15 @@ class Sidelink(Mac):
             self._check_again(about)
         else:
             assert about is not None
-            self._ready(self._stations[node], about)
+            station, frame = self._stations[node], about.frame
+            if kind == READY:
+                station.flow(frame.period_ms).sent_ns.append(frame.sent_ns)
+            elif station.frames < self._limit:
+                station.frames += 1
+            else:
+                self._leave(about, Outcome.queue_full, self._now_ns)
+                return
+            self._ready(station, about)
 
     def _draw(self, frame: Frame, index: int) -> float:
         return float(self._draws.uniform(frame.sender, frame.seq, _TIES, frame.draw)[index])
@@ -261,7 +273,6 @@ class Sidelink(Mac):
         """Give a frame a place in its flow's grant, or a resource of its own."""
         frame, slot = sent.frame, self._now_ns // self._slot_ns
         flow = station.flow(frame.period_ms)
-        flow.sent_ns.append(frame.sent_ns)
         length = self._link.length(frame.size_bytes)
         grant = flow.grant
         if grant is not None and grant.length < length:

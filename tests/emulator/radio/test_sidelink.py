@@ -17,7 +17,7 @@ from emulator.scenario.loading import scenario_of
 from emulator.scenario.radio import WinnerB1
 from emulator.scenario.scenario import Radio, least_transit_ns
 from tests.emulator.radio.test_csma import crowds, planned, run, scattered
-from tests.support.faulty_engine import FaultyEngine
+from tests.support.faulty_engine import FaultyEngine, fault
 from tests.support.radio import drained, engine, line
 from vnet.radio import SentFrame
 
@@ -402,12 +402,30 @@ def test_a_full_queue_and_a_throttle_act_as_on_other_macs() -> None:
     subject.transmit(0, 0, [b"x", b"y", b"z"])
     outcomes = Counter(row["outcome"] for row in drained(subject))
     assert outcomes == {"delivered": 1, "queue_full": 2}
-    slowed = engine(line(0, 50), **LTE)
-    throttle = Throttle(kind="throttle", bitrate_mbps=0.01, at_s=0.0, duration_s=1.0)
+    slowed = engine(line(0, 50), queue_frames=1, **LTE)
+    throttle = Throttle(kind="throttle", bitrate_mbps=0.4, at_s=0.0, duration_s=1.0)  # 2 ms a frame
     slowed.set_faults([planned(0, throttle, (0, S), 2, 0)], 0)
-    slowed.transmit(0, 0, [bytes(100)])
-    (row,) = drained(slowed)
-    assert row["on_air_ns"] >= 80 * MS
+    slowed.transmit(0, 0, [bytes(100)] * 3)
+    first, *others = sorted(drained(slowed), key=lambda row: row["seq"])
+    assert first["on_air_ns"] >= (2 + 4) * MS
+    assert [(row["outcome"], row["left_ns"]) for row in others] == [("queue_full", 4 * MS), ("queue_full", 0)]
+
+
+@pytest.mark.parametrize("radio", [LTE, NR])
+@pytest.mark.parametrize("period_ms", [100, None])
+def test_frames_sent_after_a_throttle_leave_as_without_it(radio: dict[str, Any], period_ms: int | None) -> None:
+    """Frames that still pass its queue, from 8.7 s on, neither delay nor drop them, nor mislead about periods."""
+    throttle = fault("throttle", 0.0, 1.0, bitrate_mbps=1e-4)
+    slow, free = (FaultyEngine(faults, 2, queue_frames=2, **radio) for faults in ([throttle], []))
+    for subject in (slow, free):
+        for number in [7, 8, 9, *range(30, 260)]:
+            subject.send(number * 100 * MS, 0, SentFrame("", bytes(100), period_ms=period_ms))
+    assert [row["outcome"] for row in slow.rows()] == ["delivered"] * 233
+    assert slow.rows()[0]["on_air_ns"] > 8 * S
+    assert all(row["on_air_ns"] - row["sent_ns"] <= 102 * MS for row in slow.rows(3 * S))
+    assert [row for row in slow.rows(3 * S) if row["sent_ns"] < 8 * S] == [
+        row for row in free.rows(3 * S) if row["sent_ns"] < 8 * S
+    ]
 
 
 def test_duplicates_and_copies_are_as_on_other_macs() -> None:
