@@ -42,6 +42,8 @@ from vnet.transport.session import open_local_router, router_endpoint
 
 MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
+ADMIN_S = 0.5
+"""Seconds for which others may answer what the router is asked of itself: it does so at once."""
 MOST_TOKENS = 2**16
 """Tokens that are read at once: Zenoh gives them within the call, which would wait for itself."""
 ANY_HOST = ("0.0.0.0", "::")
@@ -210,9 +212,7 @@ class Gateway(RadioSide[zenoh.Query]):
         """
         if self._session is None or not self.crosses(key) or (key in self._declared and is_there):
             return None
-        if key not in self._declared:
-            found = self._session.liveliness().get(key, zenoh.handlers.FifoChannel(MOST_TOKENS))
-            is_there = any(reply.ok is not None for reply in found)
+        is_there = key not in self._declared and self._is_alive(key)
         if (key in self._tokens) == is_there:
             return None
         (self._tokens.add if is_there else self._tokens.discard)(key)
@@ -220,19 +220,28 @@ class Gateway(RadioSide[zenoh.Query]):
             self._release(key)
         return CrossingTokens(tuple(sorted(self._tokens)))
 
-    def tokens(self) -> CrossingTokens | None:
-        """Return the tokens of the vehicle's programs, to be told again, if there are any.
+    def _is_alive(self, key: str) -> bool:
+        assert self._session is not None
+        found = self._session.liveliness().get(key, zenoh.handlers.FifoChannel(MOST_TOKENS))
+        return any(reply.ok is not None and str(reply.ok.key_expr) == key for reply in found)
 
-        Zenoh tells of none whose key is declared here, but that both are there.
+    def _find_hidden(self, keys: str = "**") -> None:
+        """Find the tokens of programs whose keys are declared here, of which Zenoh tells only that they are there.
+
+        `keys` are those that are looked for. The router does not tell of keys with a part that begins with @.
         """
+        assert self._session is not None
+        place, me = f"@/{self._session.zid()}/router/token/", str(self._session.zid())
+        found = self._session.get(place + keys, zenoh.handlers.FifoChannel(MOST_TOKENS), timeout=ADMIN_S)
+        for reply in found:
+            if reply.ok is not None and (key := str(reply.ok.key_expr).removeprefix(place)) in self._declared:
+                if {*itertools.chain(*json.loads(reply.ok.payload.to_string()).values())} != {me}:
+                    self._tokens.add(key)
+
+    def tokens(self) -> CrossingTokens | None:
+        """Return the tokens of the vehicle's programs, to be told again, if there are any."""
         if self._session is not None and self._declared:
-            me = str(self._session.zid())
-            for reply in self._session.get(f"@/{me}/router/token/**", zenoh.handlers.FifoChannel(MOST_TOKENS)):
-                if reply.ok is not None:
-                    key = str(reply.ok.key_expr).partition("/token/")[2]
-                    owners = itertools.chain(*json.loads(reply.ok.payload.to_string()).values())
-                    if key in self._declared and {*owners} != {me}:
-                        self._tokens.add(key)
+            self._find_hidden()
         return CrossingTokens(tuple(sorted(self._tokens))) if self._tokens else None
 
     # To the programs.
@@ -302,8 +311,13 @@ class Gateway(RadioSide[zenoh.Query]):
 
     def _release(self, key: str) -> None:
         """Take a token of another vehicle back, unless a program of this one has it, too."""
-        if key not in self._tokens and (token := self._declared.pop(key, None)) is not None:
-            token.undeclare()  # type: ignore[no-untyped-call]
+        if key not in self._declared:
+            return
+        self._find_hidden(key)
+        if key not in self._tokens:
+            self._declared.pop(key).undeclare()  # type: ignore[no-untyped-call]
+            if self._is_alive(key):
+                self._tokens.add(key)
 
 
 def session_name(session: zenoh.Transport | zenoh.Hello) -> str:

@@ -327,6 +327,27 @@ async def test_a_token_that_two_vehicles_have_is_there_until_both_are_gone(
     assert [await each.get() for each in seen] == [("leader", True)] * 2
 
 
+@pytest.mark.parametrize("key", ["leader", "car/@v/leader", "car/*"])
+def test_a_token_that_is_handed_over_while_the_first_is_there_is_told(key: str) -> None:
+    @two_vehicles(keys=("**", "car/@v/**"))
+    async def handed_over(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        second, seen = vehicles[1], watch(sessions[1], key)
+        tokens = [sessions[0].liveliness().declare_token(key)]
+        assert await seen.get() == (key, True)
+        tokens += [sessions[1].liveliness().declare_token(each) for each in (key, "car/other")]
+        settle(sessions[1])
+        tokens[0].undeclare()  # type: ignore[no-untyped-call]
+        while key in second.gateway.heard_tokens:
+            await vehicles[0].told.get()
+        assert second.gateway.tokens() == CrossingTokens(tuple(sorted((key, "car/other"))))
+        tokens[1].undeclare()  # type: ignore[no-untyped-call]
+        while (told := second.gateway.tokens()) != CrossingTokens(("car/other",)):
+            assert told is not None
+            await second.told.get()
+
+    handed_over()
+
+
 @two_vehicles()
 async def test_a_router_that_goes_takes_tokens_and_sessions_along(
     vehicles: list[Vehicle], sessions: list[zenoh.Session]
