@@ -86,18 +86,24 @@ def entries_of(scenario: Scenario) -> tuple[str, ...]:
 
 
 def sources_of(scenario: Scenario) -> tuple[str, ...]:
-    """The same, but in the place of the commands of Zenoh programs their modules, and their scripts as paths."""
+    """The same, but in the place of Zenoh programs' commands their modules, and their scripts as paths.
+
+    Other commands than Python's, and what is named by `{id}`, have none.
+    """
+    from emulator.scenario.program import PYTHON_NAME
+
     program = scenario.program
     if program.kind != "zenoh":
         return entries_of(scenario)
     found = set()
     for command in program.all_commands:
-        words = [command[0]] if command[0].endswith(SCRIPT) else python_words(command)
+        is_python = PYTHON_NAME.fullmatch(Path(command[0]).name)
+        words = python_words(command) if is_python else [command[0]]
         if words[:1] == ["-m"]:
             found.add(f"{words[1]}:main")
         elif words and words[0].endswith(SCRIPT):
             found.add(words[0])
-    return tuple(sorted(found))
+    return tuple(sorted(each for each in found if "{" not in each))
 
 
 def program_digest(entries: Iterable[str], folders: Iterable[Path] = ()) -> str | None:
@@ -110,11 +116,13 @@ def program_digest(entries: Iterable[str], folders: Iterable[Path] = ()) -> str 
     for entry in entries:
         name = entry.partition(":")[0]
         if not name.endswith(SCRIPT):
-            _collect(name, name.partition(".")[0], modules, searched)
+            for module in (name, f"{name}.__main__"):
+                _collect(module, name.partition(".")[0], modules, searched)
         elif path := next((file for folder in searched if (file := Path(folder) / name).is_file()), None):
-            modules[name] = path
+            beside: dict[str, Path | None] = {}  # other scripts have modules of the same names beside them
             for imported in _imported(path.stem, path):
-                _collect(imported, "", modules, [str(path.parent), *searched])
+                _collect(imported, "", beside, [str(path.parent), *searched])
+            modules |= {name: path} | {f"{name}/{module}": found for module, found in beside.items()}
         if modules.get(name) is None:
             return None
     digest = hashlib.sha256()
@@ -237,11 +245,11 @@ def _names_imported(package: str, source: bytes) -> tuple[str, ...]:
             if base:
                 names.append(base)
                 names += (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
-        elif isinstance(node, ast.Assign) and any(
-            isinstance(t, ast.Name) and t.id in DECLARING for t in node.targets
-        ):
-            named = (each.value for each in ast.walk(node.value) if isinstance(each, ast.Constant))
-            names += (each.partition(":")[0] for each in named if isinstance(each, str))
+        elif isinstance(node, (ast.Assign, ast.AnnAssign, ast.AugAssign)) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any(isinstance(target, ast.Name) and target.id in DECLARING for target in targets):
+                named = (each.value for each in ast.walk(node.value) if isinstance(each, ast.Constant))
+                names += (each.partition(":")[0] for each in named if isinstance(each, str))
     return tuple(names)
 
 

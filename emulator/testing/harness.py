@@ -319,7 +319,10 @@ class RunHarness:
         return self._judgement
 
     def close(self) -> None:
-        """End the run, if it is on, whatever state it is in, and keep what can be kept of it."""
+        """End the run, if it is on, whatever state it is in, and keep what can be kept of it.
+
+        It ends where it stands; faults that are planned for later act all the same before.
+        """
         broken = self._run.stands.done() and self._run.stands.exception() is not None
         if not self._run.started or broken:
             return

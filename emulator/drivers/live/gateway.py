@@ -235,8 +235,8 @@ class Gateway(RadioSide[zenoh.Query]):
         found = self._session.get(place + keys, zenoh.handlers.FifoChannel(MOST_TOKENS), timeout=ADMIN_S)
         for reply in found:
             if reply.ok is not None and (key := str(reply.ok.key_expr).removeprefix(place)) in self._declared:
-                if {*itertools.chain(*json.loads(reply.ok.payload.to_string()).values())} != {me}:
-                    self._tokens.add(key)
+                owners = itertools.chain(*json.loads(reply.ok.payload.to_string()).values())
+                self._tokens |= {key} if {*owners} != {me} else set()
 
     def tokens(self) -> CrossingTokens | None:
         """Return the tokens of the vehicle's programs, to be told again, if there are any."""

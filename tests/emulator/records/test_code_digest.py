@@ -35,16 +35,26 @@ FILES = {
     "cd_tools/deep/thing.py": "import cd_broken\n",
     "cd_lazy.py": "",
     "cd_broken.py": "def (:\n",
-    "cd_declared.py": "CHECKS = ['cd_check:a', 'cd_check:b']\nFIGURES = 'cd_figures:F'\nTEXT = 'cd_elsewhere:a'\n",
+    "cd_declared.py": "CHECKS: list[str] = ['cd_check:a']\nFIGURES = 'cd_figures:F'\nTEXT = 'cd_elsewhere:a'\n",
     "cd_check.py": "",
     "cd_figures.py": "",
     "scripts/cd_talker.py": "import cd_beside, cd_lazy\n",
     "scripts/cd_beside.py": "",
+    "others/cd_talker.py": "import cd_beside\n",
+    "others/cd_beside.py": "",
+    "cd_package/__init__.py": "",
+    "cd_package/__main__.py": "",
     "cd_elsewhere.py": "",
 }
 OWN = {"cd_program/__init__.py", "cd_program/app.py", "cd_program/near.py", "cd_lazy.py", "cd_broken.py"}
 OWN |= {"cd_declared.py", "cd_check.py", "cd_figures.py"}
-SCRIPTS = {"scripts/cd_talker.py", "scripts/cd_beside.py", "cd_lazy.py"}
+SCRIPTS = {
+    "scripts/cd_talker.py",
+    "scripts/cd_beside.py",
+    "cd_lazy.py",
+    "others/cd_talker.py",
+    "others/cd_beside.py",
+}
 ENTRY = "cd_program.app:main"
 
 
@@ -70,10 +80,17 @@ def test_each_module_of_a_program_counts_and_no_other(name: str, program: Path) 
     assert not any(module.startswith("cd_") for module in sys.modules), "nothing is imported"
 
 
-@pytest.mark.parametrize("command", [["python", "-u", "scripts/cd_talker.py"], ["python", "-m", "cd_lazy", "{id}"]])
-def test_sources_of_zenoh_programs_count(command: list[str], program: Path) -> None:
-    scenario = Scenario.model_validate({"program": {"kind": "zenoh", "command": command}})
-    own = SCRIPTS if "-u" in command else {"cd_lazy.py"}
+@pytest.mark.parametrize(
+    ("commands", "own"),
+    [
+        ([["python", "-u", "scripts/cd_talker.py"], ["others/cd_talker.py"], ["./car", "-m", "fast"]], SCRIPTS),
+        ([["python", "-m", "cd_lazy", "{id}"], ["python", "cd_{id}.py"]], {"cd_lazy.py"}),
+        ([["python3", "-m", "cd_package"]], {"cd_package/__init__.py", "cd_package/__main__.py"}),
+    ],
+)
+def test_sources_of_zenoh_programs_count(commands: list[list[str]], own: set[str], program: Path) -> None:
+    settings = {"run": {"pacing": "realtime"}, "program": {"kind": "zenoh", "command": commands}}
+    scenario = Scenario.model_validate(settings)
     for name, text in FILES.items():
         before = program_digest(modules_of(scenario))
         (program / name).write_text(text + "# changed\n")
