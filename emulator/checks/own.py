@@ -197,7 +197,7 @@ def _plain(what: str, value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         raise _NonsenseError(f"{what} = {value}: must be finite, or None")
     if isinstance(value, int) and not -INTEGERS <= value < INTEGERS:
-        raise _NonsenseError(f"{what} = {shown(value)}: an integer must be below 2**63; float(…) may be larger")
+        raise _NonsenseError(f"{what} = {shown(value)}: an integer must be within ±2**63; float(…) may be larger")
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise _NonsenseError(f"{what} = {shown(value)}: must be a number, a boolean, a text, None, or a list or table")

@@ -151,7 +151,9 @@ def emulator(
 
 def _refuse_hosts_of_gateways(scenario: Scenario, hosts: object) -> None:
     if hosts and scenario.has_gateways:
-        raise VnetError("--hosts: Zenoh programs run beside the emulator in real time; on hosts in lockstep alone")
+        raise VnetError(
+            "--hosts: in real time Zenoh programs run beside the emulator; hosts run them in lockstep only"
+        )
 
 
 def _announce(scenario: Scenario, asked: RunOptions) -> None:

@@ -31,7 +31,9 @@ def test_the_contents_follow_the_index(configuration: ModuleType) -> None:
 
 
 @pytest.mark.slow
-def test_site_has_every_page_and_loads_nothing_from_elsewhere(tmp_path: Path, pytestconfig: pytest.Config) -> None:
+def test_the_site_has_every_page_and_loads_nothing_from_elsewhere(
+    tmp_path: Path, pytestconfig: pytest.Config
+) -> None:
     """All pages are read and their links resolved; two are written, with the theme that all have."""
     sources = [file for name in ("vnet", "agents", "emulator", "docs") for file in (ROOT / name).rglob("*.*")]
     with unless_passed(pytestconfig, "site", [*PAGES, *sources]):

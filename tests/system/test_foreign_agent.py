@@ -216,7 +216,9 @@ def test_what_is_no_message_is_judged(vnet: Vnet, mistake: str, pacing: str, che
         (("--agent", f"{sys.executable} -c 'print(1); exit(4)' {' '.join(GIVEN)}"), "(exit status 4): 1"),
     ],
 )
-def test_agent_that_cannot_be_started_is_told_in_one_line(vnet: Vnet, options: tuple[str, ...], told: str) -> None:
+def test_an_agent_that_cannot_be_started_is_told_in_one_line(
+    vnet: Vnet, options: tuple[str, ...], told: str
+) -> None:
     done = vnet("run", "scenarios/beacon.toml", "--set", "network.vehicles=2", *options)
     assert done.status == 2 and told in done.stderr.splitlines()[-1]
 

@@ -39,7 +39,9 @@ def test_a_program_that_spins_is_invalid_and_shown(vnet: Vnet, command: str) -> 
 
 
 @pytest.mark.parametrize(("command", "options"), [("run", []), ("simulate", ["--processes", "2"])])
-def test_a_program_that_hangs_makes_run_unknown_and_is_shown(vnet: Vnet, command: str, options: list[str]) -> None:
+def test_a_program_that_hangs_makes_the_run_unknown_and_is_shown(
+    vnet: Vnet, command: str, options: list[str]
+) -> None:
     done = run(vnet, command, "hangs", "--set", "run.stall_timeout_s=3", *options)
     assert done.status == 3
     assert done.verdict["verdict"] == "unknown"

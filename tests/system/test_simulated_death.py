@@ -270,7 +270,9 @@ def test_a_signal_that_ends_the_command_ends_its_child(tmp_path: Path, number: s
 
 
 @pytest.mark.parametrize("processes", ["1", "2"])
-def test_sigterm_is_interrupt_and_one_that_a_program_sends_itself_its_death(tmp_path: Path, processes: str) -> None:
+def test_sigterm_is_an_interrupt_and_one_that_a_program_sends_itself_its_death(
+    tmp_path: Path, processes: str
+) -> None:
     told = "pathlib.Path('new').write_text('x'); os.rename('new', 'pid')"
     words = [*command(tmp_path, told), "--processes", processes, "--duration", "3000"]
     process = Command(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

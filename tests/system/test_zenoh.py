@@ -55,7 +55,9 @@ def heard(done: Finished, node: str) -> Counter[str]:
     return Counter(re.findall(r"heard car/(\w+)/pose", (done.folder / f"logs/{node}.log").read_text()))
 
 
-def test_a_program_hears_of_other_vehicles_what_radio_has_delivered_and_no_more(vnet: Vnet, tmp_path: Path) -> None:
+def test_a_program_hears_of_other_vehicles_what_the_radio_has_delivered_and_no_more(
+    vnet: Vnet, tmp_path: Path
+) -> None:
     done = vnet("run", scenario(tmp_path), "--report")
     assert done.status in SLOW
     assert done.check("conservation")["verdict"] == "valid"

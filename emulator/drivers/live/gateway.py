@@ -7,7 +7,6 @@ The gateway is in the emulator's process, in real time (docs/how-to/zenoh.md).
 from __future__ import annotations
 
 import asyncio
-import itertools
 import json
 import os
 import re
@@ -15,6 +14,7 @@ import ssl
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,6 +44,8 @@ MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
 ADMIN_S = 0.5
 """Seconds for which others may answer what the router is asked of itself: it does so at once."""
+MOST_LOOKED = 50
+"""Declared tokens with which hidden ones are looked for each time; with more it is done more rarely."""
 MOST_TOKENS = 2**16
 """Tokens that are read at once: Zenoh gives them within the call, which would wait for itself."""
 ANY_HOST = ("0.0.0.0", "::")
@@ -87,6 +89,7 @@ class Gateway(RadioSide[zenoh.Query]):
 
         One that a program of this vehicle has as well stays until that is gone: its owner would be told that it is.
         """
+        self._looks = count()
         self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
         self.sessions: set[str] = set()
@@ -208,7 +211,8 @@ class Gateway(RadioSide[zenoh.Query]):
     def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
         """Take a token that has appeared or is gone.
 
-        What comes of those that are declared here, or were, is echoes, but that it is gone where it is declared.
+        Of a key that is declared here Zenoh tells only that the last token of programs is gone. All else of it, and
+        of one that was declared here, is an echo.
         """
         if self._session is None or not self.crosses(key) or (key in self._declared and is_there):
             return None
@@ -226,21 +230,21 @@ class Gateway(RadioSide[zenoh.Query]):
         return any(reply.ok is not None and str(reply.ok.key_expr) == key for reply in found)
 
     def _find_hidden(self, keys: str = "**") -> None:
-        """Find the tokens of programs whose keys are declared here, of which Zenoh tells only that they are there.
+        """Find the programs' tokens of `keys` that are declared here as well: Zenoh does not tell of them.
 
-        `keys` are those that are looked for. The router does not tell of keys with a part that begins with @.
+        The router does not tell of keys with a part that begins with @.
         """
         assert self._session is not None
         place, me = f"@/{self._session.zid()}/router/token/", str(self._session.zid())
         found = self._session.get(place + keys, zenoh.handlers.FifoChannel(MOST_TOKENS), timeout=ADMIN_S)
         for reply in found:
             if reply.ok is not None and (key := str(reply.ok.key_expr).removeprefix(place)) in self._declared:
-                owners = itertools.chain(*json.loads(reply.ok.payload.to_string()).values())
+                owners = chain(*json.loads(reply.ok.payload.to_string()).values())
                 self._tokens |= {key} if {*owners} != {me} else set()
 
     def tokens(self) -> CrossingTokens | None:
         """Return the tokens of the vehicle's programs, to be told again, if there are any."""
-        if self._session is not None and self._declared:
+        if self._declared and next(self._looks) % (1 + len(self._declared) // MOST_LOOKED) == 0:
             self._find_hidden()
         return CrossingTokens(tuple(sorted(self._tokens))) if self._tokens else None
 

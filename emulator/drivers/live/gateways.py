@@ -329,6 +329,8 @@ class Gateways:
             await _opened(vehicle.gateway, self.endpoints[node])
         except VnetError as error:
             self._tell("ended", node, Exit(1, str(error)))
+        if self._vehicles.get(node) is not vehicle:  # or meanwhile
+            await vehicle.gateway.close()
 
     async def close(self) -> None:
         """Close all gateways, and wait for what was told to end."""

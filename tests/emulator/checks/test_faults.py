@@ -382,7 +382,9 @@ def test_a_frame_that_was_not_sent_as_often_as_it_should_be_is_found(kind: str) 
 @pytest.mark.parametrize(
     ("kind", "planned"), [("DoS", {"factor": 9}), ("Sybil", {"ghosts": 2}), ("DataReplay", {"age_s": 0.9})]
 )
-def test_frame_that_was_sent_more_often_or_later_than_planned_is_found(kind: str, planned: dict[str, Any]) -> None:
+def test_a_frame_that_was_sent_more_often_or_later_than_planned_is_found(
+    kind: str, planned: dict[str, Any]
+) -> None:
     scenario = with_fault(kind).scenario
     assert {key: getattr(scenario.fault[0], key) for key in planned} != planned
     other = scenario.model_copy(update={"fault": (scenario.fault[0].model_copy(update=planned),)})

@@ -61,7 +61,9 @@ def test_runs_that_agree_are_valid_though_a_number_is_none(recorded: RecordedRun
 
 
 @pytest.mark.parametrize(("column", "value"), [("arrival_ns", 1), ("payload_digest", 1), ("outcome", "lost")])
-def test_first_row_that_differs_is_shown_from_both_runs(recorded: RecordedRun, column: str, value: object) -> None:
+def test_the_first_row_that_differs_is_shown_from_both_runs(
+    recorded: RecordedRun, column: str, value: object
+) -> None:
     row = first(recorded, "delivered")
     found = compared(recorded, trace=with_cells(recorded.trace, column, [row, len(recorded.trace) - 1], value))
     assert found.verdict is Verdict.INVALID

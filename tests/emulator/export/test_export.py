@@ -273,7 +273,9 @@ def test_without_to_the_file_s_name_says_the_format(
 
 
 @pytest.mark.parametrize("to", ["pcapng", "mcap", "csv", "links"])
-def test_export_goes_where_it_is_told_and_never_over_something_else(folder: Path, tmp_path: Path, to: str) -> None:
+def test_an_export_goes_where_it_is_told_and_never_over_something_else(
+    folder: Path, tmp_path: Path, to: str
+) -> None:
     out = tmp_path / "out"
     done = RUNNER.invoke(app, ["export", str(folder), "--to", to, "--out", str(out)])
     assert done.exit_code == 0 and str(out) in done.stdout.replace("\n", "")

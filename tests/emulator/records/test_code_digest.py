@@ -188,7 +188,9 @@ def test_a_source_that_nests_too_deeply_has_a_digest_all_the_same(
     assert digests_of(("deep:main",))["program"]
 
 
-def test_a_folder_with_name_of_a_program_does_not_hide_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_with_the_name_of_a_program_does_not_hide_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As `platoon/platoon.toml` with `platoon.py` beside it, run from above: the import finds the module, too."""
     folder = tmp_path / "cd_same"
     folder.mkdir()

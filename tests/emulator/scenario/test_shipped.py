@@ -32,7 +32,9 @@ def test_a_path_that_exists_wins_over_a_shipped_name(tmp_path: Path, monkeypatch
     assert recorded_code(Path("twelve")) == {"entries": "mine:main"}
 
 
-def test_name_that_is_neither_a_path_nor_shipped_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_that_is_neither_a_path_nor_shipped_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert find_scenario("twelv") == Path("twelv")
     with pytest.raises(ScenarioError, match=r"^twelv: cannot be read: .* \(did you mean twelve\?\)$"):

@@ -188,7 +188,9 @@ def test_modules_that_vehicles_share_find_the_variables_of_each(drive: Drive) ->
         ({"1A": "b"}, "1A"),
     ],
 )
-def test_variables_that_cannot_be_are_refused_when_scenario_is_read(environment: dict[str, str], text: str) -> None:
+def test_variables_that_cannot_be_are_refused_when_the_scenario_is_read(
+    environment: dict[str, str], text: str
+) -> None:
     command = ["python", "talker.py"]
     with pytest.raises(ValueError, match=text):
         Scenario.model_validate({"program": {"kind": "zenoh", "command": command, "environment": environment}})

@@ -267,7 +267,9 @@ def test_an_abandoned_task_is_closed_although_it_awaits_something_in_answer(loop
 
 
 @pytest.mark.parametrize("begins", [False, True])
-def test_task_that_awaits_the_next_of_an_iterator_is_abandoned_as_others(loop: StandingLoop, begins: bool) -> None:
+def test_a_task_that_awaits_the_next_of_an_iterator_is_abandoned_as_others(
+    loop: StandingLoop, begins: bool
+) -> None:
     async def ticks() -> AsyncIterator[int]:
         await loop.create_future()
         yield 1

@@ -46,7 +46,9 @@ def test_a_program_in_a_file_that_a_module_of_python_s_hides(module: str, found:
     assert str(caught.value).endswith(f": rename {tmp_path}/{module}.py")
 
 
-def test_module_that_the_program_imports_and_another_hides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_that_the_program_imports_and_another_hides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "random.py").touch()
     (tmp_path / "imports_random.py").write_text("from random import my_own\n")
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])

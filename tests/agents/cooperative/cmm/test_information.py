@@ -72,7 +72,9 @@ def test_plain_moments_are_those_of_arrays(information: Five) -> None:
 
 @pytest.mark.slow
 @given(said(), covariances(), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
-def test_deviation_is_that_of_matrices(information: Five, covariance_m2: Array, mean: tuple[float, float]) -> None:
+def test_a_deviation_is_that_of_matrices(
+    information: Five, covariance_m2: Array, mean: tuple[float, float]
+) -> None:
     matrix, vector = Information(information).matrix, Information(information).vector
     total = matrix + matrix @ covariance_m2 @ matrix
     total += (1e-4 * np.trace(total) + 1e-9) * np.eye(2)

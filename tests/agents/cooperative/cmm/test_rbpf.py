@@ -233,7 +233,9 @@ def test_the_variance_of_a_mean_of_independent_fixes() -> None:
 
 
 @pytest.mark.parametrize(("walk_m", "variance_m2"), [(None, 9.0), (0.5 / np.sqrt(0.1), 9.0 + 10 * 0.25)])
-def test_common_error_is_a_gauss_markov_process_or_a_random_walk(walk_m: float | None, variance_m2: float) -> None:
+def test_the_common_error_is_a_gauss_markov_process_or_a_random_walk(
+    walk_m: float | None, variance_m2: float
+) -> None:
     """Ten steps: the Gauss-Markov process keeps its variance, a walk of 0.5 m a step gains 0.25 m² each."""
     config = RbpfConfig(particles=40_000, common_walk_m=walk_m, common_tau_s=1.0, start_sigma_m=3.0)
     rbpf = Rbpf(config, NOWHERE, np.random.default_rng(0))

@@ -198,7 +198,9 @@ def test_orders_of_another_and_nonsense_change_nothing(play: Play, capsys: pytes
     assert "a message of the emulator is dropped" in capsys.readouterr().err
 
 
-def test_without_emulator_agents_learn_it_and_the_host_ends(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_emulator_agents_learn_it_and_the_host_ends(
+    play: Play, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(host_module, "SHUT_DOWN_S", 0.0)
     with pytest.raises(TransportError, match="host a: the emulator has been gone for"):
         play.work(("emulator", "", False))

@@ -587,7 +587,9 @@ def test_a_certificate_that_names_its_host_is_trusted(tmp_path: Path, listen: st
         ("tea\xe9:secret", "cannot be read"),
     ],
 )
-def test_file_that_has_not_user_and_password_in_each_line_is_named(tmp_path: Path, content: str, says: str) -> None:
+def test_a_file_that_has_not_user_and_password_in_each_line_is_named(
+    tmp_path: Path, content: str, says: str
+) -> None:
     path = tmp_path / "users"
     path.write_text(content, encoding="latin-1")
     with pytest.raises(ProgramError, match=f"program.zenoh.users = '{path}': {says}"):
