@@ -31,6 +31,7 @@ from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.events import Event
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE
+from emulator.records.verdicts import Finding
 from emulator.scenario.faults import Fault, OwnRule, parse_fault, refuse_router_restart
 from emulator.scenario.loading import with_modules
 from emulator.scenario.scenario import Scenario
@@ -281,12 +282,6 @@ class RunHarness:
             raise VnetError(f"{PREFIX}{name}: there is a promise of this name")
         self._promises[name] = partial(judge, name=name)
 
-    def _must_be_new(self, judgement: Judgement) -> None:
-        taken = {each.name for each in judgement.checks} | {each.name for each in judgement.not_exercised}
-        for name in self._promises:
-            if PREFIX + name in taken:
-                raise VnetError(f"{PREFIX}{name}: the scenario has a check of this name: give the promise another")
-
     def _kept(self) -> Iterator[Result]:
         """Judge the promises. Raises VnetError for a predicate that raises."""
         run = Run.open(self.folder)
@@ -312,10 +307,17 @@ class RunHarness:
         if self._judgement is None:
             self._finish()
             self._judgement, verdict = self._run.close()
+            findings: list[Finding] = [*self._judgement.checks, *self._judgement.not_exercised]
+            taken = {finding.name for finding in findings}
+            clashing = [name for name in self._promises if PREFIX + name in taken]
+            for name in clashing:
+                del self._promises[name]
             if self._promises:
-                self._must_be_new(self._judgement)
                 findings = [finding_of(result) for result in self._kept()]
                 judge_further(self._emulation, self._judgement, verdict, findings)
+            if clashing:
+                said = "the scenario has a check of this name: give the promise another"
+                raise VnetError(f"{PREFIX}{clashing[0]}: {said}")
         return self._judgement
 
     def close(self) -> None:

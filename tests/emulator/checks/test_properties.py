@@ -285,9 +285,12 @@ def test_a_promise_with_the_name_of_a_check_is_refused(tmp_path: Path) -> None:
     async def story() -> None:
         async with RunHarness(scenario, tmp_path / "run") as emu:
             emu.always(lambda moment: True, name="files")
+            emu.always(lambda moment: False, name="other")
             await emu.run_until(0.5)
             with pytest.raises(VnetError, match="own:files: the scenario has a check of this name"):
                 emu.end()
+            with pytest.raises(AssertionError, match="own:other is invalid"):
+                emu.check("other")
 
     asyncio.run(story())
 
