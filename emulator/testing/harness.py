@@ -307,8 +307,8 @@ class RunHarness:
         if self._judgement is None:
             self._finish()
             self._judgement, verdict = self._run.close()
-            findings: list[Finding] = [*self._judgement.checks, *self._judgement.not_exercised]
-            taken = {finding.name for finding in findings}
+            checked: list[Finding] = [*self._judgement.checks, *self._judgement.not_exercised]
+            taken = {check.name for check in checked}
             clashing = [name for name in self._promises if PREFIX + name in taken]
             for name in clashing:
                 del self._promises[name]
