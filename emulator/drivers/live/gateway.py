@@ -14,7 +14,6 @@ import ssl
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,10 +41,6 @@ from vnet.transport.session import open_local_router, router_endpoint
 
 MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
-ADMIN_S = 0.5
-"""Seconds for which others may answer what the router is asked of itself: it does so at once."""
-MOST_LOOKED = 50
-"""Declared tokens with which hidden ones are looked for each time; with more it is done more rarely."""
 MOST_TOKENS = 2**16
 """Tokens that are read at once: Zenoh gives them within the call, which would wait for itself."""
 ANY_HOST = ("0.0.0.0", "::")
@@ -89,7 +84,6 @@ class Gateway(RadioSide[zenoh.Query]):
 
         One that a program of this vehicle has as well stays until that is gone: its owner would be told that it is.
         """
-        self._looks = count()
         self._tokens: set[str] = set()
         """Tokens of this vehicle's own programs that cross the radio."""
         self.sessions: set[str] = set()
@@ -229,23 +223,8 @@ class Gateway(RadioSide[zenoh.Query]):
         found = self._session.liveliness().get(key, zenoh.handlers.FifoChannel(MOST_TOKENS))
         return any(reply.ok is not None and str(reply.ok.key_expr) == key for reply in found)
 
-    def _find_hidden(self, keys: str = "**") -> None:
-        """Find the programs' tokens of `keys` that are declared here as well: Zenoh does not tell of them.
-
-        The router does not tell of keys with a part that begins with @.
-        """
-        assert self._session is not None
-        place, me = f"@/{self._session.zid()}/router/token/", str(self._session.zid())
-        found = self._session.get(place + keys, zenoh.handlers.FifoChannel(MOST_TOKENS), timeout=ADMIN_S)
-        for reply in found:
-            if reply.ok is not None and (key := str(reply.ok.key_expr).removeprefix(place)) in self._declared:
-                owners = chain(*json.loads(reply.ok.payload.to_string()).values())
-                self._tokens |= {key} if {*owners} != {me} else set()
-
     def tokens(self) -> CrossingTokens | None:
         """Return the tokens of the vehicle's programs, to be told again, if there are any."""
-        if self._declared and next(self._looks) % (1 + len(self._declared) // MOST_LOOKED) == 0:
-            self._find_hidden()
         return CrossingTokens(tuple(sorted(self._tokens))) if self._tokens else None
 
     # To the programs.
@@ -314,11 +293,11 @@ class Gateway(RadioSide[zenoh.Query]):
             self._declared[key] = self._session.liveliness().declare_token(key)
 
     def _release(self, key: str) -> None:
-        """Take a token of another vehicle back, unless a program of this one has it, too."""
-        if key not in self._declared:
-            return
-        self._find_hidden(key)
-        if key not in self._tokens:
+        """Take a token of another vehicle back, unless a program of this one has it, too.
+
+        Zenoh does not tell of a program's token while the same is declared here: it is found then.
+        """
+        if key in self._declared and key not in self._tokens:
             self._declared.pop(key).undeclare()  # type: ignore[no-untyped-call]
             if self._is_alive(key):
                 self._tokens.add(key)
