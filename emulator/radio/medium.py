@@ -95,7 +95,7 @@ class Medium:
         """Lock receivers on a new signal: those that detect it and are not locked on another one yet.
 
         A receiver releases a signal that began less than `DETECTION_NS` ago if, with the new one as interference,
-        it no longer detects it. The new signal's sender is locked on nothing.
+        it no longer detects it. The new signal's sender is locked on nothing, and no vehicle on air locks on it.
         """
         taken = np.zeros(len(total_mw), dtype=bool)
         for other in self._frames:
@@ -106,6 +106,7 @@ class Medium:
                 known.locked &= self._threshold.detects(known.power_mw, total_mw)
             known.locked[sent.frame.sender] = False
             taken |= known.locked
+            taken[other.frame.sender] = True  # whatever little power it sends with
         signal.locked = self._threshold.detects(signal.power_mw, total_mw) & ~taken
 
     def locked(self, sent: Transmission) -> NDArray[np.bool_]:

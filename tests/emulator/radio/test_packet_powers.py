@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.radio import drained, engine, line
+from vnet.radio import SentFrame
 from vnet.transport import wire
 
 MS = 1_000_000
@@ -53,6 +54,18 @@ def test_interference_counts_by_the_time_that_it_lasts() -> None:
     expected_db = first["rssi_dbm"] - 10 * math.log10(10 ** (NOISE_DBM / 10) + interference_mw)
     assert first["snr_db"] == pytest.approx(expected_db, abs=0.02)
     assert first["snr_db"] < lone.packet.snr_db
+
+
+@pytest.mark.parametrize("late_ns", [0, 100_000])
+@given(st.floats(-60, 30))
+def test_a_vehicle_that_transmits_receives_nothing_however_weakly(late_ns: int, dbm: float) -> None:
+    subject = engine(line(0, 1), path_loss=LOG_DISTANCE, mac={}, access_jitter_ms=0.0)
+    subject.transmit(0, 0, [SentFrame("v0", bytes(300), dbm)])
+    subject.transmit(late_ns, 1, [bytes(300)])
+    subject.advance(10 * MS)
+    first, second = sorted(subject.trace.to_table().to_pylist(), key=lambda row: row["sender"])
+    together = first["on_air_ns"] < second["left_ns"] and second["on_air_ns"] < first["left_ns"]
+    assert not together or "delivered" not in {first["outcome"], second["outcome"]}
 
 
 def test_fading_is_in_the_power_and_the_trace_has_what_the_packet_says() -> None:
