@@ -16,7 +16,15 @@ import os
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -130,6 +138,10 @@ class WorkerPool(Executor):
         self.close()
 
 
+BROKEN = (BrokenExecutor, CancelledError)
+"""Errors of an executor that does no further job: Dask cancels all once its scheduler is gone."""
+
+
 def each_done(
     jobs: Sequence[J],
     function: Callable[[J], R],
@@ -165,7 +177,7 @@ def each_done(
                 job, tries = waiting.pop(future)
                 try:
                     yield job, future.result()
-                except BrokenExecutor:
+                except BROKEN:
                     raise VnetError(
                         f"cell {dict(job.labels)}: the executor is broken; run it again to go on"
                     ) from None

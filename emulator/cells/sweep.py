@@ -46,10 +46,8 @@ class SweepPlan:
     varied: tuple[str, ...]
 
     @classmethod
-    def of(
-        cls, plain: Scenario, vary: Mapping[str, Sequence[Any]], seeds: Iterable[int], keeps_network: bool
-    ) -> SweepPlan:
-        """Return the plan; unless it `keeps_network`, seeds draw a generated one.
+    def of(cls, plain: Scenario, vary: Mapping[str, Sequence[Any]], seeds: Iterable[int]) -> SweepPlan:
+        """Return the plan; seeds draw a generated network, too, unless `network.seed` is set or varied.
 
         Raises ScenarioError that names the first combination that is no scenario.
         """
@@ -58,7 +56,7 @@ class SweepPlan:
         if count > MOST_CELLS:
             raise ScenarioError(f"a sweep of {count:,} runs: {MOST_CELLS:,} at most")
         numbers = _seeds(seeds)
-        keeps_network |= NETWORK_SEED in values
+        keeps_network = NETWORK_SEED in values or "seed" in plain.network.model_fields_set
         cells = []
         for combination in product(*values.values()):
             labels = dict(zip(values, combination, strict=True))
@@ -107,7 +105,7 @@ def sweep(
     changes = {**(set or {}), **{key: value for key, value in named.items() if value is not None}}
     plain = with_folder_of(checked_function(program), scenario_of(scenario, changes, checks))
     numbers = range(1, seeds + 1) if isinstance(seeds, int) else seeds
-    plan = SweepPlan.of(plain, vary, numbers, NETWORK_SEED in changes)
+    plan = SweepPlan.of(plain, vary, numbers)
     folder = default_folder(plan) if out is None else Path(out)
     run_cells(plan.cells, folder, title="sweep", executor=executor, jobs=jobs)
     return write_sweep(plan, folder)
@@ -183,7 +181,7 @@ def _seeds(given: Any) -> list[int]:
 def _refuse_repeated(name: str, values: Sequence[Any]) -> None:
     """Raise ScenarioError for a value that is there twice: the same run would count as a further sample."""
     for place, value in enumerate(values):
-        if any(value == other and type(value) is type(other) for other in values[:place]):
+        if any(value == other and isinstance(value, bool) == isinstance(other, bool) for other in values[:place]):
             raise ScenarioError(f"{name}: {shown(value)} is given twice")
 
 

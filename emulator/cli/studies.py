@@ -74,7 +74,6 @@ def sweep(
     """
     from emulator.cells.cells import open_executor, run_cells
     from emulator.cells.sweep import (
-        NETWORK_SEED,
         SweepPlan,
         default_folder,
         missing_cells,
@@ -89,8 +88,7 @@ def sweep(
         if program is not None and "," in program:
             vary, program = [f"{PROGRAM}={program}", *(vary or ())], None
         plain = load(scenario, overrides, program, Pacing.LOCKSTEP, None, duration, option, checks)
-        keeps_network = any(each.partition("=")[0].strip() == NETWORK_SEED for each in overrides or ())
-        plan = SweepPlan.of(plain, _all_varied(vary or ()), range(1, seeds + 1), keeps_network)
+        plan = SweepPlan.of(plain, _all_varied(vary or ()), range(1, seeds + 1))
         cells = plan.cells if shard is None else plan.shard(*parse_shard(shard))
         folder = out or default_folder(plan)
         if note := too_few(seeds):

@@ -146,12 +146,13 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _groups(rows: Rows, keys: Sequence[str]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
-    """The rows by their values of some keys, in their order."""
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+def _groups(rows: Rows, keys: Sequence[str]) -> list[tuple[tuple[Any, ...], list[Mapping[str, Any]]]]:
+    """The rows by their values of some keys, in their order; true is another value than 1."""
+    groups: dict[str, tuple[tuple[Any, ...], list[Mapping[str, Any]]]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
-    return groups
+        values = tuple(row[key] for key in keys)
+        groups.setdefault(repr(values), (values, []))[1].append(row)
+    return list(groups.values())
 
 
 def _mean(rows: Rows, name: str) -> Mean | None:
@@ -163,7 +164,7 @@ def _means(rows: Rows, varied: Sequence[str], titles: Mapping[str, str]) -> list
     return [
         {**dict(zip(varied, values, strict=True)), "runs": len(group)}
         | {title: "–" if (mean := _mean(group, name)) is None else str(mean) for name, title in titles.items()}
-        for values, group in _groups(rows, varied).items()
+        for values, group in _groups(rows, varied)
     ]
 
 
@@ -173,8 +174,8 @@ def differences(rows: Rows, varied: Sequence[str], titles: Mapping[str, str]) ->
         return []
     others = [key for key in varied if key != PROGRAM]
     found = []
-    for values, group in _groups(rows, others).items():
-        ((first,), base), *later = _groups(group, [PROGRAM]).items()
+    for values, group in _groups(rows, others):
+        ((first,), base), *later = _groups(group, [PROGRAM])
         of_seed = {row["seed"]: row for row in base}
         for (program,), theirs in later:
             pairs = [(row, of_seed[row["seed"]]) for row in theirs if row["seed"] in of_seed]
@@ -199,13 +200,13 @@ def _failed(rows: Rows, varied: Sequence[str]) -> list[dict[str, Any]]:
 
 def _draw(rows: Rows, varied: Sequence[str], name: str, title: str) -> Drawing:
     """Draw a figure against the varied key with the most values, of numbers if possible; the others make curves."""
-    key = max(varied, key=lambda key: (_all_numbers(rows, key), len({row[key] for row in rows})))
+    key = max(varied, key=lambda key: (_all_numbers(rows, key), len({str(row[key]) for row in rows})))
     others = [other for other in varied if other != key]
     curves = _groups(rows, others)
-    shown = dict(list(curves.items())[: len(COLOURS)])
+    shown = curves[: len(COLOURS)]
     made = canvas(key, title, -(-len(shown) // 3) if others else 0)
     ticks = None if _all_numbers(rows, key) else list(dict.fromkeys(str(row[key]) for row in rows))
-    for number, ((values, curve), colour) in enumerate(zip(shown.items(), COLOURS, strict=False)):
+    for number, ((values, curve), colour) in enumerate(zip(shown, COLOURS, strict=False)):
         label = ", ".join(
             f"{other.rpartition('.')[2]} {value}" for other, value in zip(others, values, strict=True)
         )
@@ -229,7 +230,7 @@ def _draw_curve(
     aside: float,
 ) -> None:
     """Draw a curve with its intervals; `aside` moves them by so many steps, so that none hides another."""
-    points = [(values[0], mean) for values, group in _groups(rows, [key]).items() if (mean := _mean(group, name))]
+    points = [(values[0], mean) for values, group in _groups(rows, [key]) if (mean := _mean(group, name))]
     if not points:
         return
     if ticks is None:

@@ -519,6 +519,8 @@ def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str
             data.get("radio", {}).pop("max_payload_bytes", None)
         if "jitter_ms" in source.radio.model_fields_set:  # whose default is that of the kind of program
             data.setdefault("radio", {})["jitter_ms"] = source.radio.jitter_ms
+        if "seed" in source.network.model_fields_set:  # without one, that of a run may draw the network
+            data.setdefault("network", {})["seed"] = source.network.seed
         source = data
     if not isinstance(source, Mapping):
         raise ScenarioError(f"scenario = {shown(source)}: a path, a shipped scenario's name, or a dict is needed")

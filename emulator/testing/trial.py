@@ -16,7 +16,7 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, wait
+from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from emulator.cells.cells import WorkerPool, worker_died
+from emulator.cells.cells import BROKEN, WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
 from emulator.checks.replay import compare_tables, first_call
@@ -196,8 +196,9 @@ class TrialPool:
                 return run(apart)
         except WorkerTimeoutError as error:
             return Trial.failure(HUNG, f"{error}; logs/stacks.txt says where it stood")
-        except BrokenExecutor:
-            raise VnetError("the executor is broken") from None
+        except BROKEN:
+            if not self.closed:
+                raise VnetError("the executor is broken") from None
         except Exception as error:
             if not worker_died(error):
                 raise

@@ -30,8 +30,8 @@ TINY: dict[str, Any] = {
 VARY: dict[str, list[Any]] = {"radio.loss": [0, 0.5], "network.vehicles": [3, 4]}
 
 
-def plan(vary: dict[str, list[Any]] = VARY, seeds: range = range(1, 3), **changes: Any) -> SweepPlan:
-    return SweepPlan.of(scenario_of(TINY, {}), vary, seeds, **{"keeps_network": False} | changes)
+def plan(vary: dict[str, list[Any]] = VARY, seeds: range = range(1, 3)) -> SweepPlan:
+    return SweepPlan.of(scenario_of(TINY, {}), vary, seeds)
 
 
 @pytest.fixture
@@ -47,15 +47,19 @@ def test_the_cells_are_all_combinations_with_every_seed() -> None:
     ]
     assert [cell.scenario.run.seed for cell in cells] == [1, 2] * 4
     assert [cell.scenario.network.seed for cell in cells] == [1, 2] * 4, "a seed draws the network"
-    assert {cell.scenario.network.seed for cell in plan(keeps_network=True).cells} == {1}
+    for pinned in (scenario_of(TINY, {"network.seed": 1}), scenario_of({**TINY, "network": {"seed": 1}}, {})):
+        kept = SweepPlan.of(scenario_of(pinned, {"run.duration_s": 1}), VARY, range(1, 3)).cells
+        assert {cell.scenario.network.seed for cell in kept} == {1}, "unless the scenario has a seed of its own"
     assert [cell.scenario.network.seed for cell in plan({"network.seed": [7, 8]}).cells] == [7, 7, 8, 8]
     assert len({cell.digest for cell in cells}) == len(cells)
+    with pytest.raises(VnetError, match="twice"):
+        plan({"radio.loss": [0, 0.0]})
 
 
 def test_kinds_are_varied_with_the_defaults_of_each() -> None:
     kinds = ["lte-mode4", "nr-mode2", "80211p"]
     changes = {"radio.path_loss": {"kind": "winner_b1"}, "radio.mac": {"kind": kinds[0]}}
-    cells = SweepPlan.of(scenario_of("beacon", changes), {"radio.mac.kind": kinds}, [1], True).cells
+    cells = SweepPlan.of(scenario_of("beacon", changes), {"radio.mac.kind": kinds}, [1]).cells
     assert [cell.scenario.radio.mac.kind for cell in cells if cell.scenario.radio.mac] == kinds
 
 
@@ -63,9 +67,9 @@ def test_the_largest_payload_follows_the_varied_mac_unless_it_is_given() -> None
     vary: dict[str, list[Any]] = {"radio.mac": [{"kind": "nr-mode2", "subchannels": 8}, {"kind": "80211p"}]}
     radio = {"path_loss": {"kind": "log_distance"}, "mac": {"kind": "nr-mode2"}}
     for given, expected in (({}, [1400, 1400]), ({"max_payload_bytes": 300}, [300, 300])):
-        plan = SweepPlan.of(scenario_of({"radio": {**radio, **given}}, {}), vary, [1], False)
+        plan = SweepPlan.of(scenario_of({"radio": {**radio, **given}}, {}), vary, [1])
         assert [cell.scenario.radio.max_payload_bytes for cell in plan.cells] == expected
-    plan = SweepPlan.of(scenario_of({"radio": radio}, {}), {"radio.mac.subchannels": [1, 2]}, [1], False)
+    plan = SweepPlan.of(scenario_of({"radio": radio}, {}), {"radio.mac.subchannels": [1, 2]}, [1])
     assert [cell.scenario.radio.max_payload_bytes for cell in plan.cells] == [190, 380]
 
 
@@ -214,20 +218,21 @@ def test_programs_are_compared_on_the_same_seeds(tmp_path: Path, in_this_process
     assert 'id="differences"' in (tmp_path / "o" / "sweep.html").read_text()
 
 
-def test_differences_are_of_pairs_in_each_combination() -> None:
+@pytest.mark.parametrize(("first", "second"), [(0, 1), (False, True), (1, True)])
+def test_differences_are_of_pairs_in_each_combination(first: float, second: float) -> None:
     rows = [
         {"loss": loss, "program.entry": program, "seed": seed, "pdr": pdr}
-        for loss in (0, 1)
-        for program, of_seed in {"a": (1.0, 2.0, 3.0), "b": (1.5, 2.5 + loss, None), "c": (1.0, 2.0, 3.0)}.items()
+        for number, loss in enumerate((first, second))
+        for program, of_seed in {"a": (1.0, 2.0, 3.0), "b": (1.5, 2.5 + number, None), "c": (1.0, 2.0, 3.0)}.items()
         for seed, pdr in enumerate(of_seed)
     ]
     del rows[-1]  # a pair of which one is missing
     names = ["loss", "program.entry"]
     assert differences(rows, names, {"pdr": "PDR"}) == [
-        {"loss": 0, "programs": "b − a", "pairs": 3, "PDR": "0.5 ± 0"},
-        {"loss": 0, "programs": "c − a", "pairs": 3, "PDR": "0 ± 0"},
-        {"loss": 1, "programs": "b − a", "pairs": 3, "PDR": "1.0 ± 6.4"},
-        {"loss": 1, "programs": "c − a", "pairs": 2, "PDR": "0 ± 0"},
+        {"loss": first, "programs": "b − a", "pairs": 3, "PDR": "0.5 ± 0"},
+        {"loss": first, "programs": "c − a", "pairs": 3, "PDR": "0 ± 0"},
+        {"loss": second, "programs": "b − a", "pairs": 3, "PDR": "1.0 ± 6.4"},
+        {"loss": second, "programs": "c − a", "pairs": 2, "PDR": "0 ± 0"},
     ]
     assert differences(rows, ["loss"], {"pdr": "PDR"}) == []
 

@@ -7,7 +7,7 @@ import re
 import signal
 from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,6 +15,8 @@ from typing import Any, NoReturn
 import pytest
 from rich.console import Console
 
+from emulator.cells.cells import compute, each_done
+from emulator.cells.sweep import SweepPlan
 from emulator.cells.worker import WorkerDiedError, WorkerTimeoutError
 from emulator.checks.judge import Verdict
 from emulator.records.disk import DiskError
@@ -166,9 +168,13 @@ def test_what_hangs_or_dies_on_an_executor_has_failed(error: VnetError, failed: 
     assert TrialPool(2.0, planted("proud"), Failing(error)).run_anywhere(planted("proud")).failed == failed
 
 
-def test_an_executor_that_is_broken_ends_a_campaign() -> None:
+@pytest.mark.parametrize("error", [BrokenExecutor(), CancelledError()], ids=["broken", "without its scheduler"])
+def test_an_executor_that_is_broken_ends_campaign_and_sweep(error: Exception) -> None:
     with pytest.raises(VnetError, match="the executor is broken"):
-        TrialPool(2.0, planted("proud"), Failing(BrokenExecutor())).run_anywhere(planted("proud"))
+        TrialPool(2.0, planted("proud"), Failing(error)).run_anywhere(planted("proud"))
+    cells = SweepPlan.of(planted("proud"), {}, [1]).cells
+    with pytest.raises(VnetError, match="the executor is broken; run it again to go on"):
+        next(each_done(cells, compute, Failing(error)))
 
 
 class Failing(Executor):
