@@ -56,6 +56,7 @@ class OwnChild:
             if not in_foreground:  # what is sent to the parent's group would reach it twice
                 os.setpgid(0, 0)
                 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the parent interrupts it
             signal_at_parent_death(signal.SIGKILL)
             _leaving.append(self)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -134,6 +135,8 @@ _is_commands_own = False
 
 
 def this_process_is_a_command() -> None:
-    """Take note that this process runs one command, and ends."""
+    """Take note that this process runs one command, and ends; when its terminal is closed as by SIGTERM."""
     global _is_commands_own
     _is_commands_own = True
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # not with `nohup`
+        signal.signal(signal.SIGHUP, lambda number, frame: os.kill(os.getpid(), signal.SIGTERM))

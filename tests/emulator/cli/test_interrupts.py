@@ -139,6 +139,22 @@ def test_a_program_that_does_not_yield_in_time_ends_as_at_the_second(
     assert bool(output) == bool(shown)
 
 
+@pytest.mark.parametrize(
+    ("handler", "emulated"), [(signal.SIG_DFL, "0.0 s"), (signal.SIG_IGN, "10.0 s")], ids=["", "nohup"]
+)
+def test_a_terminal_that_is_closed_ends_a_run_unless_that_is_ignored(
+    handler: signal.Handlers, emulated: str, tmp_path: Path
+) -> None:
+    (tmp_path / "closes.py").write_text(ONCE.replace("SIGINT", "SIGHUP") + "async for _ in node.gnss: pass\n")
+    before = signal.signal(signal.SIGHUP, handler)
+    try:
+        status, shown, _ = vnet(tmp_path, "simulate", BEACON, "--program", "closes:main", at_start="pass")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert status == (130 if handler is signal.SIG_DFL else 3)  # in which nobody has sent anything
+    assert (f" {emulated} " in shown, "verdict: unknown" in shown) == (True, True)
+
+
 def test_a_process_in_the_background_goes_on_ignoring_it(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
