@@ -48,6 +48,7 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
     """See `emulator.environment`. One episode is on at a time; `close` ends it."""
 
     metadata: ClassVar[dict[str, Any]] = {"name": "vnet", "render_modes": []}
+    render_mode = None
 
     def __init__(
         self, scenario: Scenario, behaviour: Behaviour, observations: Spaces, actions: Spaces, out: Path | None

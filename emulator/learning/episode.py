@@ -50,7 +50,7 @@ class Moment:
 
     time_s: emulated seconds since the start of the run.
     position_m: (2,) in m east-north, by node, read-only; NaN for a vehicle that is not there.
-    speed_m_s: speed by node, from the way since the step before (0 in the first); NaN as above.
+    speed_m_s: speed by node, from the way since the step before (0 in its first); NaN as above.
     events: what has happened since the step before, such as `collision`.
     actions: what each agent did in this step; one that had observed nothing at its beginning did nothing.
     """
@@ -220,7 +220,7 @@ class Scenes:
     def __init__(self, emulation: Emulation) -> None:
         self._emulation = emulation
         self._period = 0
-        self._speed = np.zeros(len(emulation.world.node_ids))
+        self._speed = 0.0 * emulation.world.position_m(0)[:, 0]  # NaN for those that are not there
 
     def moment(self, turn: Turn, actions: Mapping[str, Any]) -> Moment:
         """Return the moment of a step that ends with `turn`."""
@@ -229,7 +229,9 @@ class Scenes:
         if period > self._period:
             way_m = world.position_m(period) - world.position_m(self._period)
             passed_s = (period - self._period) * world.period_ns / NS_PER_S
-            self._speed, self._period = np.hypot(way_m[:, 0], way_m[:, 1]) / passed_s, period
+            speed, self._period = np.hypot(way_m[:, 0], way_m[:, 1]) / passed_s, period
+            has_entered = np.isnan(speed) & ~np.isnan(world.position_m(period)[:, 0])
+            self._speed = np.where(has_entered, 0.0, speed)
         position_m = world.position_m(period).copy()
         position_m.flags.writeable = False  # one for the functions of all agents
         return Moment(

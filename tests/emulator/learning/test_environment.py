@@ -72,6 +72,7 @@ def test_it_passes_pettingzoo_s_test_of_parallel_environments(capsys: pytest.Cap
     parallel_api_test(env, num_cycles=40)
     env.close()
     assert "Passed Parallel API test" in capsys.readouterr().out
+    assert env.render_mode is None, "as wrappers ask"
     assert threads() == 0
 
 
@@ -123,6 +124,7 @@ def test_an_episode_goes_on_while_nobody_is_there_and_others_will_enter(tmp_path
     assert "b" in alone[0] and not alone[2]["b"]
     assert next(step for step in steps if "b" in step[0]) is alone
     assert steps[-1][2]["b"] and threads() == 0
+    assert alone[1]["b"] == 0.0, "the speed of one that enters"
 
 
 @pytest.mark.slow
