@@ -25,6 +25,7 @@ from emulator.records.run_folder import SCENARIO_FILE
 from emulator.records.tables import STATES, columns_of
 from emulator.scenario.loading import parse_recorded_scenario
 from emulator.scenario.own_functions import declared, load_entry
+from emulator.scenario.scenario import Radio
 from emulator.stream import LATENCY_BIN_NS, unpack
 from emulator.viewer.drawing import (
     BLUE,
@@ -707,7 +708,7 @@ def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
 
 def has_background(scene: Mapping[str, Any]) -> bool:
     """Return whether there are vehicles without programs."""
-    return bool(tomllib.loads(scene["scenario"])["network"].get("step"))
+    return bool(tomllib.loads(scene["scenario"]).get("network", {}).get("step"))
 
 
 def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
@@ -717,32 +718,32 @@ def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
     return {outcome for outcome in Outcome if not outcome.is_possible(scenario, vehicles)}
 
 
-def in_reach(radio: Mapping[str, Any]) -> str:
-    """Rule of connectivity in words, by the scenario's section."""
-    if "path_loss" not in radio:
-        return "radio by given links" if "links" in radio else f"radio {radio['range_m']:g} m"
-    stages = {
+def in_reach(radio: Radio) -> str:
+    """Rule of connectivity in words."""
+    if radio.path_loss is None:
+        return "radio by given links" if radio.links else f"radio {radio.range_m:g} m"
+    stages: dict[str, str] = {
         "shadowing": "shadowing",
         "buildings": "buildings",
         "fading": "fading",
-        "mac": "CSMA",
+        "mac": "CSMA" if radio.mac is None or radio.mac.kind == "80211p" else radio.mac.kind,
         "congestion": "congestion",
     }
-    words = [f"radio: {radio['path_loss']['kind'].replace('_', ' ')}"]
-    return ", ".join(words + [text for name, text in stages.items() if name in radio])
+    words = [f"radio: {radio.path_loss.kind.replace('_', ' ')}"]
+    return ", ".join(words + [text for name, text in stages.items() if getattr(radio, name) is not None])
 
 
 def describe(scene: Mapping[str, Any]) -> str:
     """A run in a heading and a line, as Markdown."""
-    scenario = tomllib.loads(scene["scenario"])
-    run, radio, program = scenario["run"], scenario["radio"], scenario["program"]
+    scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
+    run, radio = scenario.run, scenario.radio
     count = int(np.frombuffer(scene["component"], dtype="<i2").max()) + 1
     at_first = " at first" if scene["moves"] else ""
     parts = [
         f"{len(scene['node_ids'])} vehicles in {counted(count, 'component')}{at_first}",
-        program["entry"].removesuffix(":main"),
-        f"{in_reach(radio)}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
-        f"{run['pacing']}, {run['duration_s']:g} s, seed {run['seed']}",
+        scenario.program.entry.removesuffix(":main"),
+        f"{in_reach(radio)}, loss {radio.loss:.0%}, at most {scene['max_peers']} peers",
+        f"{run.pacing}, {run.duration_s:g} s, seed {run.seed}",
     ]
     return f"### {drawable(scene['name'])}\n\n{drawable(' · '.join(parts))}"
 
