@@ -791,6 +791,61 @@ def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
     ]
 
 
+def test_a_session_undeclares_what_it_has_declared_which_then_shows_nothing(drive: Drive) -> None:
+    """As Zenoh 1.10 does, with which this program was compared."""
+    run = drive("""
+        import time, zenoh
+        session = zenoh.open(zenoh.Config())
+        held = []
+
+        def answer(query):
+            held.append(query)
+            with query:
+                query.reply(query.key_expr, "there")
+
+        entities = {
+            "subscriber": session.declare_subscriber("a/b", lambda sample: print("heard")),
+            "queryable": session.declare_queryable("a/b", answer),
+            "publisher": session.declare_publisher("a/b"),
+            "querier": session.declare_querier("a/b"),
+            "token": session.liveliness().declare_token("t/a"),
+        }
+        session.liveliness().declare_subscriber("t/*", lambda sample: print(sample.kind))
+        print([reply.ok.payload.to_string() for reply in session.get("a/b")])
+
+        def attempt(act):
+            try:
+                act()
+            except (zenoh.ZError, AttributeError) as error:
+                print(type(error).__name__, str(error).partition(':')[0])
+
+        for name in ("selector", "key_expr", "parameters", "payload", "encoding", "attachment", "source_info"):
+            attempt(lambda: getattr(held[0], name))
+        for entity in entities.values():
+            session.undeclare(entity)
+            attempt(lambda: session.undeclare(entity))
+            for name in ("id", "key_expr") if entity is not entities["token"] else ():
+                attempt(lambda: getattr(entity, name))
+        session.put("a/b", "x")
+        print([reply.ok for reply in session.get("a/b", timeout=0.1)])
+        key = session.declare_keyexpr("k/k")
+        session.undeclare(key)
+        for what in (zenoh.KeyExpr("x/y"), 3):
+            attempt(lambda: session.undeclare(what))
+        time.sleep(0.1)
+        session.close()
+        attempt(lambda: session.declare_keyexpr("k/k"))
+        """)
+    lines = printed(run)
+    assert lines[0] == "['there']" and lines[1:8] == ["ZError Dropped query"] * 7
+    for place, name in enumerate(["subscriber", "queryable", "publisher", "querier"]):
+        assert lines[8 + 3 * place : 11 + 3 * place] == [f"ZError Undeclared {name}"] * 3
+    assert lines[20:] == [
+        "ZError Undeclared LivelinessToken", "SampleKind.DELETE", "[None]", "ZError Failed to undeclare x/y",
+        "AttributeError 'int' object has no attribute 'undeclare'", "ZError session closed",
+    ]  # fmt: skip
+
+
 def test_the_end_of_a_run_is_no_failure_of_a_thread(drive: Drive) -> None:
     run = drive("""
         import threading, time

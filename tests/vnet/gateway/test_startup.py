@@ -39,6 +39,7 @@ def start(*paths: Path, code: str) -> subprocess.CompletedProcess[str]:
         "import zenoh",
         "import importlib.util; assert importlib.util.find_spec('zenoh'); import zenoh",
         "import importlib, zenoh; importlib.reload(zenoh)",
+        "import zenoh; from zenoh import *",
     ],
 )
 def test_zenoh_heeds_the_environment_however_it_is_found(imports: str) -> None:
@@ -115,7 +116,8 @@ def test_a_main_thread_that_fails_ends_its_program_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: str, status: int, told: str
 ) -> None:
     monkeypatch.setenv(FAILURE, str(tmp_path / "failure"))
-    assert start(code=f"{STAYS}\n{ends}").returncode == status
+    done = start(code=f"{STAYS}\nimport atexit; atexit.register(print, 'bye')\n{ends}")
+    assert (done.returncode, done.stdout) == (status, "bye\n")
     assert json.loads((tmp_path / "failure").read_text())["error"] == told
 
 

@@ -1,8 +1,11 @@
 """Threads, clocks and chance of programs on virtual time."""
 
+import datetime
 import re
 import signal
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -209,6 +212,47 @@ def test_chance_is_the_vehicles_own_and_replays(drive: Drive) -> None:
     assert lines[4] == "2025-01-01 00:00:00,500 car moves"
 
 
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Another time zone."""
+    monkeypatch.setenv("TZ", "EST5")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_moments_are_of_the_classes_that_compiled_code_looks_for(drive: Drive) -> None:
+    run = drive("""
+        import datetime, functools, msgspec, pickle, pydantic, time
+
+        class Mine(datetime.datetime):
+            pass
+
+        class Model(pydantic.BaseModel):
+            at: datetime.datetime
+
+        @functools.singledispatch
+        def name(value):
+            return "object"
+
+        name.register(datetime.datetime, lambda value: "moment")
+        now = datetime.datetime.now()
+        print(type(now) is datetime.datetime, type(Mine.now()) is Mine, isinstance(now, Mine), name(now), repr(now))
+        print(pickle.loads(pickle.dumps(now)) == now == Model(at=now).at, msgspec.json.encode(now).decode())
+        print(datetime.datetime.fromtimestamp(time.time()) - now, type(datetime.date.today()) is datetime.date)
+        while datetime.datetime.now() < now + datetime.timedelta(milliseconds=20):
+            pass
+        print("waited", datetime.datetime.today() >= now + datetime.timedelta(milliseconds=20))
+        """)
+    assert printed(run) == [
+        "True True False moment datetime.datetime(2025, 1, 1, 0, 0)", 'True "2025-01-01T00:00:00"', "0:00:00 True",
+        "waited True",
+    ]  # fmt: skip
+    assert datetime.datetime.now().year > 2025, "of the tests' own"
+
+
 def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path: Path) -> None:
     package = tmp_path / "cars"
     package.mkdir()
@@ -286,6 +330,22 @@ def test_crash_of_main_is_a_crash_of_its_vehicle_with_its_line(drive: Drive) -> 
     assert "ZeroDivisionError" in crash["error"]
     files = [line.split('"')[1] for line in log(run) if line.startswith("  File")]
     assert [Path(file).name for file in files] == ["program0.py"], "frames of vnet's own tell nothing"
+
+
+def test_what_is_to_be_done_at_exit_is_done_after_a_failure_and_beside_one(drive: Drive) -> None:
+    text = """
+        import atexit, sys
+        atexit.register(print, "bye")
+        atexit.register(sys.exit, 9)
+        atexit.register(lambda: 1 / 0)
+        1 / (sys.argv[1] == "v01")
+        """
+    run = drive(text, vehicles=2)
+    assert [(event["node"], event["place"]) for event in events(run, "crashed")] == [("v02", "program0.py:6")]
+    for node in ("v01", "v02"):
+        (told,) = (event for event in events(run, "exception") if event["node"] == node)
+        assert "ZeroDivisionError" in told["error"] and "atexit" in str(told)
+        assert "bye" in log(run, node)
 
 
 def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None:

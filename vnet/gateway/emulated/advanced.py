@@ -423,7 +423,7 @@ class AdvancedSubscriber(Subscriber):
         self._ask(key, parameters, partial(self._told_about, source))
 
     def _replied(self, reply: Reply) -> None:
-        if reply.ok is not None and self.key_expr.intersects(reply.ok.key_expr):
+        if reply.ok is not None and self._entity.key.intersects(reply.ok.key_expr):
             self._handle(reply.ok)
 
     def _begun(self) -> None:
@@ -441,7 +441,7 @@ class AdvancedSubscriber(Subscriber):
         """Ask for what follows the last sample of a publisher with numbers."""
         assert isinstance(source.id, EntityGlobalId)
         first = "" if source.last is None else source.last + 1
-        key = key or f"{self.key_expr}/@adv/*/{source.id.zid}/{source.id.eid}/**"
+        key = key or f"{self._entity.key}/@adv/*/{source.id.zid}/{source.id.eid}/**"
         self._ask_about(source, key, f"_sn={first}..{'' if last is None else last}")
 
     def _query_periodically(self, source: _Source) -> None:

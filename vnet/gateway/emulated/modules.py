@@ -8,7 +8,8 @@ program, and so are the modules of the standard library that block: they import 
 from __future__ import annotations
 
 import builtins
-import datetime
+import ctypes
+import gc
 import importlib
 import importlib.machinery
 import importlib.metadata
@@ -26,6 +27,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextvars import ContextVar
 from copy import copy
+from datetime import date, datetime, tzinfo
 from functools import cache, partial
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
@@ -39,7 +41,7 @@ from vnet.gateway import client_config, python_words, session_variables
 from vnet.gateway.emulated.loops import prepare_asyncio
 from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
 from vnet.gateway.emulated.shown import facade, hide, import_shared, show
-from vnet.gateway.emulated.strands import Threads, look, set_generator_hooks, sleep
+from vnet.gateway.emulated.strands import Threads, fail, look, set_generator_hooks, sleep
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Numbered
 from vnet.units import NS_PER_S
@@ -113,6 +115,39 @@ def _import_for_present(name: str, package: str | None = None) -> ModuleType:
 
 
 vars(importlib.metadata)["import_module"] = _import_for_present  # by which an entry point is loaded
+
+
+def _now(cls: Any, tz: tzinfo | None = None) -> Any:
+    look()
+    program = _present.get()
+    assert program is not None
+    return cls.fromtimestamp((EPOCH_NS + program.node.now_ns) / NS_PER_S, tz)
+
+
+def _today(cls: Any) -> Any:
+    return _now(cls) if issubclass(cls, datetime) else cls.fromordinal(_now(datetime).toordinal())
+
+
+def _show_clock(kind: type, name: str, own: Callable[..., Any]) -> None:
+    """Have programs call `own` in place of a class method of `datetime` or `date`, and all others that method.
+
+    The classes stay what they are, for compiled code (pickle, msgspec, pydantic) looks for these and no others.
+    """
+    methods = gc.get_referents(vars(kind))[0]  # behind the proxy, as built-in classes refuse to be changed
+    method = methods[name]
+
+    def chosen(cls: Any, *args: Any, **options: Any) -> Any:
+        return own(cls, *args, **options) if is_program() else method.__get__(None, cls)(*args, **options)
+
+    methods[name] = classmethod(chosen)
+    ctypes.pythonapi.PyType_Modified(ctypes.py_object(kind))
+
+
+_show_clock(datetime, "now", _now)
+_show_clock(datetime, "utcnow", lambda cls: _now(cls))
+_show_clock(date, "today", _today)
+os.environ["TZ"] = "UTC0"  # local time is the same on all machines, also where compiled code computes it
+time.tzset()
 
 
 class OwnModules(dict[str, ModuleType]):
@@ -215,7 +250,6 @@ class ProgramModules:
         self._facades: dict[str, Callable[[], ModuleType]] = {
             "_thread": self.threads.module,
             "atexit": self._atexit,
-            "datetime": self._datetime,
             "importlib": self._importlib,
             "importlib.machinery": self._importlib_machinery,
             "importlib.util": self._importlib_util,
@@ -272,14 +306,24 @@ class ProgramModules:
             hook: Any = vars(self.load("sys"))["excepthook"]
             if hook is not sys.excepthook:
                 hook(type(error), error, error.__traceback__)
+            self._leave()
             raise
         self.load("threading")._shutdown()
         if leave is None or leave.code in (None, 0):  # a failure ends it at once, as in real time
             self.threads.await_callbacks()
-        for function in reversed(self.at_exit):
-            function()
+        self._leave()
         if leave is not None:
             raise leave
+
+    def _leave(self) -> None:
+        """Call what `atexit` is to call, the last first; what fails keeps none of the others from it."""
+        while self.at_exit:
+            try:
+                self.at_exit.pop()()
+            except GreenletExit:
+                raise
+            except BaseException as error:
+                fail(error, "in a function of atexit")
 
     def _find_main(self, words: Sequence[str]) -> tuple[Any, str, ModuleSpec | None]:
         """Return code, file and specification of the program, and set `sys.argv` and `sys.path` for it."""
@@ -507,36 +551,9 @@ class ProgramModules:
             "ctime": lambda at=None: time.asctime(utc(at)),
             "asctime": lambda at=None: time.asctime(at or utc()),
             "strftime": lambda form, at=None: time.strftime(form, at or utc()),
-            **dict.fromkeys(["timezone", "altzone", "daylight"], 0),
-            "tzname": ("UTC", "UTC"),
         }
         # As those of `time`, they make no methods of classes that have them.
         return facade(time, **{name: staticmethod(each) if callable(each) else each for name, each in own.items()})
-
-    def _datetime(self) -> ModuleType:
-        node = self.node
-
-        class Alike(type):
-            def __instancecheck__(cls, instance: object) -> bool:
-                return isinstance(instance, cls.__base__ or object)
-
-        class Moment(datetime.datetime, metaclass=Alike):
-            @classmethod
-            def now(cls, tz: Any = None) -> Any:
-                zone = tz or datetime.UTC
-                at = datetime.datetime.fromtimestamp((EPOCH_NS + node.now_ns) / NS_PER_S, zone)
-                return at if tz else at.replace(tzinfo=None)
-
-            utcnow = today = now
-
-        class Day(datetime.date, metaclass=Alike):
-            @classmethod
-            def today(cls) -> Any:
-                return Moment.now().date()
-
-        Moment.__name__ = Moment.__qualname__ = "datetime"
-        Day.__name__ = Day.__qualname__ = "date"
-        return facade(datetime, datetime=Moment, date=Day)
 
     def _atexit(self) -> ModuleType:
         module = ModuleType("atexit")

@@ -21,6 +21,7 @@ from vnet.gateway.emulated.values import (
     Reply,
     ReplyError,
     Sample,
+    Shown,
     Sink,
     SourceInfo,
     bytes_or_none,
@@ -203,6 +204,10 @@ class Query:
 
     def __init__(self, asking: Asking, entity: Entity) -> None:
         self._asking, self._entity, self._is_open = asking, entity, True
+        self.selector, self.key_expr = zenoh.Selector(asking.key, str(asking.parameters)), asking.key
+        self.parameters = zenoh.Parameters(str(asking.parameters))
+        self.payload, self.encoding = asking.payload, asking.encoding
+        self.attachment, self.source_info = asking.attachment, asking.source_info
         self._conclude = entity.session.until_end(partial(asking.done, entity.session))
 
     def __enter__(self) -> Query:
@@ -215,18 +220,20 @@ class Query:
         self.drop()
 
     def __str__(self) -> str:
+        self.check_declared()
         return str(self._asking.selector)
 
-    selector = property(lambda self: zenoh.Selector(self._asking.key, str(self._asking.parameters)))
-    key_expr = property(lambda self: self._asking.key)
-    parameters = property(lambda self: zenoh.Parameters(str(self._asking.parameters)))
-    payload = property(lambda self: self._asking.payload)
-    encoding = property(lambda self: self._asking.encoding)
-    attachment = property(lambda self: self._asking.attachment)
-    source_info = property(lambda self: self._asking.source_info)
+    selector, key_expr, parameters, payload = Shown(), Shown(), Shown(), Shown()
+    encoding, attachment, source_info = Shown(), Shown(), Shown()
+
+    def check_declared(self) -> None:
+        """Raise ZError if it has been concluded."""
+        if not self._is_open:
+            raise zenoh.ZError("Dropped query")
 
     def accepts_replies(self) -> zenoh.ReplyKeyExpr:
         """Return which keys replies may have."""
+        self.check_declared()
         any_key = self._asking.takes_any_key
         return zenoh.ReplyKeyExpr.ANY if any_key else zenoh.ReplyKeyExpr.MATCHING_QUERY
 
@@ -271,8 +278,7 @@ class Query:
         self._answer(Sample(key_expr, payload, kind, encoding, **options))
 
     def _answer(self, result: Sample | ReplyError) -> None:
-        if not self._is_open:
-            raise zenoh.ZError("Dropped query")
+        self.check_declared()
         if not self._entity.session.is_closed():
             self._asking.reply(Reply(result, self._entity.id), self._entity.session)
 

@@ -27,6 +27,7 @@ from vnet.gateway.emulated.values import (
     Outlet,
     Reply,
     Sample,
+    Shown,
     Sink,
     ZenohId,
     bytes_or_none,
@@ -196,12 +197,11 @@ class Subscriber(Listening):
         check({"allowed_origin": allowed_origin, "complete": complete})
         session, own_id, key = session.inner, session.new_id(), key_of(key_expr)
         super().__init__(handler, session.outlet)
-        self.session = session
+        self.session, self.id, self.key_expr = session, own_id, key
         self._entity = Entity(self.kind, session, own_id, key, self._intake(), allowed_origin, bool(complete))
         self._ends = {session.declare(self._entity): None}
 
-    id = property(lambda self: self._entity.id)
-    key_expr = property(lambda self: self._entity.key)
+    id, key_expr = Shown(), Shown()
 
     def _intake(self) -> Sink:
         """Return where the vehicle puts its items."""
@@ -323,8 +323,7 @@ class MatchingListener(Listening):
 class Sending(Declared):
     """A publisher or a querier."""
 
-    key_expr: zenoh.KeyExpr
-    id: EntityGlobalId
+    key_expr, id = Shown(), Shown()
     matches: Callable[[], bool]
     """Returns whether anybody may take its samples, or may answer."""
 
@@ -354,6 +353,7 @@ class Sending(Declared):
     @property
     def matching_status(self) -> MatchingStatus:
         """True for `matching` if there may be anybody at the other end."""
+        self.check_declared()
         return MatchingStatus(self.matches())
 
     declare_matching_listener = partialmethod(MatchingListener)
@@ -390,10 +390,7 @@ class Publisher(Sending):
         self.priority = priority or zenoh.Priority.DEFAULT
         self.reliability = reliability or zenoh.Reliability.RELIABLE
 
-    encoding: zenoh.Encoding
-    congestion_control: zenoh.CongestionControl
-    priority: zenoh.Priority
-    reliability: zenoh.Reliability
+    encoding, congestion_control, priority, reliability = Shown(), Shown(), Shown(), Shown()
 
     def put(self, payload: Any, *, encoding: Any = None, **options: Any) -> None:
         """Put a sample."""
@@ -431,7 +428,7 @@ class Querier(Sending):
         self._options = {**options, "target": target, "accept_replies": accept_replies}
         check(self._options)
 
-    accept_replies: zenoh.ReplyKeyExpr
+    accept_replies = Shown()
 
     def get(self, handler: Any = None, *, parameters: Any = None, **options: Any) -> Any:
         """Ask for replies."""
@@ -478,6 +475,7 @@ class Session(Ending):
         self.vehicle, self.outlet = vehicle, outlet
         self._entity_numbers = count(1)
         self._ends = {}
+        self._declared_keys: set[str] = set()
 
         def setting(name: str) -> Any:
             return msgspec.json.decode(config.get_json(name))
@@ -544,15 +542,25 @@ class Session(Ending):
         return self.until_end(partial(self.vehicle.undeclare, entity))
 
     def undeclare(self, obj: Any) -> None:
-        """Undeclare a key expression, which is none the less valid."""
+        """Undeclare what a session has declared; a key expression is none the less valid.
+
+        Raises ZError if it has been undeclared, or if this session has not declared the key expression.
+        """
+        if not isinstance(obj, (str, zenoh.KeyExpr)):
+            obj.undeclare()
+            return
+        if str(obj) not in self._declared_keys:
+            raise zenoh.ZError(f"Failed to undeclare {obj}: this session has not declared it")
 
     def new_timestamp(self) -> zenoh.Timestamp:
         """Return the present time by the vehicle's clock."""
         return self.vehicle.new_timestamp(self._zid)
 
     def declare_keyexpr(self, key_expr: Any) -> zenoh.KeyExpr:
-        """Return the key expression."""
-        return key_of(key_expr)
+        """Return the key expression. Raises ZError if the session has been closed."""
+        self.check_open()
+        self._declared_keys.add(str(key := key_of(key_expr)))
+        return key
 
     def put(self, key_expr: Any, payload: Any, **options: Any) -> None:
         """Put a sample."""

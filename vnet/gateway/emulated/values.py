@@ -41,6 +41,22 @@ MOST_COUNT = 2**64
 """Bound of counts, and of seconds."""
 
 
+class Shown:
+    """An attribute that an entity shows until it is undeclared, or a query until it is concluded, as at Zenoh."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = f"_{name}"
+
+    def __set__(self, entity: Any, value: object) -> None:
+        vars(entity)[self._name] = value
+
+    def __get__(self, entity: Any, owner: type | None = None) -> Any:
+        if entity is None:
+            return self
+        entity.check_declared()
+        return vars(entity)[self._name]
+
+
 class _Value(msgspec.Struct, frozen=True, eq=False, gc=False):
     """A value that vehicles share."""
 

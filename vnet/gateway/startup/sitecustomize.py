@@ -75,6 +75,7 @@ def open_with_override(zenoh: Any) -> None:
         return opened(config, **options)
 
     zenoh.open = open
+    vars(zenoh).get("zenoh", zenoh).open = open  # the compiled part, as which `from zenoh import *` binds `zenoh`
 
 
 class _Code:
@@ -121,6 +122,7 @@ def _failure() -> BaseException | None:
 
 
 def _leave(status: Any) -> None:
+    import_module("atexit")._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):
             stream.flush()
