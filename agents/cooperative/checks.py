@@ -13,6 +13,8 @@ from vnet.units import NS_PER_S
 
 MEAN_TOLERANCE_M = 1.0
 """Distance of a mean from its component's, where the vehicle does not state more, as with receivers of 30 m."""
+LAG_PERIODS = 3
+"""Periods by which a mean is behind its component's: a frame is heard a period later, and sums take hops."""
 AT_REST_S = 5.0
 """Time after the start, or the last fault, that the consensus has to settle."""
 WITHIN_S = 10.0
@@ -22,6 +24,8 @@ BACK_FACTOR, BACK_LEAST_M = 2.0, 0.3
 LEVEL_PERIODS = 20
 DIVERGENT_M, DIVERGENT_S = 10.0, 5.0
 """Common error above which a vehicle diverges, and the time for which it has to stay above it (MODEL 6)."""
+DIVERGENT_DEVIATIONS = 3.0
+"""Deviations that it states, above which as well: along its road c is as uncertain as before the first fix."""
 NO_COMMON_ERROR = "the program reports no common error"
 
 Result = tuple[str, str, str] | tuple[str, str, str, dict[str, Any]]
@@ -47,14 +51,13 @@ def check_consensus_mean(run: Any) -> Result:
         return name, "not applicable", "the program reports no mean"
     if run.rested_s < AT_REST_S:
         return name, "not applicable", f"{run.rested_s:.1f} s at rest; {AT_REST_S:g} s are needed"
-    off_m = _off_the_mean(run, mean_m, common_m)
+    off_m, moved_m = _off_the_mean(run, mean_m, common_m)
     judged = int(np.isfinite(off_m).sum())
     if not judged:
         text = "no component in which all vehicles run the scenario's program, are up and report a mean"
         return name, "not applicable", text
     worst_m = float(np.nanmax(off_m))
-    covariance_m2 = run.column("common_error_covariance_m2")[-1]
-    tolerance_m = np.fmax(MEAN_TOLERANCE_M, np.sqrt(covariance_m2[:, 0] + covariance_m2[:, 3]))
+    tolerance_m = np.fmax(MEAN_TOLERANCE_M, _stated_m(run)[-1]) + moved_m
     over = np.flatnonzero(off_m > tolerance_m).tolist()
     off = [{"node": run.nodes[node], "off_m": float(off_m[node])} for node in over]
     figures = {"vehicles": judged, "worst_m": worst_m, "tolerance_m": MEAN_TOLERANCE_M}
@@ -69,18 +72,29 @@ def check_consensus_mean(run: Any) -> Result:
     return _result(name, off, text, broken_text, **figures)
 
 
-def _off_the_mean(run: Any, mean_m: Array, common_m: Array) -> Array:
-    """Distance (N,) of each vehicle's mean from its component's over the last second; NaN where unknown."""
+def _stated_m(run: Any) -> Array:
+    """Deviations (periods, N) of the common error that vehicles state; NaN where they state none."""
+    covariance_m2 = run.column("common_error_covariance_m2")
+    return np.asarray(np.sqrt(covariance_m2[..., 0] + covariance_m2[..., 3]))
+
+
+def _off_the_mean(run: Any, mean_m: Array, common_m: Array) -> tuple[Array, Array]:
+    """Distance (N,) of each vehicle's mean from its component's over the last second; NaN where unknown.
+
+    And the way (N,) of that one within the last `LAG_PERIODS`.
+    """
     period_ns = run.scenario.period_ns
     last = slice(-max(1, NS_PER_S // period_ns), None)
     up: Mask = np.asarray(run.up_throughout[last].all(axis=0))
     known = np.isfinite(common_m[last]).all(axis=(0, 2)) & np.isfinite(mean_m[last]).all(axis=(0, 2))
-    off_m = np.full(len(up), np.nan)
+    off_m, moved_m = np.full((2, len(up)), np.nan)
     for part in _parts(run, (len(common_m) - 1) * period_ns, up):
         if (run.runs_the_program & known)[part].all():
             centre = common_m[last, part].mean(axis=1)[:, None]
             off_m[part] = np.hypot(*np.median(mean_m[last, part] - centre, axis=0).T)
-    return off_m
+            before = common_m[-1 - LAG_PERIODS :, part].mean(axis=1)
+            moved_m[part] = np.nanmax(np.hypot(*(before - before[-1]).T))
+    return off_m, moved_m
 
 
 def check_convergence(run: Any) -> Result:
@@ -161,13 +175,14 @@ def check_bounded_error(run: Any) -> Result:
         return name, "not applicable", NO_COMMON_ERROR
     error_m = np.hypot(*np.moveaxis(common_m - run.column("common_error_m"), 2, 0))
     judged = np.isfinite(error_m) & run.up_throughout & run.runs_the_program & ~run.misled(WITHIN_S)
-    diverged = run.first_lasting(judged & (error_m > DIVERGENT_M), DIVERGENT_S)
+    limit_m = np.fmax(DIVERGENT_M, DIVERGENT_DEVIATIONS * _stated_m(run))
+    diverged = run.first_lasting(judged & (error_m > limit_m), DIVERGENT_S)
     rows = [
         {"node": run.nodes[node], "period": period, "error_m": float(error_m[period, node])}
         for node, period in diverged.items()
     ]
     worst_m = float(error_m[judged].max(initial=0))
-    text = f"no common error over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s; {worst_m:.1f} m at most"
-    lost = counted(len(rows), "vehicle")
-    broken_text = f"{lost} with a common error over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s"
+    limit = f"over {DIVERGENT_M:g} m and {DIVERGENT_DEVIATIONS:g} stated deviations for {DIVERGENT_S:g} s"
+    text = f"no common error {limit}; {worst_m:.1f} m at most"
+    broken_text = f"{counted(len(rows), 'vehicle')} with a common error {limit}"
     return _result(name, rows, text, broken_text, worst_m=worst_m, lost=len(rows))

@@ -23,7 +23,10 @@ COOPERATION = ("consensus_mean", "convergence", "bounded_error")
 
 
 async def believes(node: Node) -> None:
-    """Report beliefs that agree, but for the `wrong`: {node, what, from_s, to_s, by_m}."""
+    """Report beliefs that agree, but for the `wrong`: {node, what, from_s, to_s, by_m}.
+
+    With `lag_s` all beliefs move by 1.5 m a second, to and fro, and means follow after that time.
+    """
     wrong: Mapping[str, Any] = node.options
     number = int(node.id[1:])
     async for fix in node.gnss:
@@ -31,9 +34,16 @@ async def believes(node: Node) -> None:
         values: dict[str, Any] = {"common_error_m": [0.02 * number, 0.0], "mean_m": [0.05, 0.0]}
         if wrong and node.id == wrong["node"] and wrong["from_s"] <= fix.time_ns / 1e9 < wrong["to_s"]:
             values[wrong["what"]][1] += wrong["by_m"]
+        if "lag_s" in wrong:
+            values["common_error_m"][0] += away_m(fix.time_ns / 1e9)
+            values["mean_m"][0] += away_m(fix.time_ns / 1e9 - wrong["lag_s"])
         if "stated_m2" in wrong:
             values["common_error_covariance_m2"] = [[wrong["stated_m2"], 0.0], [0.0, wrong["stated_m2"]]]
         node.report(fix.position_m, fix.covariance_m2, **values)
+
+
+def away_m(time_s: float) -> float:
+    return 1.5 * abs(time_s % 12 - 6)
 
 
 async def silent(node: Node) -> None:
@@ -102,9 +112,14 @@ def test_programs_without_beliefs_leave_nothing_to_judge() -> None:
     assert all(isinstance(result(recorded, name), NotExercised) for name in COOPERATION)
 
 
-@pytest.mark.parametrize(("to_s", "found"), [(6.5, {"bounded_error": Verdict.INVALID}), (5.7, {})])
-def test_a_vehicle_that_is_lost_for_five_seconds_is_found(to_s: float, found: dict[str, Verdict]) -> None:
-    recorded = run(duration_s=9.0, what="common_error_m", from_s=1.0, to_s=to_s, by_m=12.0)
+@pytest.mark.parametrize(
+    ("to_s", "stated_m2", "found"),
+    [(6.5, 0.1, {"bounded_error": Verdict.INVALID}), (5.7, 0.1, {}), (6.5, 9.0, {})],
+)
+def test_a_vehicle_that_is_lost_for_five_seconds_is_found_unless_it_says_so(
+    to_s: float, stated_m2: float, found: dict[str, Verdict]
+) -> None:
+    recorded = run(duration_s=9.0, what="common_error_m", from_s=1.0, to_s=to_s, by_m=12.0, stated_m2=stated_m2)
     assert not_valid(recorded) == found
 
 
@@ -125,6 +140,12 @@ def test_a_mean_that_is_none_is_found() -> None:
 @pytest.mark.parametrize(("stated_m2", "found"), [(0.4, {"consensus_mean": Verdict.INVALID}), (4.0, {})])
 def test_a_mean_may_be_as_far_off_as_the_vehicle_states(stated_m2: float, found: dict[str, Verdict]) -> None:
     recorded = run(duration_s=12.0, what="mean_m", from_s=3.0, to_s=12.0, by_m=2.0, stated_m2=stated_m2)
+    assert not_valid(recorded) == found
+
+
+@pytest.mark.parametrize(("lag_s", "found"), [(1.0, {}), (5.0, {"consensus_mean": Verdict.INVALID})])
+def test_a_mean_follows_a_few_periods_later(lag_s: float, found: dict[str, Verdict]) -> None:
+    recorded = run(duration_s=60.0, what="mean_m", lag_s=lag_s, rate_hz=1)
     assert not_valid(recorded) == found
 
 
