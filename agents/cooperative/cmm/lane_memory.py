@@ -15,7 +15,8 @@ and correlation time of the offset relative to those of a receiver without multi
 
 Where nobody has so precise a receiver (`PRECISE_M2`) increments are about c: they also hold what fixes say along
 the lane (4 % of the error of c), and what the vehicle has learned of c from others. A receiver that states
-multipath is always taken for a precise one.
+multipath is always taken for a precise one. Beside increments of lanes, a vehicle with several lanes says nothing:
+about c it would claim c's latest movement once more.
 
 An increment of a lane is written as (a_x, a_y, −kind, w, age): Λ = a aᵀ and η = a w about c − u. The exchange of a
 vehicle holds its own increments, and those that it takes.
@@ -478,7 +479,7 @@ class LaneExchange:
         lane = self._own.lane
         if lane is None or not (self.has_joined or self._is_precise(lane, fix)):
             self._lane = self._lane_of = None
-            return increment.numbers
+            return NOTHING.numbers if self.has_joined else increment.numbers
         if not self.has_joined:
             self._waits = True
             return NOT_BEGUN
