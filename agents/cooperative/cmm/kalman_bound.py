@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import scipy  # its parts are imported when they are first used: `linalg` takes longer than many a run
 
+from agents.cooperative.cmm.information import PRECISE_M2
 from vnet.types import Array
 
 LATERAL_SIGMA_M = 0.38
@@ -158,6 +159,16 @@ def common_step(sigma_m: float, tau_s: float, walk_m: float | None, dt_s: float)
         return 1.0, walk_m**2 * dt_s
     keep = float(np.exp(-dt_s / tau_s))
     return keep, sigma_m**2 * (1 - keep**2)
+
+
+def precise_m2(sigma_m: float, tau_s: float, walk_m: float | None) -> float:
+    """Return the variance (m²) of a fix below which its receiver is precise; see `PRECISE_M2`.
+
+    That is of a c of 3 m and 600 s. It grows with what is added to c in a second; a slower c does not change it.
+    """
+    usual = LaneModel()
+    usual_m2 = common_step(usual.common_sigma_m, usual.common_tau_s, None, 1.0)[1]
+    return PRECISE_M2 * max(1.0, common_step(sigma_m, tau_s, walk_m, 1.0)[1] / usual_m2)
 
 
 def lane_axes(heading_rad: Array | float) -> Array:

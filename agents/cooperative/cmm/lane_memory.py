@@ -13,7 +13,7 @@ independent, and add up exactly. `CommonMemory` is a Gaussian over c, its value 
 Multipath is part of the offset, and makes it larger and last longer. So there are *families* of kinds, by deviation
 and correlation time of the offset relative to those of a receiver without multipath, rounded up.
 
-Where nobody has so precise a receiver (`PRECISE_M2`) increments are about c: they also hold what fixes say along
+Where nobody has so precise a receiver (`precise_m2`) increments are about c: they also hold what fixes say along
 the lane (4 % of the error of c), and what the vehicle has learned of c from others. A receiver that states
 multipath is always taken for a precise one. Beside increments of lanes, a vehicle with several lanes says nothing:
 about c it would claim c's latest movement once more.
@@ -32,14 +32,13 @@ import numpy as np
 
 from agents.cooperative.cmm.information import (
     NOTHING,
-    PRECISE_M2,
     Five,
     Information,
     Three,
     inverted,
     plain_moments,
 )
-from agents.cooperative.cmm.kalman_bound import LaneModel
+from agents.cooperative.cmm.kalman_bound import LaneModel, precise_m2
 from agents.cooperative.cmm.own_kalman import OwnKalman
 from agents.cooperative.cmm.own_vehicle import OwnVehicle
 from agents.cooperative.cmm.plausibility import MEMORY_S
@@ -458,6 +457,7 @@ class LaneExchange:
         self._own = own
         self._period_s = period_s
         self._model = own.model  # without multipath, of which no fix has told yet
+        self._precise_m2 = precise_m2(own.model.common_sigma_m, own.model.common_tau_s, own.model.common_walk_m)
         self._memory = CommonMemory(self._model, period_s)
         self.has_joined = False
         self._waits = False
@@ -491,7 +491,7 @@ class LaneExchange:
     def _is_precise(self, lane: OwnKalman, fix: Observation | None) -> bool:
         if fix is None:
             return False
-        return self._own.model is not self._model or lane.noise_across(fix.white_covariance_m2) < PRECISE_M2
+        return self._own.model is not self._model or lane.noise_across(fix.white_covariance_m2) < self._precise_m2
 
     def _advance(self, periods: int) -> None:
         if self._begins:

@@ -16,7 +16,7 @@ That the vehicle is on no road is the last hypothesis: anywhere within 15 m of o
 
 Multipath m that a receiver states is one more state, a Gauss-Markov process in time: fixes show c + p + m.
 
-A precise receiver counts as one of `PRECISE_M2`, as far as its fixes are about c: with what they say beyond that
+A precise receiver counts as one of `precise_m2`, as far as its fixes are about c: with what they say beyond that
 the vehicles would correct c by many times its movement, and it would diverge. The position has their full
 precision.
 """
@@ -30,8 +30,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cooperative.cmm.information import NOTHING, PRECISE_M2, Five, Information, gained, inverse, transport
-from agents.cooperative.cmm.kalman_bound import common_step
+from agents.cooperative.cmm.information import NOTHING, Five, Information, gained, inverse, transport
+from agents.cooperative.cmm.kalman_bound import common_step, precise_m2
 from agents.cooperative.cmm.map_matching import MAX_GATE_M, MAX_LANES, MIN_GATE_M, OFF_ROAD_WITHIN_M, STAND_M
 from agents.cooperative.cmm.plausibility import scaled_by
 from agents.cooperative.cmm.rbpf import Observation, RbpfConfig
@@ -339,6 +339,7 @@ class OwnVehicleOnMap:
 
     def __init__(self, config: RbpfConfig, roads: RoadMap, rng: np.random.Generator) -> None:
         self._config = config
+        self._precise_m2 = precise_m2(config.common_sigma_m, config.common_tau_s, config.common_walk_m)
         self._roads = roads
         self._sigma_m = np.hypot(roads.sigma_m, roads.half_width_m / np.sqrt(3))
         self.largest_increment = 1 / float(self._sigma_m.min(initial=config.common_sigma_m)) ** 2
@@ -356,7 +357,7 @@ class OwnVehicleOnMap:
         self._untaken_s = self._since_s = 0.0  # the times since these
         self._heading_rad: float | None = None
         self._multipath = (0.0, 0.0)
-        self._rest: tuple[Array, Array] | None = None  # what the latest fix says beyond `PRECISE_M2`
+        self._rest: tuple[Array, Array] | None = None  # what the latest fix says beyond `_precise_m2`
         self.owed = NOTHING
         self._take_moments()
         self.prior = self._said = Information.of(*self.belief)
@@ -425,7 +426,7 @@ class OwnVehicleOnMap:
         before, since_s = self._latest, self._since_s
         self._latest, self._since_s = fix, 0.0
         exact_m2 = fix.white_covariance_m2
-        more_m2 = max(PRECISE_M2 - float(exact_m2.diagonal().min()), 0.0)
+        more_m2 = max(self._precise_m2 - float(exact_m2.diagonal().min()), 0.0)
         noise_m2 = exact_m2 + more_m2 * np.eye(2)
         if not self._is_placed:
             self._place(fix, noise_m2)

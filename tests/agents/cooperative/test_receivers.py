@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import emulator
 from agents.cooperative.cmm.kalman_bound import LaneModel, OffsetAndMultipath
 from agents.cooperative.cmm.lane_memory import LaneExchange
 from agents.cooperative.cmm.own_vehicle import OwnConfig, OwnVehicle
@@ -215,6 +217,25 @@ def test_who_is_between_two_lanes_says_nothing_beside_increments_of_lanes(has_jo
     said = np.array([exchange.step(PERIOD_S, fix) for _ in range(20)])
     assert (said[:, 2] >= 0).all(), "no increment of a lane"
     assert said.any() == (not has_joined)
+
+
+def test_in_a_city_a_common_error_that_moves_fast_is_followed(tmp_path: Path) -> None:
+    """Ten precise receivers corrected c by many times its movement: after 18 s by 17 m too much, stating 0.5."""
+    scenario = {
+        "run": {"seed": 7, "duration_s": 18.0, "settle_s": 0.0},
+        "network": {"kind": "city", "vehicles": 10, "seed": 5007},
+        "world": {
+            "gnss": {"sigma_m": 0.25},
+            "common_error": {"sigma_m": 10.0, "tau_s": 300.0},
+            "lateral": {"half_width_m": 1.5, "sigma_m": 0.35},
+        },
+        "program": {
+            "entry": "agents.cooperative:main",
+            "options": {"common_sigma_m": 10.0, "common_tau_s": 300.0},
+        },
+    }
+    figures = emulator.simulate(scenario, out=tmp_path / "run").figures
+    assert max(figures[name] or 0 for name in ("common_error_rmse_m", "common_error_anees")) < 2
 
 
 def test_offset_and_multipath_make_one_process() -> None:
