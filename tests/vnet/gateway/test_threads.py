@@ -348,6 +348,27 @@ def test_what_is_to_be_done_at_exit_is_done_after_a_failure_and_beside_one(drive
         assert "bye" in log(run, node)
 
 
+def test_handlers_of_signals_are_refused_as_by_python(drive: Drive) -> None:
+    run = drive("""
+        import signal, threading
+
+        def attempt(*given):
+            try:
+                print(signal.signal(*given))
+            except (ValueError, OSError, TypeError) as error:
+                print(type(error).__name__)
+
+        for given in ((0, print), (signal.NSIG, print), (signal.SIGKILL, print), (signal.SIGTERM, "handler")):
+            attempt(*given)
+        thread = threading.Thread(target=attempt, args=(signal.SIGTERM, print))
+        thread.start()
+        thread.join()
+        attempt(signal.SIGTERM, print)
+        """)
+    refusals = ["ValueError", "ValueError", "OSError", "TypeError", "ValueError"]
+    assert printed(run) == [*refusals, str(signal.SIG_DFL)]
+
+
 def test_crash_of_a_thread_is_told_and_the_program_goes_on(drive: Drive) -> None:
     run = drive("""
         import threading, time

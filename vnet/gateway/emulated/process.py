@@ -82,7 +82,16 @@ class OwnProcess:
         }
 
     def set_handler(self, number: int, handler: Any) -> Any:
-        """Have a signal handled so; return what it was handled by before."""
+        """Have a signal handled so; return what it was handled by before. Raises as `signal.signal`."""
+        if not callable(handler) and handler not in (signal.SIG_DFL, signal.SIG_IGN):
+            raise TypeError("signal handler must be signal.SIG_IGN, signal.SIG_DFL, or a callable object")
+        strand, main = current_strand(), self._threads.main
+        if strand is not None and main is not None and strand.number != main.number:
+            raise ValueError("signal only works in main thread of the main interpreter")
+        if not 0 < number < signal.NSIG:
+            raise ValueError("signal number out of range")
+        if number in (signal.SIGKILL, signal.SIGSTOP):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         before = self._handlers.get(number, signal.SIG_DFL)
         self._handlers[number] = handler
         return before
