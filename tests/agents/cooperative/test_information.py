@@ -120,14 +120,19 @@ class RoadNetwork(Network):
 
 
 class MovingNetwork(Network):
-    """Vehicles with receivers of some deviations (m), in the program's own world: c moves, and offsets do."""
+    """Vehicles with receivers of some deviations (m), in the program's own world: c moves, and offsets do.
 
-    def __init__(self, sigma_m: list[float], seed: int, reach: int | None = None) -> None:
-        super().__init__(len(sigma_m), reach)
-        self._sigma_m = sigma_m
+    common: deviation (m) and correlation time (s) of c, of which the program is told.
+    """
+
+    def __init__(
+        self, sigma_m: list[float], seed: int, reach: int | None = None, common: tuple[float, float] = (3.0, 600.0)
+    ) -> None:
+        super().__init__(len(sigma_m), reach, common_sigma_m=common[0], common_tau_s=common[1])
+        self._sigma_m, self._common = sigma_m, common
         self.change: Change = _honest
         self._rng = np.random.default_rng(seed)
-        self.common_m = 3 * self._rng.standard_normal(2)
+        self.common_m = common[0] * self._rng.standard_normal(2)
         self._offset_m = 0.38 * self._rng.standard_normal(len(sigma_m))
 
     def advance(self, periods: int) -> list[float]:
@@ -142,7 +147,7 @@ class MovingNetwork(Network):
 
     def move(self) -> None:
         """Move on by a period."""
-        for state, sigma_m, tau_s in ((self.common_m, 3.0, 600.0), (self._offset_m, 0.38, 20.0)):
+        for state, sigma_m, tau_s in ((self.common_m, *self._common), (self._offset_m, 0.38, 20.0)):
             keep = np.exp(-0.1 / tau_s)
             state *= keep
             state += sigma_m * np.sqrt(1 - keep**2) * self._rng.standard_normal(len(state))

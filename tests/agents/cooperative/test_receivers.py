@@ -37,10 +37,24 @@ class Receiver:
 
 
 class MixedNetwork(MovingNetwork):
-    """Vehicles with any receivers; what they state of multipath is true."""
+    """Vehicles with any receivers; what they state of multipath is true.
 
-    def __init__(self, receivers: list[Receiver], seed: int, reach: int | None = None) -> None:
-        super().__init__([each.sigma_m for each in receivers], seed, reach)
+    beside: true if there is another lane beside that of the first.
+    """
+
+    def __init__(
+        self,
+        receivers: list[Receiver],
+        seed: int,
+        reach: int | None = None,
+        common: tuple[float, float] = (3.0, 600.0),
+        beside: bool = False,
+    ) -> None:
+        super().__init__([each.sigma_m for each in receivers], seed, reach, common)
+        if beside:
+            places_m = np.vstack([np.zeros((len(receivers), 2)), [0.0, -3.0]])
+            self.lanes = LaneMap(places_m, np.append(self.lanes.heading_rad, 0.0), 0.85)
+            self.estimators = [self.new(k) for k in range(len(receivers))]
         self._receivers = receivers
         self._multipath_m = np.array([each.multipath_m for each in receivers])[:, None] * self._rng.standard_normal(
             (len(receivers), 2)
@@ -103,10 +117,18 @@ receivers = st.builds(
 
 
 @settings(max_examples=8, deadline=None, derandomize=True)
-@given(st.lists(receivers, min_size=3, max_size=6), st.integers(0, 2**16), st.integers(1, 3))
-def test_in_any_network_errors_are_as_stated(drawn: list[Receiver], seed: int, reach: int) -> None:
+@given(
+    st.lists(receivers, min_size=3, max_size=6),
+    st.integers(0, 2**16),
+    st.integers(1, 3),
+    st.sampled_from([(3.0, 600.0), (10.0, 300.0), (5.0, 100.0)]),
+    st.booleans(),
+)
+def test_in_any_network_errors_are_as_stated(
+    drawn: list[Receiver], seed: int, reach: int, common: tuple[float, float], beside: bool
+) -> None:
     """A world is one sample: the normalized squared error of two coordinates is beyond 16 once in ten million."""
-    network = MixedNetwork(drawn, seed, reach)
+    network = MixedNetwork(drawn, seed, reach, common, beside)
     assert network.advance(40)[-1] < 16
     for estimator in network.estimators:
         assert np.isfinite(estimator.common_error[0]).all()
