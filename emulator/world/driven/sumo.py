@@ -234,6 +234,11 @@ def _begin(scenario: Scenario, path: Path, step_ns: int) -> tuple[SumoProcess, B
     start_s = begin_s if network.start_s is None else network.start_s
     if start_s < begin_s:
         raise ScenarioError(f"network.start_s = {start_s:g}: SUMO begins at {begin_s:g} s ({path})")
+    if round((start_s - begin_s) * NS_PER_S) % step_ns:
+        raise ScenarioError(
+            f"network.start_s = {start_s:g}: SUMO begins at {begin_s:g} s ({path}), and a whole number of steps of "
+            f"{step_ns / NS_PER_S:g} s after that is needed"
+        )
     process = SumoProcess(path, scenario.run.join_timeout_s)
     begun = process.ask(Begin(_options(path, network.seed, step_ns)), Begun)
     while begin_s < start_s:

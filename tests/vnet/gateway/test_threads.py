@@ -348,6 +348,34 @@ def test_what_is_to_be_done_at_exit_is_done_after_a_failure_and_beside_one(drive
         assert "bye" in log(run, node)
 
 
+def test_the_standard_library_has_the_programs_clock_output_and_waits(drive: Drive) -> None:
+    run = drive("""
+        import calendar, contextlib, http.cookies, io, mailbox, pprint, select, selectors, signal, threading, time
+        import traceback
+
+        def written(stream, act, *given):
+            with getattr(contextlib, f"redirect_{stream}")(io.StringIO()) as into:
+                act(*given)
+            return bool(into.getvalue())
+
+        acts = (pprint.pprint, 1), (calendar.prmonth, 2025, 1)
+        print([written("stdout", *act) for act in acts], written("stderr", traceback.print_stack))
+        cookie = http.cookies.SimpleCookie({"a": "b"})
+        cookie["a"]["expires"] = 0
+        print("01 Jan 2025" in cookie.output(), mailbox.MaildirMessage().get_date() == time.time())
+        for selector in (selectors.DefaultSelector(), selectors.SelectSelector()):
+            started = time.monotonic()
+            selector.select(0.3)
+            print(round(time.monotonic() - started, 2))
+        signal.signal(signal.SIGUSR1, lambda *_: print(threading.current_thread() is threading.main_thread()))
+        thread = threading.Thread(target=signal.raise_signal, args=(signal.SIGUSR1,))
+        thread.start()
+        thread.join()
+        time.sleep(0.1)
+        """)
+    assert printed(run) == ["[True, True] True", "True True", "0.3", "0.3", "True"]
+
+
 def test_handlers_of_signals_are_refused_as_by_python(drive: Drive) -> None:
     run = drive("""
         import signal, threading

@@ -60,27 +60,34 @@ _OWN_COPIES = (
     "_threading_local",
     "argparse",
     "asyncio",
+    "calendar",
     "concurrent",
     "contextlib",
+    "email.generator",
     "email.utils",
     "fileinput",
     "gzip",
+    "http.cookies",
     "http.server",
     "logging",
+    "mailbox",
     "multiprocessing.dummy",
     "multiprocessing.pool",
     "multiprocessing.util",
     "optparse",
     "pkgutil",
+    "pprint",
     "pydoc",
     "queue",
     "runpy",
     "sched",
+    "selectors",
     "socketserver",
     "tarfile",
     "tempfile",
     "threading",
     "timeit",
+    "traceback",
     "unittest.mock",
     "uuid",
     "weakref",
@@ -89,7 +96,7 @@ _OWN_COPIES = (
     "zipfile",
 )
 """Modules and packages of the standard library of which each program has its own: they block, keep such objects,
-ask for the time, load modules, wait for the end of the program, or read the words of the command."""
+ask for the time, print, load modules, wait for the end of the program, or read the words of the command."""
 _SHARED_PARENTS = {name.rpartition(".")[0] for name in _OWN_COPIES if "." in name}
 """Packages that are shared but for modules of which each program has its own."""
 _ABSENT = {
@@ -254,7 +261,7 @@ class ProgramModules:
             "importlib.machinery": self._importlib_machinery,
             "importlib.util": self._importlib_util,
             "os": self._os,
-            "select": lambda: facade(select, select=_select),
+            "select": lambda: facade(select, select=staticmethod(_select)),
             "signal": lambda: facade(signal, **self.process.signal_functions()),
             "subprocess": lambda: facade(subprocess, **subprocess_functions(self.environ, tell)),
             "sys": self._sys,
@@ -268,6 +275,7 @@ class ProgramModules:
             "concurrent.futures": self._prepare_futures,
             "multiprocessing.pool": self._prepare_pools,
             "multiprocessing.util": _prepare_finalizers,
+            "selectors": _prepare_selectors,
             "socketserver": _prepare_servers,
             "queue": self._prepare_queue,
             "threading": self._prepare_threading,
@@ -697,6 +705,12 @@ def _prepare_uuid(module: Any) -> None:
     """Have ids of version 1 drawn, where Python asks for the machine's address and the system."""
     module._node = random.getrandbits(48) | 1 << 40
     module._generate_time_safe = module._UuidCreate = None
+
+
+def _prepare_selectors(module: Any) -> None:
+    """Have all selectors wait by `select.select`, which is the program's own."""
+    for name in ("DefaultSelector", "PollSelector", "EpollSelector"):
+        setattr(module, name, module.SelectSelector)
 
 
 def _select(readers: Any, writers: Any, others: Any, timeout_s: float | None = None) -> Any:

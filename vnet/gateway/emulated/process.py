@@ -85,8 +85,7 @@ class OwnProcess:
         """Have a signal handled so; return what it was handled by before. Raises as `signal.signal`."""
         if not callable(handler) and handler not in (signal.SIG_DFL, signal.SIG_IGN):
             raise TypeError("signal handler must be signal.SIG_IGN, signal.SIG_DFL, or a callable object")
-        strand, main = current_strand(), self._threads.main
-        if strand is not None and main is not None and strand.number != main.number:
+        if self._is_in_thread():
             raise ValueError("signal only works in main thread of the main interpreter")
         if not 0 < number < signal.NSIG:
             raise ValueError("signal number out of range")
@@ -95,6 +94,11 @@ class OwnProcess:
         before = self._handlers.get(number, signal.SIG_DFL)
         self._handlers[number] = handler
         return before
+
+    def _is_in_thread(self) -> bool:
+        """Return whether another than the main thread runs."""
+        strand, main = current_strand(), self._threads.main
+        return strand is not None and main is not None and strand.number != main.number
 
     def _timer_left(self, which: int) -> tuple[float, float]:
         if self._timer is None or which != signal.ITIMER_REAL:
@@ -176,6 +180,9 @@ class OwnProcess:
         ):
             self._exit(-number)
         if not callable(handler):
+            return
+        if self._is_in_thread():
+            self._threads.start_as_main(lambda: self.send(number))
             return
         try:
             handler(int(number), self._frame())
