@@ -25,7 +25,7 @@ COOPERATION = ("consensus_mean", "convergence", "bounded_error")
 async def believes(node: Node) -> None:
     """Report beliefs that agree, but for the `wrong`: {node, what, from_s, to_s, by_m}.
 
-    With `lag_s` all beliefs move by 1.5 m a second, to and fro, and means follow after that time.
+    With `lag_s` all beliefs move by 1.5 m a second, back and forth, and means follow after that time.
     """
     wrong: Mapping[str, Any] = node.options
     number = int(node.id[1:])
