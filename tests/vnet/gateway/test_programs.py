@@ -830,7 +830,7 @@ def test_a_session_undeclares_what_it_has_declared_which_then_shows_nothing(driv
         print([reply.ok for reply in session.get("a/b", timeout=0.1)])
         key = session.declare_keyexpr("k/k")
         session.undeclare(key)
-        for what in (zenoh.KeyExpr("x/y"), 3):
+        for what in (zenoh.KeyExpr("x/y"), "k/k", 3):
             attempt(lambda: session.undeclare(what))
         time.sleep(0.1)
         session.close()
@@ -842,6 +842,7 @@ def test_a_session_undeclares_what_it_has_declared_which_then_shows_nothing(driv
         assert lines[8 + 3 * place : 11 + 3 * place] == [f"ZError Undeclared {name}"] * 3
     assert lines[20:] == [
         "ZError Undeclared LivelinessToken", "SampleKind.DELETE", "[None]", "ZError Failed to undeclare x/y",
+        "ZError Failed to undeclare k/k",
         "AttributeError 'int' object has no attribute 'undeclare'", "ZError session closed",
     ]  # fmt: skip
 

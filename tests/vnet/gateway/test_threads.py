@@ -228,7 +228,9 @@ def test_moments_are_of_the_classes_that_compiled_code_looks_for(drive: Drive) -
         import datetime, functools, msgspec, pickle, pydantic, time
 
         class Mine(datetime.datetime):
-            pass
+            @classmethod
+            def fromtimestamp(cls, timestamp, tz=None):
+                return cls.now(tz)
 
         class Model(pydantic.BaseModel):
             at: datetime.datetime
@@ -240,6 +242,7 @@ def test_moments_are_of_the_classes_that_compiled_code_looks_for(drive: Drive) -
         name.register(datetime.datetime, lambda value: "moment")
         now = datetime.datetime.now()
         print(type(now) is datetime.datetime, type(Mine.now()) is Mine, isinstance(now, Mine), name(now), repr(now))
+        pickle.loads(pickle.dumps([datetime.datetime.now, datetime.datetime.utcnow, datetime.date.today]))
         print(pickle.loads(pickle.dumps(now)) == now == Model(at=now).at, msgspec.json.encode(now).decode())
         print(datetime.datetime.fromtimestamp(time.time()) - now, type(datetime.date.today()) is datetime.date)
         while datetime.datetime.now() < now + datetime.timedelta(milliseconds=20):

@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequenc
 from contextvars import ContextVar
 from copy import copy
 from datetime import date, datetime, tzinfo
-from functools import cache, partial
+from functools import cache, partial, wraps
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -124,11 +124,14 @@ def _import_for_present(name: str, package: str | None = None) -> ModuleType:
 vars(importlib.metadata)["import_module"] = _import_for_present  # by which an entry point is loaded
 
 
+_from_timestamp = vars(datetime)["fromtimestamp"]  # Python's own, whatever a subclass has
+
+
 def _now(cls: Any, tz: tzinfo | None = None) -> Any:
     look()
     program = _present.get()
     assert program is not None
-    return cls.fromtimestamp((EPOCH_NS + program.node.now_ns) / NS_PER_S, tz)
+    return _from_timestamp.__get__(None, cls)((EPOCH_NS + program.node.now_ns) / NS_PER_S, tz)
 
 
 def _today(cls: Any) -> Any:
@@ -143,6 +146,7 @@ def _show_clock(kind: type, name: str, own: Callable[..., Any]) -> None:
     methods = gc.get_referents(vars(kind))[0]  # behind the proxy, as built-in classes refuse to be changed
     method = methods[name]
 
+    @wraps(method)  # pickle finds it by its name
     def chosen(cls: Any, *args: Any, **options: Any) -> Any:
         return own(cls, *args, **options) if is_program() else method.__get__(None, cls)(*args, **options)
 
@@ -153,7 +157,7 @@ def _show_clock(kind: type, name: str, own: Callable[..., Any]) -> None:
 _show_clock(datetime, "now", _now)
 _show_clock(datetime, "utcnow", lambda cls: _now(cls))
 _show_clock(date, "today", _today)
-os.environ["TZ"] = "UTC0"  # local time is the same on all machines, also where compiled code computes it
+os.environ["TZ"] = "UTC"  # local time is the same on all machines, also where compiled code computes it
 time.tzset()
 
 

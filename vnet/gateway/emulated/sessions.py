@@ -549,7 +549,7 @@ class Session(Ending):
         if not isinstance(obj, (str, zenoh.KeyExpr)):
             obj.undeclare()
             return
-        if str(obj) not in self._declared_keys:
+        if isinstance(obj, str) or str(obj) not in self._declared_keys:
             raise zenoh.ZError(f"Failed to undeclare {obj}: this session has not declared it")
 
     def new_timestamp(self) -> zenoh.Timestamp:
