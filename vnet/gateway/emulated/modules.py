@@ -60,7 +60,6 @@ _OWN_COPIES = (
     "_threading_local",
     "argparse",
     "asyncio",
-    "calendar",
     "concurrent",
     "contextlib",
     "email.generator",
