@@ -15,8 +15,8 @@ and correlation time of the offset relative to those of a receiver without multi
 
 Where nobody has so precise a receiver (`precise_m2`) increments are about c: they also hold what fixes say along
 the lane (4 % of the error of c), and what the vehicle has learned of c from others. A receiver that states
-multipath is always taken for a precise one. Beside increments of lanes, a vehicle with several lanes says nothing:
-about c it would claim c's latest movement once more.
+multipath is always taken for a precise one. Beside increments of lanes such a vehicle says nothing while it has
+several lanes: about c it would claim c's latest movement once more.
 
 An increment of a lane is written as (a_x, a_y, −kind, w, age): Λ = a aᵀ and η = a w about c − u. The exchange of a
 vehicle holds its own increments, and those that it takes.
@@ -479,7 +479,8 @@ class LaneExchange:
         lane = self._own.lane
         if lane is None or not (self.has_joined or self._is_precise(lane, fix)):
             self._lane = self._lane_of = None
-            return NOTHING.numbers if self.has_joined else increment.numbers
+            is_silent = lane is None and self.has_joined and self._is_precise(None, fix)
+            return NOTHING.numbers if is_silent else increment.numbers
         if not self.has_joined:
             self._waits = True
             return NOT_BEGUN
@@ -488,10 +489,12 @@ class LaneExchange:
             return NOTHING.numbers
         return self._filter_on(lane, fix).take(fix.position_m, self._memory.age)
 
-    def _is_precise(self, lane: OwnKalman, fix: Observation | None) -> bool:
+    def _is_precise(self, lane: OwnKalman | None, fix: Observation | None) -> bool:
         if fix is None:
             return False
-        return self._own.model is not self._model or lane.noise_across(fix.white_covariance_m2) < self._precise_m2
+        noise_m2 = fix.white_covariance_m2
+        across_m2 = float(noise_m2.diagonal().min()) if lane is None else lane.noise_across(noise_m2)
+        return self._own.model is not self._model or across_m2 < self._precise_m2
 
     def _advance(self, periods: int) -> None:
         if self._begins:

@@ -228,17 +228,21 @@ def test_an_increment_of_another_age_is_not_judged_and_not_used() -> None:
         assert exchange.can_use((0.0, 1.0, -3.0, 0.5, float(age)), is_before) == is_used
 
 
-@pytest.mark.parametrize("has_joined", [False, True])
-def test_who_is_between_two_lanes_says_nothing_beside_increments_of_lanes(has_joined: bool) -> None:
-    """Increments about c claim how it has moved, which those of lanes claim once for all: c had an ANEES of 60."""
+@pytest.mark.parametrize(
+    ("has_joined", "multipath_m", "says"), [(False, 3.0, True), (True, 3.0, False), (True, 0.0, True)]
+)
+def test_who_is_between_two_lanes_says_nothing_beside_increments_of_lanes(
+    has_joined: bool, multipath_m: float, says: bool
+) -> None:
+    """A precise receiver: its increments about c claim how that has moved once more. c had an ANEES of 60."""
     lanes = LaneMap(np.array([[0.0, 0.0], [0.0, 3.0]]), np.zeros(2), 0.85)
     exchange = LaneExchange(OwnVehicle(OwnConfig(RbpfConfig()), lanes, np.random.default_rng(1)), PERIOD_S)
     if has_joined:
         exchange.join([(0.0, 1.0, -3.0, 0.5, 20.0)])
-    fix = Observation(np.array([0.0, 1.5]), 9.01 * np.eye(2), 0.0, multipath=(3.0, 200.0))
+    fix = Observation(np.array([0.0, 1.5]), (1 + multipath_m**2) * np.eye(2), 0.0, multipath=(multipath_m, 200.0))
     said = np.array([exchange.step(PERIOD_S, fix) for _ in range(20)])
     assert (said[:, 2] >= 0).all(), "no increment of a lane"
-    assert said.any() == (not has_joined)
+    assert said.any() == says
 
 
 def test_in_a_city_a_common_error_that_moves_fast_is_followed(tmp_path: Path) -> None:
