@@ -32,7 +32,7 @@ from functools import cache, partial, wraps
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 from greenlet import GreenletExit
 
@@ -156,8 +156,16 @@ def _show_clock(kind: type, name: str, own: Callable[..., Any]) -> None:
 _show_clock(datetime, "now", _now)
 _show_clock(datetime, "utcnow", lambda cls: _now(cls))
 _show_clock(date, "today", _today)
-os.environ["TZ"] = "UTC"  # local time is the same on all machines, also where compiled code computes it
-time.tzset()
+_MACHINES_ZONE = os.environ.get("TZ")
+
+
+def _set_zone(zone: str | None) -> None:
+    """Have local time be that of a zone, also where compiled code computes it; None is that of /etc/localtime."""
+    if zone is None:
+        os.unsetenv("TZ")
+    else:
+        os.putenv("TZ", zone)
+    time.tzset()
 
 
 class OwnModules(dict[str, ModuleType]):
@@ -236,6 +244,9 @@ for _environ in os.environ, os.environb:
 class ProgramModules:
     """The modules of one program of a vehicle, as `sys.modules` has them."""
 
+    _open: ClassVar[set[ProgramModules]] = set()
+    """Those of programs that are there, whose local time is the same on all machines."""
+
     def __init__(self, node: Node, environment: Mapping[str, str]) -> None:
         self.node = node
         self.threads = Threads()
@@ -249,7 +260,9 @@ class ProgramModules:
         self.path: list[str] = []
         self.argv: list[str] = []
         own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)
-        self.environ = Variables({**os.environ, **environment, **own})
+        self.environ = Variables({**os.environ, **environment, **own, "TZ": "UTC"})
+        self._open.add(self)
+        _set_zone("UTC")
         searched = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
         self._searched = [*searched, *sys.path]
         if "ros2" in node.options:
@@ -291,6 +304,9 @@ class ProgramModules:
         """Have none of its modules found any more."""
         self.modules.close()
         self._no_keys.close()
+        self._open.discard(self)
+        if not self._open:
+            _set_zone(_MACHINES_ZONE)
 
     # Running.
 
