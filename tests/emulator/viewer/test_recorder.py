@@ -10,7 +10,7 @@ from rerun.chunk import RrdReader
 from emulator.radio.outcomes import Outcome
 from emulator.viewer.drawing import OUTCOME_COLOURS, PeriodArrays, ellipses, link_states
 from emulator.viewer.recorder import Recorder
-from emulator.viewer.scenes import STROKES
+from emulator.viewer.scenes import STROKES, describe
 from emulator.viewer.sinks import Sinks, is_closed
 from tests.emulator.test_playback import watch
 from tests.support.recordings import Entity, read_back, rrd
@@ -96,6 +96,21 @@ def test_the_blueprint_has_four_tabs_and_shows_whatever_there_is(path: Path, ent
 def test_nothing_that_is_always_there_hides_what_comes_with_a_time(entities: dict[str, Entity]) -> None:
     hidden = {name: set(entity.static) & set(entity.at) for name, entity in entities.items()}
     assert {name: both for name, both in hidden.items() if both} == {}
+
+
+@pytest.mark.parametrize(
+    ("scenario", "radio"),
+    [
+        ("", "radio 3000 m"),
+        (
+            "[radio]\npath_loss = { kind = 'winner_b1' }\nmac = { kind = 'lte-mode4' }\n",
+            "radio: winner b1, lte-mode4",
+        ),
+    ],
+)
+def test_a_scenario_is_described_by_what_it_leaves_out_too(told: Told, scenario: str, radio: str) -> None:
+    scene = next(message for stream, message in told if "lane_heading_rad" in message)
+    assert f" · {radio}, loss 0%, at most 3 peers" in describe({**scene, "scenario": scenario})
 
 
 def test_there_is_no_time_but_the_emulated(path: Path) -> None:
