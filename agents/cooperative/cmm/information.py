@@ -75,9 +75,6 @@ class Information:
 
 NOTHING = Information((0.0, 0.0, 0.0, 0.0, 0.0))
 """A fix that is not used says this."""
-PRECISE_M2 = 0.64
-"""Variance (m²) of a fix below which its receiver is precise (0.8 m): the movement of c between fixes, which is the
-same for all vehicles, shows in their increments about c, and their sum claims too much (Bar-Shalom 1981)."""
 
 
 # Symmetric matrices (xx, xy, yy) in plain numbers.

@@ -14,9 +14,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 import scipy  # its parts are imported when they are first used: `linalg` takes longer than many a run
 
-from agents.cooperative.cmm.information import PRECISE_M2
 from vnet.types import Array
 
+PRECISE_M2 = 0.64
+"""Variance (m²) of a fix below which its receiver is precise (0.8 m): the movement of c between fixes, which is the
+same for all vehicles, shows in their increments about c, and their sum claims too much (Bar-Shalom 1981)."""
 LATERAL_SIGMA_M = 0.38
 """Deviation (m) of a lateral offset: that of 0.4 m after reflection at ±0.85 m."""
 UNKNOWN_ALONG_M = 1e4

@@ -239,6 +239,7 @@ def test_no_process_is_left_behind(tmp_path: Path) -> None:
         ({"network": {"sumo": {"nodes": ["never"]}}}, "'never': SUMO inserts no such vehicle in the run's 3 s"),
         ({"network": {"sumo": {"lights_to": ["x"]}}}, "lights_to = 'x': no such node; there are"),
         ({"network": {"start_s": -1.0}}, "network.start_s = -1: SUMO begins at 0 s"),
+        ({"network": {"start_s": 2.05}}, "SUMO begins at 0 s"),
         ({"network": {"start_s": 100.0}}, "SUMO inserts no vehicle in the run's 3 s"),
     ],
 )
