@@ -212,8 +212,11 @@ def progress_bar(title: str, total: int, done: int) -> Iterator[Callable[[], Non
 
 
 @contextmanager
-def open_executor(address: str | None) -> Iterator[Executor | None]:
-    """Yield the executor that an address names, `dask://host:port`; None for None. Raises VnetError."""
+def open_executor(address: str | None, say: Callable[[str], object] = print) -> Iterator[Executor | None]:
+    """Yield the executor that an address names, `dask://host:port`; None for None. Raises VnetError.
+
+    `say` is given what a user should know: that the scheduler has no worker.
+    """
     if address is None:
         yield None
         return
@@ -228,6 +231,8 @@ def open_executor(address: str | None) -> Iterator[Executor | None]:
     except (OSError, TimeoutError) as error:
         raise VnetError(f"--executor {address}: no Dask scheduler answers: {error}") from None
     with client:
+        if not client.nthreads():
+            say(f"--executor {address}: the scheduler has no worker yet; the runs wait for one")
         yield client.get_executor(pure=False)
 
 

@@ -94,7 +94,7 @@ def sweep(
         if note := too_few(seeds):
             tell(note)
         try:
-            with open_executor(executor) as pool:
+            with open_executor(executor, tell) as pool:
                 run_cells(cells, folder, title="sweep", executor=pool, jobs=jobs)
         except KeyboardInterrupt:
             done = len(plan.cells) - missing_cells(plan, folder)
@@ -216,5 +216,5 @@ def campaign(
         plan = Plan.of(loaded, faults, runs, loaded.run.seed, **options)
         if plan.note:
             tell(plan.note)
-        with open_executor(executor) as pool:
+        with open_executor(executor, tell) as pool:
             raise typer.Exit(run_campaign(plan, out, SafeConsole(stderr=True), pool, before))

@@ -59,3 +59,11 @@ def test_a_worker_that_is_killed_loses_nothing(
     here = emulator.sweep(TINY, VARY, seeds=3, out=tmp_path / "here", jobs=1)
     assert len(there) == 6 and set(there["verdict"].to_pylist()) == {"valid"}
     assert there.drop_columns(list(WALL_CLOCK)).equals(here.drop_columns(list(WALL_CLOCK)))
+
+
+def test_a_scheduler_without_workers_is_told(cluster: LocalCluster) -> None:
+    said = list[str]()
+    cluster.scale(0)
+    cluster.sync(cluster._correct_state)
+    with open_executor(cluster.scheduler_address.replace("tcp://", "dask://"), said.append):
+        assert len(said) == 1 and "no worker" in said[0]
