@@ -49,7 +49,7 @@ from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.error_text import NOT_THE_PROGRAM, error_line
-from vnet.runtime.host import Disks, Host
+from vnet.runtime.host import Disks, Host, is_discarding
 from vnet.runtime.outside_loop import caught, collected_by_schedule, present_node
 from vnet.runtime.programs import Programs, imports_noted, load_programs
 from vnet.runtime.ready_queue import CpuMeter
@@ -419,7 +419,9 @@ class _Branched:
         return self.buffer
 
     def write(self, text: str) -> int:
-        """Write to the stream, and to the log of the node on whose behalf the present code runs."""
+        """Write to the stream, and to the log of the node on whose behalf the present code runs, if it lives."""
+        if is_discarding():
+            return len(text)
         written: int = self.stream.write(text)
         self.keep(text)
         return written
@@ -454,6 +456,8 @@ class _BranchedBytes(io.BufferedIOBase):
     def write(self, data: Any) -> int:
         """Write bytes; the log has them as text."""
         content = bytes(data)
+        if is_discarding():
+            return len(content)
         self.flush()  # what was written as text before
         self._text.stream.buffer.write(content)
         self._text.keep(content.decode(errors="replace"))

@@ -741,10 +741,13 @@ _discarding: int | None = None
 """The thread in which what was killed is discarded."""
 
 
+def is_discarding() -> bool:
+    """Return whether code of the present thread is that of a killed program."""
+    return _discarding == get_ident()
+
+
 def _refuse_changes(event: str, arguments: tuple[Any, ...]) -> None:
-    if _discarding == get_ident() and (
-        event in CHANGES or (event == "open" and arguments[2] & (os.O_ACCMODE | os.O_CREAT))
-    ):
+    if is_discarding() and (event in CHANGES or (event == "open" and arguments[2] & (os.O_ACCMODE | os.O_CREAT))):
         raise ProcessEndedError(f"{event}: the program has been killed")
 
 

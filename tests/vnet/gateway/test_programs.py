@@ -791,6 +791,31 @@ def test_ids_texts_and_refusals_are_those_of_zenoh(drive: Drive) -> None:
     ]
 
 
+def test_a_session_tells_none_that_a_token_is_new_which_it_has_told_one_of_its_subscribers(drive: Drive) -> None:
+    """As Zenoh 1.10 does, with which these programs were compared."""
+    token = """
+        import time, zenoh
+        session = zenoh.open(zenoh.Config())
+        time.sleep({})
+        token = session.liveliness().declare_token("t/a")
+        time.sleep(0.3)
+        token.undeclare()
+        """
+    watch = """
+        import time, zenoh
+        session = zenoh.open(zenoh.Config())
+        time.sleep(0.2)
+        declare = session.liveliness().declare_subscriber
+        held = [declare("t/*", lambda sample, name=name: print(name, str(sample.kind)[11:]), history=name == "all")
+                for name in {}]
+        time.sleep(0.8)
+        """
+    run = drive(token.format(0.1), token.format(0.3), watch.format(["all", "new"]), duration_s=3.0)
+    assert printed(run) == ["all PUT", "all DELETE", "new DELETE"]
+    run = drive(token.format(0.1), token.format(0.3), watch.format(["new"]), duration_s=3.0)
+    assert printed(run) == ["new PUT", "new DELETE"]
+
+
 def test_a_session_undeclares_what_it_has_declared_which_then_shows_nothing(drive: Drive) -> None:
     """As Zenoh 1.10 does, with which this program was compared."""
     run = drive("""

@@ -3,10 +3,12 @@
 import datetime
 import re
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
@@ -502,6 +504,43 @@ def test_kill_pause_and_restart_of_a_vehicle(drive: Drive) -> None:
     times = [float(found[1]) for line in log(run) if (found := re.match(r"main (\S+)", line))]
     assert times == [0.0, 0.5, 1.7, 2.2, 3.4, 3.9, 4.5]
     assert log(run).count("never") == 2, "as by SIGTERM, which Python does not handle; the run's end is its own"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("begin", ["asyncio.run(wait())", "wait_in_thread()"])
+def test_nothing_of_a_killed_program_is_done_afterwards(tmp_path: Path, begin: str) -> None:
+    text = f"""
+        import asyncio, os, time
+
+        def over():
+            print("never", flush=True)
+            os.mkdir("never")
+
+        async def wait():
+            try:
+                await asyncio.sleep(9)
+            finally:
+                over()
+
+        def wait_in_thread():
+            try:
+                time.sleep(9)
+            finally:
+                over()
+
+        {begin}
+        """
+    (tmp_path / "program.py").write_text(dedent(text))
+    (tmp_path / "killed.toml").write_text("""
+        run = { duration_s = 1.0, settle_s = 0.0 }
+        network.vehicles = 1
+        program = { kind = "zenoh", command = ["python", "program.py"] }
+        fault = [{ kind = "kill", at_s = 0.7, duration_s = 9.0, nodes = ["v01"] }]
+        """)
+    command = [sys.executable, "-m", "emulator", "simulate", "killed.toml"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 3, done.stderr
+    assert "never" not in done.stdout + done.stderr and not (tmp_path / "never").exists()
 
 
 def test_clock_error_of_a_vehicle_is_that_of_its_program(drive: Drive) -> None:

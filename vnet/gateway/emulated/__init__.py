@@ -172,6 +172,8 @@ async def run_program(vehicle: Vehicle, words: Sequence[str], environment: Mappi
             modules.threads.stop_where_they_are()
             for session in modules.sessions:
                 session.discard()
+        if isinstance(sys.exception(), GeneratorExit):
+            modules.threads.close_tasks()
         if not modules.has_session and not isinstance(sys.exception(), Exception):
             vehicle.node.log(f"{' '.join(words)} has opened no Zenoh session", "warning")
         modules.close()

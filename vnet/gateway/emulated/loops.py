@@ -14,6 +14,7 @@ from greenlet import GreenletExit
 
 from vnet.gateway.emulated.strands import Lock, Threads, fail
 from vnet.node import Node
+from vnet.runtime.asyncio_internals import abandon_pending, close_abandoned
 from vnet.runtime.outside_loop import collector
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.units import NS_PER_S
@@ -48,9 +49,19 @@ def prepare_asyncio(module: Any, node: Node, threads: Threads, set_handler: Call
     By address, which is Python's way, the order of a set of them would be another in each run.
     """
 
+    loops: list[Any] = []
+
+    def close_tasks() -> None:
+        for loop in loops:
+            for task in abandon_pending([*module.all_tasks(loop)]):
+                close_abandoned(task)
+
+    threads.close_tasks = close_tasks
+
     class Loop(module.BaseEventLoop):  # type: ignore[misc]
         def __init__(self, selector: object = None) -> None:
             super().__init__()
+            loops.append(self)
             self._selector = _Selector()
             self._write_to_self = self._selector.wake
 

@@ -437,6 +437,8 @@ class Threads:
         self._main_task: asyncio.Task[Any] | None = None
         self.on_interrupt: Callable[[], object] = lambda: None
         """Does what `_thread.interrupt_main` does."""
+        self.close_tasks: Callable[[], object] = lambda: None
+        """Closes what the program's loops of asyncio have left; Python would run its `finally` at any time."""
 
     async def run_main(self, run: Callable[[], Any]) -> None:
         """Run the main thread."""

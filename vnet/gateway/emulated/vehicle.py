@@ -265,9 +265,11 @@ class Vehicle(RadioSide[Asking]):
         text = str(key)
         if not alive and text in map(str, self.tokens(key)):
             return  # another of its name is there
-        for watcher in self._entities["watcher"]:
-            is_news = text not in watcher.told if alive else not watcher.session.is_closed()
-            if is_news and watcher.key.intersects(key):
+        watchers = [watcher for watcher in self._entities["watcher"] if watcher.key.intersects(key)]
+        # A session that has told one of its subscribers tells none that the token is new.
+        knowing = {watcher.session for watcher in watchers if text in watcher.told}
+        for watcher in watchers:
+            if watcher.session not in knowing if alive else not watcher.session.is_closed():
                 (watcher.told.add if alive else watcher.told.discard)(text)
                 watcher.arrive(token_sample(key, alive))
 
