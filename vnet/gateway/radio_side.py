@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import count
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 import zenoh
@@ -69,6 +69,10 @@ class RadioSide(ABC, Generic[Q]):
         if key.startswith(OWN_KEYS) or (self._ros2 is not None and not self._ros2.crosses(key)):
             return False
         return any(each.intersects(key) for each in self._expressions)
+
+    def crosses_in(self, reply: Any) -> bool:
+        """Return whether a reply to a query of another vehicle crosses; one to `**` may have any key."""
+        return reply.ok is None or self.crosses(str(reply.ok.key_expr))
 
     def show_fix(self, fix: Fix) -> None:
         """Put a fix of the vehicle's receiver at its programs."""

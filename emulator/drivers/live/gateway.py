@@ -14,6 +14,7 @@ import ssl
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -97,10 +98,10 @@ class Gateway(RadioSide[zenoh.Query]):
         session = open_local_router(listen, self._router_settings())
         self._session = session
         endpoint = router_endpoint(session)
-        for key in self._keys:
+        for number, key in enumerate(self._keys):
             session.declare_subscriber(key, self._telling(self._put), allowed_origin=REMOTE)
             # Clients of ROS 2's services ask none but complete queryables.
-            is_complete, asked = self._ros2 is not None, self._telling(self._asked)
+            is_complete, asked = self._ros2 is not None, self._telling(partial(self._asked, number))
             session.declare_queryable(key, asked, complete=is_complete, allowed_origin=REMOTE)
             watch = session.liveliness().declare_subscriber(key, self._telling(self._token), history=True)
             self._watches.append(watch)
@@ -147,8 +148,10 @@ class Gateway(RadioSide[zenoh.Query]):
             _keep_publisher(sample)
             self._tell("message", crossing_sample(sample, stamp))
 
-    def _asked(self, query: zenoh.Query) -> None:
-        if self.crosses(str(query.key_expr)):
+    def _asked(self, number: int, query: zenoh.Query) -> None:
+        """Take a query that the expression of this number matches; Zenoh asks each, and the first takes it."""
+        is_first = not any(each.intersects(query.key_expr) for each in self._expressions[:number])
+        if is_first and self.crosses(str(query.key_expr)):
             self._tell("query", query)
         else:
             query.drop()  # type: ignore[no-untyped-call]
@@ -255,8 +258,9 @@ class Gateway(RadioSide[zenoh.Query]):
         assert self._session is not None
 
         def answered(reply: zenoh.Reply) -> None:
-            _keep_publisher(reply.ok)
-            self._tell("message", crossing_reply(asker, query, reply))
+            if self.crosses_in(reply):
+                _keep_publisher(reply.ok)
+                self._tell("message", crossing_reply(asker, query, reply))
 
         self._session.get(
             query.selector,

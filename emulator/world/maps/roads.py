@@ -35,7 +35,7 @@ _ONE_WAY_CLASSES = {"motorway", "motorway_link"}
 """Classes whose ways are one-way unless tagged otherwise."""
 _ROUND = {"roundabout", "circular"}
 """Values of `junction` whose ways are one-way unless tagged otherwise."""
-_WIDTH = re.compile(r"(\d{1,4}(?:\.\d{1,9})?)\s*m?")
+_WIDTH = re.compile(r"(\d{1,4}(?:\.\d{1,9})?)\s*(m|ft|'(?:(\d{1,2})\")?)?")
 MAX_POINTS = 5_000_000
 """Most points of a map: ten times those of a large city."""
 MIN_HALF_WIDTH_M = 0.3
@@ -106,10 +106,16 @@ def street(tags: Mapping[str, str]) -> Street | None:
         return None
     lanes, is_reversed = _lanes(tags, name)
     lane_width_m = float(LANE_WIDTH_M[kind])
-    width = _WIDTH.fullmatch(tags.get("width", ""))
-    if width and MIN_LANE_WIDTH_M <= float(width[1]) / sum(lanes) <= MAX_LANE_WIDTH_M:
-        lane_width_m = float(width[1]) / sum(lanes)
+    if MIN_LANE_WIDTH_M <= (width_m := _width_m(tags.get("width", "")) / sum(lanes)) <= MAX_LANE_WIDTH_M:
+        lane_width_m = width_m
     return Street(kind, lanes, lane_width_m, is_reversed)
+
+
+def _width_m(text: str) -> float:
+    """Return a width in metres, or in feet and inches as `26'` and `16'3"`; 0 if it is none."""
+    if (found := _WIDTH.fullmatch(text)) is None:
+        return 0.0
+    return float(found[1]) if found[2] in (None, "m") else 0.3048 * (float(found[1]) + int(found[3] or 0) / 12)
 
 
 def _closed_to_cars(tags: Mapping[str, str]) -> bool:
@@ -125,7 +131,9 @@ def _lanes(tags: Mapping[str, str], name: str) -> tuple[tuple[int, int], bool]:
     one_way = tags.get("oneway", "yes" if is_one_way else "no")
     usual, total = CLASSES[name].lanes, _count(tags.get("lanes"))
     if one_way in ("yes", "true", "1", "-1", "reverse"):
-        return (total or usual, 0), one_way in ("-1", "reverse")
+        is_reversed = one_way in ("-1", "reverse")
+        total = total or _count(tags.get("lanes:backward" if is_reversed else "lanes:forward"))
+        return (total or usual, 0), is_reversed
     forward, backward = _count(tags.get("lanes:forward")), _count(tags.get("lanes:backward"))
     if total:
         forward = forward or (max(1, total - backward) if backward else max(1, (total + 1) // 2))

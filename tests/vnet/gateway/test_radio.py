@@ -179,6 +179,25 @@ def test_keys_keep_samples_inside_and_sessions_of_a_vehicle_talk_past_the_radio(
     assert len(run.trace) == 1
 
 
+def test_replies_of_keys_that_stay_inside_do_not_cross(drive: Drive) -> None:
+    text = """
+    import sys, time, zenoh
+    session = zenoh.open(zenoh.Config())
+    def reply(query):
+        for key in ("vnet/fix", "lidar/points", "car/a", "other/b"):
+            query.reply(key, b"x")
+    if sys.argv[1] == "v02":
+        session.declare_queryable("**", reply)
+        time.sleep(2)
+    else:
+        time.sleep(0.5)
+        for answer in session.get("**", consolidation=zenoh.ConsolidationMode.NONE):
+            print(answer.ok.key_expr if answer.ok else "error")
+    """
+    run = drive(text, vehicles=2, radio={"keys": ["car/**", "other/*"]})
+    assert log(run)[:2] == ["car/a", "other/b"] and len(run.trace) == 3
+
+
 def test_queries_replies_and_errors_cross_the_radio(drive: Drive) -> None:
     text = """
         import sys, time, zenoh

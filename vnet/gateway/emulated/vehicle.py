@@ -229,7 +229,8 @@ class Vehicle(RadioSide[Asking]):
         """Ask the sessions of this vehicle on behalf of another, and send their replies by radio."""
 
         def reply(reply: Reply) -> None:
-            self._send(crossing_reply(asker, query, reply))
+            if self.crosses_in(reply):
+                self._send(crossing_reply(asker, query, reply))
 
         asking = Asking(
             zenoh.Selector(query.selector),

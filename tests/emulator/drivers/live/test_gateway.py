@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -273,6 +274,23 @@ async def test_a_query_is_answered_by_the_programs_of_another_vehicle_with_sampl
     answers = await asyncio.to_thread(lambda: list(sessions[0].get("service?fails=1")))
     assert answers[0].err is not None and answers[0].err.payload.to_bytes() == b"no"
     assert len(vehicles[0].frames) == len(vehicles[1].frames) == 2
+
+
+@two_vehicles(keys=("car/**", "other/*"))
+async def test_a_query_of_several_radio_keys_is_sent_once_and_replies_of_other_keys_stay_inside(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            for key in (FIX_KEY, "lidar/points", "car/a", "other/b"):
+                query.reply(key, b"x")
+
+    sessions[1].declare_queryable("**", reply)
+    listen(sessions[1], "other")
+    ask = partial(sessions[0].get, "**", consolidation=zenoh.ConsolidationMode.NONE)
+    answers = await asyncio.to_thread(lambda: [*ask()])
+    assert [str(answer.ok.key_expr) for answer in answers if answer.ok] == ["car/a", "other/b"]
+    assert (len(vehicles[0].frames), len(vehicles[1].frames)) == (1, 2)
 
 
 @two_vehicles()

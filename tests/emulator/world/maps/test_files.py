@@ -100,6 +100,8 @@ def one_way_road(folder: Path, **tags: str) -> Roads:
         ({"highway": "primary", "lanes:forward": "3"}, (3, 1)),
         ({"highway": "primary", "lanes": "3", "oneway": "yes"}, (3, 0)),
         ({"highway": "primary", "lanes": "many", "oneway": "true"}, (1, 0)),
+        ({"highway": "primary", "lanes:forward": "2", "oneway": "yes"}, (2, 0)),
+        ({"highway": "primary", "lanes:forward": "3", "lanes:backward": "2", "oneway": "-1"}, (2, 0)),
         ({"highway": "primary", "lanes": "99999999999999999999"}, (1, 1)),
         ({"highway": "service", "access": "private"}, (1, 1)),
         ({"highway": "primary", "access": "no", "motorcar": "yes"}, (1, 1)),
@@ -118,7 +120,15 @@ def test_a_way_against_its_direction_is_turned_round(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("tags", "width_m"),
-    [({"width": "8"}, 4.0), ({"width": "6.5 m"}, 3.25), ({"width": "narrow"}, 3.5), ({"width": "900"}, 3.5)],
+    [
+        ({"width": "8"}, 4.0),
+        ({"width": "6.5 m"}, 3.25),
+        ({"width": "narrow"}, 3.5),
+        ({"width": "900"}, 3.5),
+        ({"width": "26'"}, 3.9624),
+        ({"width": "16'3\""}, 2.4765),
+        ({"width": "20 ft"}, 3.048),
+    ],
 )
 def test_a_width_is_that_of_all_lanes(tmp_path: Path, tags: dict[str, str], width_m: float) -> None:
     assert one_way_road(tmp_path, highway="primary", **tags).lane_width_m.tolist() == [width_m]
