@@ -41,6 +41,7 @@ class NodeClocks:
             if error.is_wrong:
                 self._errors[error.node] = error
         loop.clock_error_of = self._error_of_task if self._errors else lambda: None
+        loop.clock_errors_of = lambda node: self._past.get(node, ())
 
     def _error_of_task(self) -> ClockError | None:
         node = present_node()

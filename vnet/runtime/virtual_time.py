@@ -17,7 +17,7 @@ import gc
 import os
 import selectors
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from concurrent.futures import Future as Job
 from contextvars import Context, copy_context
@@ -80,6 +80,8 @@ class SkewedLoop(asyncio.SelectorEventLoop):
     """
 
     clock_error_of: Callable[[], ClockError | None] = staticmethod(lambda: None)
+    clock_errors_of: Callable[[str], Sequence[ClockError]] = staticmethod(lambda node: ())
+    """Called with a node; returns all errors that its clock has had, each until the next."""
     on_failed: Callable[[asyncio.Future[Any]], None] = staticmethod(lambda future: None)
     """Called when a future, which is no task, is given an exception."""
     on_unhandled: Callable[[dict[str, Any]], bool] = staticmethod(lambda context: True)
@@ -113,6 +115,14 @@ class SkewedLoop(asyncio.SelectorEventLoop):
             return self.own_time()
         now_ns = self.now_ns
         return self.own_time() + (clock_error.shown_ns(now_ns) - now_ns) / NS_PER_S
+
+    def steady_ns(self, node: str, since_ns: int) -> int:
+        """Return what a clock of `node` shows that was right at `since_ns`: it drifts, and nobody sets it."""
+        now_ns, errors = self.now_ns, self.clock_errors_of(node)
+        shown_ns, ends_ns = now_ns, [*(error.since_ns for error in errors[1:]), now_ns]
+        for error, end_ns in zip(errors, ends_ns, strict=False):
+            shown_ns += round(error.rate * max(end_ns - max(error.since_ns, since_ns), 0))
+        return shown_ns
 
     def own_time(self) -> float:
         """Seconds on the loop's own clock."""

@@ -544,9 +544,26 @@ def test_nothing_of_a_killed_program_is_done_afterwards(tmp_path: Path, begin: s
 
 
 def test_clock_error_of_a_vehicle_is_that_of_its_program(drive: Drive) -> None:
-    faults = [{"kind": "skew", "at_s": 0.0, "duration_s": 1.0, "nodes": ["v01"], "offset_ms": 250.0}]
-    run = drive("import time\ntime.sleep(0.5)\nprint(round(time.time() % 100, 3))", fault=faults)
-    assert log(run)[0] == "0.75"
+    """A skew sets the time of day alone, a drift is that of all clocks and waits."""
+    text = """
+    import asyncio, time
+    def show(name):
+        print(name, round(time.time() % 100, 3), round(time.monotonic(), 3))
+    async def main():
+        for seconds in (0.5, 2.0, 2.5):
+            asyncio.get_running_loop().call_later(seconds, show, seconds)
+        await asyncio.sleep(3.0)
+    show("begin")
+    asyncio.run(main())
+    time.sleep(1.0)
+    show("end")
+    """
+    faults = [
+        {"kind": "skew", "at_s": 0.2, "duration_s": 1.0, "nodes": ["v01"], "offset_ms": 250.0},
+        {"kind": "drift", "at_s": 2.0, "duration_s": 4.0, "nodes": ["v01"], "rate_ppm": 100_000},
+    ]
+    run = drive(text, duration_s=5.0, fault=faults)
+    assert printed(run) == ["begin 0.0 0.0", "0.5 0.75 0.5", "2.0 2.0 2.0", "2.5 2.5 2.5", "end 4.0 4.0"]
 
 
 def test_a_program_that_waits_busily_comes_to_its_time(drive: Drive) -> None:

@@ -13,7 +13,6 @@ from typing import Any
 from greenlet import GreenletExit
 
 from vnet.gateway.emulated.strands import Lock, Threads, fail
-from vnet.node import Node
 from vnet.runtime.asyncio_internals import abandon_pending, close_abandoned
 from vnet.runtime.outside_loop import collector
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -43,7 +42,9 @@ class _Selector:
         self._news.release_if_locked()
 
 
-def prepare_asyncio(module: Any, node: Node, threads: Threads, set_handler: Callable[[int, Any], Any]) -> None:
+def prepare_asyncio(
+    module: Any, steady_ns: Callable[[], int], threads: Threads, set_handler: Callable[[int, Any], Any]
+) -> None:
     """Have the loops of a program's `asyncio` wait on emulated time, and its futures hash by number.
 
     By address, which is Python's way, the order of a set of them would be another in each run.
@@ -66,7 +67,7 @@ def prepare_asyncio(module: Any, node: Node, threads: Threads, set_handler: Call
             self._write_to_self = self._selector.wake
 
         def time(self) -> float:
-            return node.now_ns / NS_PER_S
+            return steady_ns() / NS_PER_S
 
         def _process_events(self, events: object) -> None:
             pass

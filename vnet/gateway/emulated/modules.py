@@ -7,6 +7,7 @@ program, and so are the modules of the standard library that block: they import 
 
 from __future__ import annotations
 
+import asyncio
 import builtins
 import ctypes
 import gc
@@ -23,7 +24,6 @@ import subprocess
 import sys
 import time
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextvars import ContextVar
 from copy import copy
@@ -44,6 +44,7 @@ from vnet.gateway.emulated.shown import facade, hide, import_shared, show
 from vnet.gateway.emulated.strands import Threads, fail, look, set_generator_hooks, sleep
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Numbered
+from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.units import NS_PER_S
 
 ENDPOINT = "tcp/127.0.0.1:1"
@@ -249,6 +250,10 @@ class ProgramModules:
 
     def __init__(self, node: Node, environment: Mapping[str, str]) -> None:
         self.node = node
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualTimeLoop)
+        self.steady_ns = partial(loop.steady_ns, node.id, loop.now_ns)
+        """Returns nanoseconds on the clock that nobody sets: a skew does not move it."""
         self.threads = Threads()
         self.process = OwnProcess(self.threads)
         self.threads.on_interrupt = partial(self.process.send, signal.SIGINT)
@@ -287,7 +292,9 @@ class ProgramModules:
             "multiprocessing": self._multiprocessing,
         }
         self._preparations: dict[str, Callable[[Any], None]] = {
-            "asyncio": lambda module: prepare_asyncio(module, node, self.threads, self.process.set_handler),
+            "asyncio": lambda module: prepare_asyncio(
+                module, self.steady_ns, self.threads, self.process.set_handler
+            ),
             "concurrent.futures": self._prepare_futures,
             "multiprocessing.pool": self._prepare_pools,
             "multiprocessing.util": _prepare_finalizers,
@@ -553,26 +560,25 @@ class ProgramModules:
     def _time(self) -> ModuleType:
         node = self.node
 
-        def ns(start_ns: int = 0) -> int:
+        def ns(clock: int = time.CLOCK_REALTIME) -> int:
             look()
-            return start_ns + node.now_ns
+            return EPOCH_NS + node.now_ns if clock == time.CLOCK_REALTIME else self.steady_ns()
 
-        def seconds(start_ns: int = 0) -> float:
-            return ns(start_ns) / NS_PER_S
+        def seconds(clock: int = time.CLOCK_REALTIME) -> float:
+            return ns(clock) / NS_PER_S
 
         def utc(at: float | None = None) -> time.struct_time:
-            return time.gmtime(seconds(EPOCH_NS) if at is None else at)
+            return time.gmtime(seconds() if at is None else at)
 
-        starts_ns = defaultdict(int, {time.CLOCK_REALTIME: EPOCH_NS})
         own: dict[str, Any] = {
-            "time": partial(seconds, EPOCH_NS),
-            "time_ns": partial(ns, EPOCH_NS),
-            **dict.fromkeys(["monotonic", "perf_counter"], seconds),
-            **dict.fromkeys(["monotonic_ns", "perf_counter_ns"], ns),
+            "time": lambda: seconds(),
+            "time_ns": lambda: ns(),
+            **dict.fromkeys(["monotonic", "perf_counter"], partial(seconds, time.CLOCK_MONOTONIC)),
+            **dict.fromkeys(["monotonic_ns", "perf_counter_ns"], partial(ns, time.CLOCK_MONOTONIC)),
             **dict.fromkeys(["process_time", "thread_time"], lambda: 0.0),  # computing costs no emulated time
             **dict.fromkeys(["process_time_ns", "thread_time_ns"], lambda: 0),
-            "clock_gettime": lambda clock: seconds(starts_ns[clock]),
-            "clock_gettime_ns": lambda clock: ns(starts_ns[clock]),
+            "clock_gettime": lambda clock: seconds(clock),
+            "clock_gettime_ns": lambda clock: ns(clock),
             "sleep": sleep,
             **dict.fromkeys(["gmtime", "localtime"], utc),
             "ctime": lambda at=None: time.asctime(utc(at)),
