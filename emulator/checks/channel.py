@@ -19,7 +19,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.radio.own_rules import LONGEST_DELAY_S, MOST_COPIES
 from emulator.records.distributions import binomial_interval
 from emulator.records.events import EventKind
-from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, RecordedRun
+from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, NO_FAULT, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, not_exercised, result, unknown
 from emulator.scenario.faults import (
     Custom,
@@ -568,7 +568,8 @@ def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arr
                     least += np.where(recorded.surely_reaches(planned), least_ms, 0)
                 most += np.where(recorded.may_reach(planned), most_ms, 0)
             case Custom():
-                later = np.where(recorded.may_reach(planned), LONGEST_DELAY_S * NS_PER_S / NS_PER_MS, 0)
+                mine = recorded.may_reach(planned) & (recorded.cause != NO_FAULT)  # what it delays names a fault
+                later = np.where(mine, LONGEST_DELAY_S * NS_PER_S / NS_PER_MS, 0)
                 most += later * np.where(received_twice(recorded), 1 + MOST_COPIES, 1)
             case Duplicate(delay_ms=delay_ms, copies=copies):
                 mine = (recorded.cause == planned.number) & (recorded.copy > 0)

@@ -76,7 +76,7 @@ class Outcome(IntEnum):
 
     # fmt: off
     pending = 0, None, "", "", "it is in flight; no finished trace has it"
-    delivered = 1, ARRIVAL, "green", "█", "it arrived, at `arrival_ns`"
+    delivered = 1, ARRIVAL, "green", "█", "it arrived, at `arrival_ns`; after the run's end nobody hears it"
     out_of_range = (
         2, None, "", "", "counted in `verdict.json`, and has no row, but for a frame to this vehicle alone")
     peer_cap = (

@@ -164,7 +164,7 @@ STATES = Table(
                               "nobody knows"),
         "fix_m": Column(POINT, "what the receiver gave; NaN in an outage"),
         "common_error_m": Column(POINT, "truth: the error that all receivers share"),
-        "estimate_m": Column(POINT, "the position that the vehicle reported last in this period; null if it "
+        "estimate_m": Column(POINT, "the position in the vehicle's last report of this period; null if it "
                              "reported none", True),
         "covariance_m2": Column(MATRIX, "of `estimate_m`, as it reported: a 2 × 2 matrix by rows", True),
         "values": Column(pa.map_(TEXT, pa.list_(FLOAT)), "what it reported besides and has no column, by name: "

@@ -74,9 +74,15 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
         import osmium
 
         file = osmium.FileProcessor(path).with_locations().with_filter(osmium.filter.KeyFilter("highway"))
+        versions: dict[int, int] = {}
         for entity in file:
             if isinstance(entity, osmium.osm.Way):
-                _add_way(path, builder, entity)
+                if versions.setdefault(entity.id, entity.version) != entity.version:
+                    raise ScenarioError(f"{path}: way {entity.id} is there in two versions: no map of one day")
+                if entity.deleted:
+                    builder.note("deleted ways")
+                else:
+                    _add_way(path, builder, entity)
     if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
         raise ScenarioError(
             f"{path}: it lacks the nodes of its {clipped} ways; nodes come before ways, with ids above 0"
@@ -91,6 +97,9 @@ def osm_errors(path: Path) -> Iterator[None]:
     import osmium
 
     try:
+        # Of objects that JOSM's user has deleted pyosmium does not tell.
+        if path.suffix == ".osm" and (line := _line_of(path, "delete", " action=")):
+            raise ScenarioError(f"{path}: {line}deleted in JOSM: upload it there, or purge it, before saving")
         yield
     except osmium.InvalidLocationError as error:
         value = str(error).partition("'")[2].removesuffix("'")
@@ -99,12 +108,12 @@ def osm_errors(path: Path) -> Iterator[None]:
         raise ScenarioError(f"{path}: not an OpenStreetMap file: {printable(str(error), 300)}") from None
 
 
-def _line_of(path: Path, value: str) -> str:
+def _line_of(path: Path, value: str, before: str = "") -> str:
     """Return `line N: ` of a quoted value in an XML file, or nothing: pyosmium gives lines only for bad XML."""
-    quoted, line = value.encode(), 1
+    forms, line = [f"{before}{quote}{value}{quote}".encode() for quote in ("'", '"')], 1
     with path.open("rb") as file:
         while part := file.readline(_LONGEST_LINE):
-            if b'"' + quoted + b'"' in part or b"'" + quoted + b"'" in part:
+            if any(form in part for form in forms):
                 return f"line {line}: "
             line += part.endswith(b"\n")
     return ""
@@ -272,7 +281,7 @@ def _read_osm(path: Path) -> list[Rings]:
 
         tagged = osmium.filter.KeyFilter("building")
         for entity in osmium.FileProcessor(path).with_areas(tagged).with_filter(tagged):
-            if not isinstance(entity, osmium.osm.Area) or entity.tags["building"] == "no":
+            if not isinstance(entity, osmium.osm.Area) or entity.deleted or entity.tags["building"] == "no":
                 continue
             rings = [
                 np.array([(node.lon, node.lat) for node in ring][:-1])

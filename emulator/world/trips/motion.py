@@ -323,7 +323,7 @@ def _fresh(trip: Trip, rules: Rules) -> Rows:
 def _without_jumps(trip: Trip, rows: Rows, rules: Rules) -> NDArray[np.bool_]:
     """Return the mask of the rows that belong to the largest set in which no step is a jump.
 
-    Raise ImpossibleTripError if too many are.
+    Raise ImpossibleTripError if too many are, or no step is left.
 
     Between two jumps there is a run of samples. A chain leaves a run at its end, or a few samples before, and
     continues in a later run, at its first sample that can be reached or lies after a long gap. The chain with the
@@ -351,6 +351,8 @@ def _without_jumps(trip: Trip, rows: Rows, rules: Rules) -> NDArray[np.bool_]:
     while best.before is not None:
         kept[best.before.entry : best.left + 1] = True
         best = best.before
+    if too_fast and kept.sum() == 1:
+        raise ImpossibleTripError(trip.node_id, too_fast, len(rows) - 1, rules.fastest_mps)
     return kept
 
 

@@ -185,6 +185,14 @@ def test_rules_beside_all_other_faults_leave_the_run_valid(
     assert effect.verdict is Verdict.VALID
 
 
+def test_a_delay_shows_beside_a_rule_that_delays_nothing(tmp_path: Path) -> None:
+    delay = {"kind": "delay", "delay_ms": 40, "at_s": 0.2, "duration_s": 1.0}
+    rule = {"kind": "custom", "rule": "tests.support.rules:passes", "duration_s": 1.2}
+    recorded = run_scenario(tmp_path / "run", Scenario.model_validate({**DATA, "fault": [delay, rule]}))
+    (effect,) = [check for check in judge(recorded).checks if check.name == "effect:delay-0"]
+    assert effect.verdict is Verdict.VALID, effect.text
+
+
 def test_a_test_gives_a_rule_as_a_function_and_its_run_can_be_reproduced(tmp_path: Path) -> None:
     async def run() -> str:
         async with RunHarness(Scenario.model_validate(DATA), tmp_path / "run") as emu:

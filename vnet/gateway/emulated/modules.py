@@ -341,6 +341,8 @@ class ProgramModules:
             if hook is not sys.excepthook:
                 hook(type(error), error, error.__traceback__)
             self._leave()
+            if isinstance(error, StopIteration):  # which no coroutine can pass on
+                raise RuntimeError("StopIteration").with_traceback(error.__traceback__) from None
             raise
         self.load("threading")._shutdown()
         if leave is None or leave.code in (None, 0):  # a failure ends it at once, as in real time

@@ -49,7 +49,7 @@ from vnet.gateway.frames import (
 )
 from vnet.gateway.keys import FIX_KEY, REPORT_KEY
 from vnet.gateway.radio_side import RadioSide
-from vnet.gateway.ros2 import MOST_KEYS, Ros2
+from vnet.gateway.ros2 import MOST_KEYS, TOKENS, Ros2
 from vnet.node import Node
 from vnet.radio import Packet
 from vnet.runtime.own_asyncio import Task
@@ -83,7 +83,8 @@ class Vehicle(RadioSide[Asking]):
 
     def _crosses(self, key: str) -> bool:
         crosses = super()._crosses(key)
-        if not crosses and not self._is_verbatim_told and not key.startswith("@/"):  # which is Zenoh's own
+        # Zenoh's own keys are no user's, nor are tokens of ROS 2, which cross as their topics do.
+        if not crosses and not self._is_verbatim_told and not key.startswith(("@/", f"{TOKENS}/")):
             unmarked = f"/{key}".replace("/@", "/_")[1:]
             if unmarked != key and super()._crosses(unmarked):
                 self._is_verbatim_told = True

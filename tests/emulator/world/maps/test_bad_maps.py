@@ -116,6 +116,16 @@ def test_a_node_without_coordinates_is_as_one_that_is_missing(tmp_path: Path) ->
     assert roads.notes[CLIPPED] >= 1
 
 
+def test_a_deleted_way_is_no_road(tmp_path: Path) -> None:
+    text = maps.osm_xml({7: ((1, 2), {"highway": "primary"}), 8: ((2, 3), {"highway": "primary"})})
+    roads = read_roads(write(tmp_path, "town.osm", text.replace('<way id="8"', '<way id="8" visible="false"')))
+    assert roads.name == ("way 7",) and roads.notes["deleted ways"] == 1
+    joined = text.replace('<way id="8"', "<way id='8' action='delete'")
+    assert "deleted in JOSM" in refusal(write(tmp_path, "josm.osm", joined))
+    history = text.replace('<way id="8" version="1"', '<way id="7" version="2"')
+    assert refusal(write(tmp_path, "history.osm", history)) == "way 7 is there in two versions: no map of one day"
+
+
 def test_without_pyosmium_it_is_said_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "osmium", None)
     assert "pip install 'vnet-emulator[maps]'" in refusal(write(tmp_path, "town.osm", maps.osm_xml()))

@@ -122,6 +122,14 @@ def test_one_impossible_trip_is_left_out_and_told() -> None:
     assert course.notes == ("1 of 2 vehicles left out as impossible: b: 99 of 99 steps are faster than 70 m/s",)
 
 
+@pytest.mark.parametrize("samples", [2, 11])
+def test_a_trip_of_which_jumps_leave_nothing_is_told_however_short(samples: int) -> None:
+    time_s = np.arange(11.0)
+    course = drive(trip(time_s, 15 * time_s, name="a"), trip(time_s[:samples], 72 * time_s[:samples], name="b"))
+    steps = f"{samples - 1} of {samples - 1} steps are faster than 70 m/s"
+    assert course.notes == (f"1 of 2 vehicles left out as impossible: b: {steps}",)
+
+
 def test_impossible_trips_are_refused_if_wanted_or_if_most_are() -> None:
     time_s = np.arange(0, 10, 0.1)
     good, *wild = [trip(time_s, 15 * time_s), *(trip(time_s, 1000.0 * (np.arange(100) % 2), name=n) for n in "bcd")]
