@@ -18,7 +18,8 @@ names what is missing or different when a new version of Python changes it. What
 - `call_soon`, `call_soon_threadsafe` and tasks make their handles in `_call_soon`. What writes to the self-pipe
   wakes the selector. An async generator is told of to `_asyncgen_firstiter_hook` when it begins, and to
   `_asyncgen_finalizer_hook` when it is discarded before its end, which calls `call_soon_threadsafe`.
-- `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`.
+- `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`, `events._get_running_loop`
+  and `_set_running_loop`, `tasks._enter_task` and `_leave_task`.
 """
 
 from __future__ import annotations
@@ -121,20 +122,54 @@ def abandon_pending(tasks: Sequence[asyncio.Task[Any]]) -> list[asyncio.Task[Any
     return pending
 
 
-def close_abandoned(task: asyncio.Task[Any]) -> None:
-    """Close an abandoned task's coroutine, or what else it awaits as one, whose loop is closed, whatever it raises.
+def close_abandoned(task: asyncio.Task[Any], module: Any = asyncio) -> None:
+    """Close an abandoned task's coroutine, or what else it awaits as one, whatever it does in answer.
 
     Python would do so when it discards the coroutine, at any time, and print what it raises: a task group
-    cannot cancel its tasks any more.
+    cannot cancel its tasks any more. What it asks of its loop never comes; were it refused, one that catches all
+    exceptions in a loop of its own would go on for ever. `module` is the asyncio to which the task belongs.
     """
-    for _ in range(MOST_CLOSINGS):
-        try:
-            cast("Coroutine[Any, Any, Any]", task.get_coro()).close()
-            return
-        except KeyboardInterrupt:
-            raise
-        except BaseException:  # a task group raises a group of GeneratorExit
-            pass
+    loop, coroutine = task.get_loop(), cast("Coroutine[Any, Any, Any]", task.get_coro())
+    if loop.is_closed():
+        _grant_nothing(loop, module.events)
+    before = module.events._get_running_loop()
+    module.events._set_running_loop(loop)
+    is_idle = module.tasks.current_task(loop) is None
+    if is_idle:
+        module.tasks._enter_task(loop, task)
+    try:
+        for _ in range(MOST_CLOSINGS):
+            try:
+                coroutine.close()
+                return
+            except KeyboardInterrupt:
+                raise
+            except BaseException:  # a task group raises a group of GeneratorExit
+                pass
+        import ctypes  # seldom needed
+
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(coroutine))  # for ever: to discard it is to close it again
+    finally:
+        if is_idle:
+            module.tasks._leave_task(loop, task)
+        module.events._set_running_loop(before)
+
+
+def _grant_nothing(loop: Any, events: Any) -> None:
+    """Have a closed loop take callbacks, timers, tasks and jobs, of which none will run."""
+
+    def soon(callback: Any, *args: Any, context: Any = None) -> Any:
+        return events.Handle(callback, args, loop, context)
+
+    def later(when: float, callback: Any, *args: Any, context: Any = None) -> Any:
+        return events.TimerHandle(when, callback, args, loop, context)
+
+    def task(coroutine: Any, **options: Any) -> Any:
+        coroutine.close()
+        return loop.create_future()
+
+    loop.call_soon, loop.call_later, loop.call_at, loop.create_task = soon, later, later, task
+    loop.run_in_executor = lambda *job: loop.create_future()
 
 
 def is_unretrieved(future: asyncio.Future[Any]) -> bool:

@@ -601,6 +601,9 @@ class Host:
                     show(node.id)
                     for task in tasks:
                         asyncio_internals.close_abandoned(task)
+                show("")
+                self._killed.clear()
+                gc.collect()  # what else it has left, which Python would discard at any time
         for task in self._left:
             if (owner := self._tasks[task]) is not None:
                 show(owner.id)

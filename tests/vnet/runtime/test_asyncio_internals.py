@@ -266,6 +266,28 @@ def test_an_abandoned_task_is_closed_although_it_awaits_something_in_answer(loop
     assert ended == ["ended"]
 
 
+def test_an_abandoned_task_that_catches_all_in_a_loop_is_closed(loop: StandingLoop) -> None:
+    caught: list[str] = []
+
+    async def swallows() -> None:
+        while True:
+            try:
+                async with asyncio.timeout(9), asyncio.TaskGroup() as group:
+                    group.create_task(asyncio.sleep(9))
+                    await asyncio.sleep(9)
+            except BaseException as error:
+                caught.append(type(error).__name__)
+                assert len(caught) < 100
+
+    loop.create_task(swallows())
+    loop.round()
+    tasks = asyncio_internals.abandon_pending([*asyncio.all_tasks(loop)])
+    loop.close()
+    for task in tasks:
+        asyncio_internals.close_abandoned(task)
+    assert 0 < len(caught) < 100
+
+
 @pytest.mark.parametrize("begins", [False, True])
 def test_a_task_that_awaits_the_next_of_an_iterator_is_abandoned_as_others(
     loop: StandingLoop, begins: bool

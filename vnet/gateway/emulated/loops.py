@@ -55,7 +55,7 @@ def prepare_asyncio(
     def close_tasks() -> None:
         for loop in loops:
             for task in abandon_pending([*module.all_tasks(loop)]):
-                close_abandoned(task)
+                close_abandoned(task, module)
 
     threads.close_tasks = close_tasks
 
