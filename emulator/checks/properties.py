@@ -70,7 +70,9 @@ class Moment:
     def get(self, name: str, default: Any = None) -> Any:
         """Return a value, or the default where there is none: the property then asks of the moment all the same."""
         value = self.values.get(name)
-        return default if value is None or (isinstance(value, float) and math.isnan(value)) else value
+        numbers = value if isinstance(value, list) and value else [value]  # `fix_m` in an outage is two of NaN
+        is_missing = all(each is None or (isinstance(each, float) and math.isnan(each)) for each in numbers)
+        return default if is_missing else value
 
 
 Predicate = Callable[[Moment], bool | None]

@@ -18,8 +18,8 @@ names what is missing or different when a new version of Python changes it. What
 - `call_soon`, `call_soon_threadsafe` and tasks make their handles in `_call_soon`. What writes to the self-pipe
   wakes the selector. An async generator is told of to `_asyncgen_firstiter_hook` when it begins, and to
   `_asyncgen_finalizer_hook` when it is discarded before its end, which calls `call_soon_threadsafe`.
-- `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`, `events._get_running_loop`
-  and `_set_running_loop`, `tasks._enter_task` and `_leave_task`.
+- `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`, `_enter_task` and
+  `_leave_task` of `tasks`, `_get_running_loop` and `_set_running_loop` of `events`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Properties over time: always, never, eventually, leads to, over reported values, events and truth."""
 
 import asyncio
+import math
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -206,6 +207,11 @@ def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty:
     )
     assert always(faulty, "reports", lambda m: "dead" in m).verdict == "invalid"
     assert always(faulty, "typing error", lambda m: m["no_such"] <= 1).verdict == "unknown"
+
+
+def test_what_is_not_a_number_is_no_value() -> None:
+    moment = Moment(0, "v01", values={"fix_m": [math.nan, math.nan], "odd": [math.nan, 1.0], "none": []})
+    assert [name in moment for name in ("fix_m", "odd", "none", "speed")] == [False, True, True, False]
 
 
 @pytest.mark.slow
