@@ -259,15 +259,15 @@ class Node:
     ) -> None:
         """Report the present estimates: position (2,) in m, its covariance (2, 2) in m², and further values.
 
-        The last report of a period counts alone. Each further keyword is a number, a boolean, a text of at most 64
-        characters, or an array of numbers. All but arrays are figures of the run: a column of its states, a row of
-        its summary, a curve. A name that ends in a unit is shown with it, as `delay_ms`; one that ends in
-        `covariance_m2` is a covariance matrix (2, 2). `heard` is the number of packets received since the last
-        report, which is checked against the trace. A name is a Python identifier, with a dot and any printable text
-        behind it if need be (`delay_ms.v03`, of which 32 have a column). Raise ValueError for a wrong shape, for
-        another kind of value, for a covariance that is none (not finite, not symmetric, or not positive
-        semidefinite), for a name that is none or that vnet's own columns have, and for a text under a name that
-        this node has reported numbers by, or the reverse.
+        The last report of a period counts alone. Each further keyword is a number (kept as a 64-bit float), a
+        boolean, a text of at most 64 characters, or an array of numbers. All but arrays are figures of the run: a
+        column of its states, a row of its summary, a curve. A name that ends in a unit is shown with it, as
+        `delay_ms`; one that ends in `covariance_m2` is a covariance matrix (2, 2). `heard` is the number of packets
+        received since the last report, which is checked against the trace. A name is a Python identifier, with a
+        dot and any printable text behind it if need be (`delay_ms.v03`, of which 32 have a column). Raise
+        ValueError for a wrong shape, for another kind of value, for a covariance that is none (not finite, not
+        symmetric, or not positive semidefinite), for a name that is none or that vnet's own columns have, and for a
+        text under a name that this node has reported numbers by, or the reverse.
         """
         self._transport.send_report(self._reporter.report(self.now_ns, estimate_m, covariance_m2, values))
 
