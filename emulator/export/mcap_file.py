@@ -73,6 +73,7 @@ _FRAME = _object(
     payload={"type": "string", "contentEncoding": "base64"},
     cause=TEXT,
     outcomes={"type": "object", "additionalProperties": _list(TEXT)},
+    altered=_list(TEXT),
 )
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "/tf": ("foxglove.FrameTransforms", _object(transforms=_list(_TRANSFORM))),
@@ -271,12 +272,13 @@ def _frames(recorded: OpenedRun) -> Iterator[Message]:
     edges = np.flatnonzero(np.diff(recorded.emission[order])) + 1
     outcomes = recorded.trace["outcome"].cast(pa.string()).to_pylist()
     causes = recorded.trace["cause"].cast(pa.string()).to_pylist()
-    sizes = recorded.column("size_bytes")
+    sizes, altered = recorded.column("size_bytes"), recorded.caused_by("corrupt", "custom")
     for rows in np.split(order, edges) if len(order) else ():
         by_outcome: dict[str, list[str]] = {}
         for row in rows.tolist():
             by_outcome.setdefault(outcomes[row], []).append(recorded.node_ids[int(recorded.receiver[row])])
-        first = int(rows[0])
+        first = int(rows[np.argmin(altered[rows])])  # which shows what was sent, if any does
+        others = rows[recorded.digest[rows] != recorded.digest[first]].tolist()
         sender, seq = recorded.node_ids[int(recorded.sender[first])], int(recorded.seq[first])
         kept = recorded.payloads
         payload = None if kept is None else kept.of(sender, seq, recorded.digest[rows].tolist())
@@ -292,5 +294,6 @@ def _frames(recorded: OpenedRun) -> Iterator[Message]:
                 **({} if payload is None else {"payload": b64encode(payload).decode()}),
                 "cause": causes[first],
                 "outcomes": by_outcome,
+                "altered": [recorded.node_ids[int(recorded.receiver[row])] for row in others],
             },
         )

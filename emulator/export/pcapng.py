@@ -227,7 +227,9 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
 
 def _packets(recorded: RecordedRun) -> Iterator[_Packet]:
     """Yield all packets in the order of their times."""
-    sent = np.unique(recorded.emission, return_index=True)[1]
+    # Of the receptions of a frame one that shows what was sent: the first that no fault has altered.
+    rows = np.argsort(recorded.caused_by("corrupt", "custom"), kind="stable")
+    sent = rows[np.unique(recorded.emission[rows], return_index=True)[1]]
     # A frame that a fault duplicates at a receiver was sent only once.
     sent = sent[~(recorded.caused_by("duplicate") & (recorded.copy > 0))[sent]]
     delivered = np.flatnonzero(recorded.outcome_is("delivered"))

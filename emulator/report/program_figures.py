@@ -85,7 +85,8 @@ def points(time_s: Array, value: Array, usual: float) -> tuple[Array, Array]:
 
 def _fit(axes: Axes, value: Array) -> None:
     """Let the axis of values begin at zero, or below where values are negative."""
-    least, most = float(np.nanmin(value)), float(np.nanmax(value))
+    finite = value[np.isfinite(value)]
+    least, most = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     margin = 0.05 * (most - min(least, 0.0)) or 1.0
     axes.set_ylim(least - margin if least < 0 else 0, most + margin)
 

@@ -5,6 +5,7 @@ import io
 import json
 import shutil
 import struct
+from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typer.testing import CliRunner
 from emulator.export.mcap_file import SCHEMAS, write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import flat, measured_links, write_csv
+from emulator.radio.trace import payload_digest
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
 from emulator.world.radio_inputs import read_link_table
@@ -232,6 +234,34 @@ def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> 
     assert [m["kind"] for _, m in messages["/events"] if m["node"]] == ["entered", "left"]
     (attachment,) = reader.iter_attachments()
     assert attachment.name == "scenario.toml" and b"[network]" in attachment.data
+
+
+def test_a_frame_that_a_fault_alters_at_some_receivers_is_the_one_that_was_sent(tmp_path: Path) -> None:
+    data = {
+        "run": {"duration_s": 1.0, "settle_s": 0.1, "keep_payloads": True},
+        "network": {"vehicles": 5, "layout": "dense"},
+        "program": {"entry": "agents.beacon:main"},
+        "fault": [{"kind": "corrupt", "at_s": 0.2, "duration_s": 0.7, "probability": 0.5}],
+    }
+    run_scenario(tmp_path / "run", Scenario.model_validate(data))
+    recorded, mcap, capture = OpenedRun.open(tmp_path / "run"), io.BytesIO(), io.BytesIO()
+    altered = {(r["sender"], r["seq"], r["receiver"]) for r in recorded.trace.to_pylist() if r["cause"]}
+    write_mcap(recorded, mcap)
+    mcap.seek(0)
+    frames = [
+        json.loads(m.data) for _, channel, m in make_reader(mcap).iter_messages() if channel.topic == "/frames"
+    ]
+    sent = {(m["sender"], m["seq"]): m for m in frames if not m["cause"]}
+    for message in sent.values():
+        assert f"{payload_digest(b64decode(message['payload'])):016x}" == message["payload_digest"]
+    told = {(*frame, receiver) for frame, m in sent.items() for receiver in m["altered"]}
+    assert len(told) > 20 and told == {row for row in altered if row[:2] in sent}
+    write_pcapng(recorded, capture)
+    for packet in packets(capture.getvalue()):
+        sender, _, number = packet["comment"].split(";")[0].split(" ")
+        if packet["direction"] == 2 and (sender, int(number)) in sent:
+            assert sent[sender, int(number)]["payload_digest"] in packet["comment"]
+            assert "corrupt" not in packet["comment"]
 
 
 # CSV.

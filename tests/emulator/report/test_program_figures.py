@@ -24,6 +24,7 @@ async def talkative(node: Node) -> None:
             figures["seldom"] = seconds
         if seconds == 0.5:
             figures["once"] = number
+        figures["endless"] = float("inf") if seconds == 0.5 else seconds
         node.report(**figures, warned=seconds > 0.5, state="busy" if seconds > 0.5 else "idle")
 
 
@@ -40,7 +41,9 @@ def test_each_value_has_a_chart(source: Source) -> None:
     charts, missing = draw_charts(program_charts(source))
     found = {chart.title: chart for chart in charts}
     assert missing == {}
-    assert set(found) == {"load", "debt", "same", "late", "seldom", "warned", "state"}, "one point is no curve"
+    assert set(found) == {"load", "debt", "same", "late", "seldom", "endless", "warned", "state"}, (
+        "one point is no curve"
+    )
     assert "load (%)" in found["load"].svg and "5 to 95 %" in found["load"].caption
     assert "warned (%)" in found["warned"].svg and "say true" in found["warned"].caption
     assert "busy" in found["state"].svg and "idle" in found["state"].svg
