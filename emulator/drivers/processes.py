@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from emulator.drivers.emulation import ProcessActions
 from vnet.errors import VnetError
+from vnet.node import MOMENTS_OF_FAULTS
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 from vnet.transport.wire import SentMessage
@@ -80,6 +81,9 @@ def check_ownership(nodes: Sequence[str], *traffic: wire.Traffic, waiting: Seque
     for action in (action for each in traffic for action in each.actions):
         if not action.is_sound:
             raise ProtocolError(f"{action.node} asks for an acceleration that is no number")
+    for note in (note for each in traffic for note in each.notes):
+        if note.kind == "event" and note.text in MOMENTS_OF_FAULTS:
+            raise ProtocolError(f"{note.node} tells an event {note.text}, which is a name of vnet's own")
 
 
 def _told(traffic: wire.Traffic) -> Sequence[Sequence[Any]]:

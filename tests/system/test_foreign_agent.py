@@ -133,6 +133,7 @@ MISTAKES = {
     "SpeaksForOthers": "speaks for v02, which is not its own",
     "TimerInThePast": "its next timer, 0, lies before the end of its window",
     "StepsAfterItsWindow": "a step at 2000000, where 0 to 1999999 are allowed",
+    "ClaimsAFault": "tells an event fault_started, which is a name of vnet's own",
 }
 
 

@@ -28,8 +28,11 @@ SAID: dict[str, tuple[tuple[str, ...], Callable[[Fields], Fields]]] = {
 """The fields that go out in place of those of a message, by its type."""
 FORGED = {"covariance_m2": [-1.0, 0.0, 0.0, -1.0], "values": {"../../x": 1.0}}
 """A covariance that is none, under a name that is none, beside the foreign agent's own report."""
+CLAIMED = ["v07", 0, "event", "info", "fault_started", {}]
+"""An event of a name that is vnet's own."""
 TRAFFIC: dict[str, Callable[[Fields, Fields, Fields], Fields]] = {
     "SpeaksForOthers": lambda frames, *more: [[["v02", payload] for _, payload in frames], *more],
+    "ClaimsAFault": lambda *told: [*told[:3], [], [CLAIMED]],
     "SendsHundredMegabytes": lambda frames, *more: [[[node, bytes(100_000_000)] for node, _ in frames], *more],
     "ReportsNoCovariance": lambda frames, reports, endings: [frames, [each | FORGED for each in reports], endings],
 }
