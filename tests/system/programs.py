@@ -1,6 +1,7 @@
 """Vehicle programs that behave and misbehave, for whole runs: entries are `tests.system.programs:NAME`."""
 
 import asyncio
+import contextlib
 import hashlib
 import json
 import os
@@ -9,6 +10,7 @@ import signal
 import sys
 import time
 import zlib
+from collections.abc import AsyncGenerator
 from pathlib import Path
 
 import numpy as np
@@ -177,3 +179,19 @@ async def computes_for_ever(node: Node) -> None:
     await asyncio.sleep(0.5)
     while True:
         pass
+
+
+async def is_told_to_end_in_its_end(node: Node) -> None:
+    """Wait in a generator whose end waits, too: who closes it raises another error."""
+
+    async def ticks() -> AsyncGenerator[int, None]:
+        try:
+            while True:
+                await asyncio.sleep(0.1)
+                yield 1
+        finally:
+            await asyncio.sleep(0.1)
+
+    async with contextlib.aclosing(ticks()) as each:
+        async for _ in each:
+            await node.radio.broadcast(b"here")

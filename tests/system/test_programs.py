@@ -126,3 +126,10 @@ def test_on_the_wall_clock_frames_share_the_medium_too(tmp_path: Path) -> None:
     assert run.outcomes["delivered"] >= 30
     checks = {name: run.check(name)["verdict"] for name in ("conservation", "range", "fading", "medium", "latency")}
     assert set(checks.values()) == {"valid"}, checks
+
+
+@pytest.mark.parametrize("command", ["run", "simulate"])
+def test_a_program_that_errs_as_it_is_told_to_end_has_not_failed(vnet: Vnet, command: str) -> None:
+    done = run(vnet, command, "is_told_to_end_in_its_end")
+    assert done.status == 0, done.stdout
+    assert not [file for file in (done.folder / "logs").iterdir() if "exception" in file.read_text()]

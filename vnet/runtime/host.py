@@ -102,6 +102,8 @@ class Host:
         """Sends of finalizers of paused programs, to be called with the time at which the pause is over: in a
         process of its own the collector runs then."""
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
+        self._discards = False
+        """True while what is left of a program is closed."""
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
         self._left: list[asyncio.Task[Any]] = []
@@ -312,7 +314,7 @@ class Host:
             self._unhandled.settle(gone)
             self._unhandled.silence(gone)
             for task in asyncio_internals.abandon_pending(self._tasks_of(gone)):
-                self._context_of(gone).run(asyncio_internals.close_abandoned, task)
+                self._context_of(gone).run(self._discard, task)
             self._killed[gone] = asyncio_internals.abandon_pending(self._tasks_of(gone))
         self._stopped_ns.clear()
         self._hold()
@@ -600,15 +602,22 @@ class Host:
                 for node, tasks in self._killed.items():
                     show(node.id)
                     for task in tasks:
-                        asyncio_internals.close_abandoned(task)
+                        self._discard(task)
                 show("")
                 self._killed.clear()
                 gc.collect()  # what else it has left, which Python would discard at any time
         for task in self._left:
             if (owner := self._tasks[task]) is not None:
                 show(owner.id)
-            asyncio_internals.close_abandoned(task)
+            self._discard(task)
         show("")
+
+    def _discard(self, task: asyncio.Task[Any]) -> None:
+        self._discards = True
+        try:
+            asyncio_internals.close_abandoned(task)
+        finally:
+            self._discards = False
 
     async def cancel(self) -> None:
         """Cancel all programs and wait a second at most for their `finally` blocks (real time)."""
@@ -638,6 +647,8 @@ class Host:
                 raise
             self._exited(node, error)
         except BaseException as error:
+            if self._discards:  # it is told to end, whatever it makes of that
+                raise
             if self._debugger is not None and isinstance(error, Exception):
                 self._debugger.crashed(node.id, error)
             self._exited(node, error)
