@@ -86,14 +86,19 @@ def test_what_ends_the_process_after_the_run_is_a_death_then_and_no_earlier(tmp_
 CATCHES_ALL = """while True:
                 try:
                     await asyncio.sleep(1.0)
-                except BaseException:
-                    pass"""
+                except BaseException as error:
+                    ANSWER"""
 
 
-def test_a_program_that_catches_all_that_ends_it_has_died_after_the_run(tmp_path: Path) -> None:
-    """Outside of its loop `asyncio.sleep` fails at once, and the program goes round for ever."""
-    ended([*command(tmp_path, CATCHES_ALL), "--set", "run.stall_timeout_s=0.3"], tmp_path, 1)
-    assert died(tmp_path / "run") == {"v02"}
+@pytest.mark.parametrize(
+    ("answer", "status"), [("pass", 0), ("while isinstance(error, GeneratorExit): pass", 1)], ids=["waits", "spins"]
+)
+def test_a_program_that_catches_all_that_ends_it_has_died_after_the_run_if_it_does_not_wait(
+    tmp_path: Path, answer: str, status: int
+) -> None:
+    words = command(tmp_path, CATCHES_ALL.replace("ANSWER", answer))
+    ended([*words, "--set", "run.stall_timeout_s=0.3"], tmp_path, status)
+    assert died(tmp_path / "run") == ({"v02"} if status else set())
 
 
 @pytest.mark.parametrize("processes", ["1", "2"])

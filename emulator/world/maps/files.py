@@ -73,16 +73,18 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
     with osm_errors(path):
         import osmium
 
-        file = osmium.FileProcessor(path).with_locations().with_filter(osmium.filter.KeyFilter("highway"))
+        # All ways, as one that has been deleted or is no road any more has no tags in its last version.
+        ways = osmium.FileProcessor(path).with_locations().with_filter(osmium.filter.EntityFilter(osmium.osm.WAY))
         versions: dict[int, int] = {}
-        for entity in file:
-            if isinstance(entity, osmium.osm.Way):
-                if versions.setdefault(entity.id, entity.version) != entity.version:
-                    raise ScenarioError(f"{path}: way {entity.id} is there in two versions: no map of one day")
-                if entity.deleted:
+        for way in ways:
+            assert isinstance(way, osmium.osm.Way)
+            if versions.setdefault(way.id, way.version) != way.version:
+                raise ScenarioError(f"{path}: way {way.id} is there in two versions: no map of one day")
+            if "highway" in way.tags:
+                if way.deleted:
                     builder.note("deleted ways")
                 else:
-                    _add_way(path, builder, entity)
+                    _add_way(path, builder, way)
     if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
         raise ScenarioError(
             f"{path}: it lacks the nodes of its {clipped} ways; nodes come before ways, with ids above 0"
