@@ -598,6 +598,7 @@ class Host:
         `show` is told whose code runs: one that catches all that ends it may run on and on.
         """
         if self._killed:
+            gc.collect()  # what others have left may still act
             with nothing_changed():
                 for node, tasks in self._killed.items():
                     show(node.id)

@@ -93,6 +93,30 @@ def test_what_was_killed_holds_nothing_and_writes_no_more() -> None:
     assert incarnation == 1 and rows >= counted - 2, "what either has committed is there"
 
 
+class Collected:
+    """Writes a file when it is discarded; a cycle keeps it until then."""
+
+    def __init__(self, path: Path) -> None:
+        self.me, self.path = self, path
+
+    def __del__(self) -> None:
+        self.path.write_text("collected")
+
+
+async def leaves_garbage(node: Node) -> None:
+    Collected(node.folder / "late.txt")
+    if node.id == "v01":
+        await asyncio.sleep(99)
+
+
+@pytest.mark.slow
+def test_what_those_have_left_who_were_not_killed_still_acts() -> None:
+    killed = [{"kind": "kill", "at_s": 0.5, "duration_s": 99.0, "nodes": {"ids": ["v01"]}}]
+    emulation = run_together(scenario_of(killed, f"{__name__}:leaves_garbage", vehicles=2))
+    assert (emulation.folder.disks / "v02" / "late.txt").read_text() == "collected"
+    concluded(emulation)
+
+
 async def keeps_nothing(node: Node) -> None:
     async for fix in node.gnss:
         node.report(fix.position_m, fix.covariance_m2)
