@@ -169,7 +169,7 @@ def _grant_nothing(loop: Any, events: Any) -> None:
         return loop.create_future()
 
     loop.call_soon, loop.call_later, loop.call_at, loop.create_task = soon, later, later, task
-    loop.run_in_executor = lambda *job: loop.create_future()
+    loop.call_soon_threadsafe, loop.run_in_executor = soon, lambda *job: loop.create_future()
 
 
 def is_unretrieved(future: asyncio.Future[Any]) -> bool:

@@ -7,6 +7,7 @@ property; `building=no` is none. Courts are rings of their own.
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -65,6 +66,8 @@ WRITERS: dict[str, Callable[[Roads, Path], None]] = {
 }
 LARGEST_BYTES = 2**31
 """Largest file that is read."""
+_DELETED = re.compile(rb"""<way\b[^>]*\saction=["']delete["']""")
+"""A way that is deleted once JOSM uploads it."""
 
 
 def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
@@ -100,22 +103,23 @@ def osm_errors(path: Path) -> Iterator[None]:
 
     try:
         # Of objects that JOSM's user has deleted pyosmium does not tell.
-        if path.suffix == ".osm" and (line := _line_of(path, "delete", " action=")):
+        if path.suffix == ".osm" and (line := _line_of(path, _DELETED)):
             raise ScenarioError(f"{path}: {line}deleted in JOSM: upload it there, or purge it, before saving")
         yield
     except osmium.InvalidLocationError as error:
         value = str(error).partition("'")[2].removesuffix("'")
-        raise ScenarioError(f"{path}: {_line_of(path, value)}{printable(str(error), 300)}") from None
+        quoted = re.compile(b"[\"']" + re.escape(value.encode()) + b"[\"']")
+        raise ScenarioError(f"{path}: {_line_of(path, quoted)}{printable(str(error), 300)}") from None
     except (RuntimeError, ValueError, OSError) as error:
         raise ScenarioError(f"{path}: not an OpenStreetMap file: {printable(str(error), 300)}") from None
 
 
-def _line_of(path: Path, value: str, before: str = "") -> str:
-    """Return `line N: ` of a quoted value in an XML file, or nothing: pyosmium gives lines only for bad XML."""
-    forms, line = [f"{before}{quote}{value}{quote}".encode() for quote in ("'", '"')], 1
+def _line_of(path: Path, text: re.Pattern[bytes]) -> str:
+    """Return `line N: ` of a text in an XML file, or nothing: pyosmium gives lines only for bad XML."""
+    line = 1
     with path.open("rb") as file:
         while part := file.readline(_LONGEST_LINE):
-            if any(form in part for form in forms):
+            if text.search(part):
                 return f"line {line}: "
             line += part.endswith(b"\n")
     return ""

@@ -35,7 +35,7 @@ _ONE_WAY_CLASSES = {"motorway", "motorway_link"}
 """Classes whose ways are one-way unless tagged otherwise."""
 _ROUND = {"roundabout", "circular"}
 """Values of `junction` whose ways are one-way unless tagged otherwise."""
-_WIDTH = re.compile(r"(\d{1,4}(?:\.\d{1,9})?)\s*(m|ft|'(?:(\d{1,2})\")?)?")
+_WIDTH = re.compile(r"(\d{1,4}(?:\.\d{1,9})?)\s*(m|ft|feet|'(?:\s*(\d{1,2})\")?)?")
 MAX_POINTS = 5_000_000
 """Most points of a map: ten times those of a large city."""
 MIN_HALF_WIDTH_M = 0.3

@@ -507,7 +507,15 @@ def test_kill_pause_and_restart_of_a_vehicle(drive: Drive) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("begin", ["asyncio.run(wait())", "wait_in_thread()"])
+@pytest.mark.parametrize(
+    "begin",
+    [
+        "asyncio.run(wait())",
+        "wait_in_thread()",
+        "leave_a_cycle()",
+        "asyncio.new_event_loop().run_until_complete(catch_all())",
+    ],
+)
 def test_nothing_of_a_killed_program_is_done_afterwards(tmp_path: Path, begin: str) -> None:
     text = f"""
         import asyncio, os, time
@@ -527,6 +535,24 @@ def test_nothing_of_a_killed_program_is_done_afterwards(tmp_path: Path, begin: s
                 time.sleep(9)
             finally:
                 over()
+
+        class Cycle:
+            def __init__(self):
+                self.me = self
+
+            def __del__(self):
+                over()
+
+        def leave_a_cycle():
+            cycle = Cycle()
+            time.sleep(9)
+
+        async def catch_all():
+            while True:
+                try:
+                    await wait()
+                except BaseException:
+                    pass
 
         {begin}
         """

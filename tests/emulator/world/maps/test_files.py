@@ -128,6 +128,7 @@ def test_a_way_against_its_direction_is_turned_round(tmp_path: Path) -> None:
         ({"width": "26'"}, 3.9624),
         ({"width": "16'3\""}, 2.4765),
         ({"width": "20 ft"}, 3.048),
+        ({"width": "19' 6\""}, 2.9718),
     ],
 )
 def test_a_width_is_that_of_all_lanes(tmp_path: Path, tags: dict[str, str], width_m: float) -> None:
