@@ -314,7 +314,7 @@ def consensus(networks: NetworksOption = None, seeds: SeedsOption = 3, out: OutO
 def capacity(
     seconds: Annotated[float, typer.Option(min=1, max=DAY_S, help="Emulated seconds of each network.")] = 5.0,
     seeds: SeedsOption = 2,
-    out: OutOption = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="For the results.")] = None,
 ) -> None:
     """Capacity of an 802.11p channel: packet delivery ratio against the number of senders in range."""
     from studies import capacity as study

@@ -25,6 +25,7 @@ from emulator.records.disk import atomically, disk_errors
 from emulator.records.manifest import differing_files, read_manifest
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, UnicastFigures, radio_metrics, unicast_figures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.run_folder import check_is_run
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError
@@ -161,6 +162,7 @@ def export(
             raise VnetError(f"--payloads {payloads.value}: of pcapng, and not of {chosen.value}")
         if definitions is not None and chosen is not Format.MCAP:
             raise VnetError(f"--definitions {definitions}: of mcap, and not of {chosen.value}")
+        check_is_run(run)
         recorded = RecordedRun.open(run)
         for problem in _damage(run):
             tell(f"{run}: {problem}; vnet check says more")

@@ -369,6 +369,7 @@ def test_an_export_of_a_damaged_run_says_so(folder: Path, tmp_path: Path) -> Non
 
 
 def test_what_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
-    for command in (["export", str(tmp_path)], ["radio", str(tmp_path)]):
+    exports = [["export", str(tmp_path / "none"), "--to", form] for form in ("pcapng", "mcap", "csv", "links")]
+    for command in (["export", str(tmp_path)], ["radio", str(tmp_path)], *exports):
         done = RUNNER.invoke(app, command)
         assert done.exit_code == 2 and done.stderr.count("\n") == 1 and "not a run's folder" in done.stderr
