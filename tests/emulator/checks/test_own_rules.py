@@ -185,11 +185,20 @@ def test_rules_beside_all_other_faults_leave_the_run_valid(
     assert effect.verdict is Verdict.VALID
 
 
-def test_a_delay_shows_beside_a_rule_that_delays_nothing(tmp_path: Path) -> None:
-    delay = {"kind": "delay", "delay_ms": 40, "at_s": 0.2, "duration_s": 1.0}
+@pytest.mark.parametrize(
+    "late",
+    [
+        {"kind": "delay", "delay_ms": 40},
+        {"kind": "jitter", "jitter_ms": 40},
+        {"kind": "reorder"},
+        {"kind": "throttle", "bitrate_mbps": 0.1},
+    ],
+)
+def test_a_delay_shows_beside_a_rule_that_delays_nothing(tmp_path: Path, late: dict[str, Any]) -> None:
     rule = {"kind": "custom", "rule": "tests.support.rules:passes", "duration_s": 1.2}
-    recorded = run_scenario(tmp_path / "run", Scenario.model_validate({**DATA, "fault": [delay, rule]}))
-    (effect,) = [check for check in judge(recorded).checks if check.name == "effect:delay-0"]
+    faults = [{**late, "at_s": 0.2, "duration_s": 1.0}, rule]
+    recorded = run_scenario(tmp_path / "run", Scenario.model_validate({**DATA, "fault": faults}))
+    (effect,) = [check for check in judge(recorded).checks if check.name == f"effect:{late['kind']}-0"]
     assert effect.verdict is Verdict.VALID, effect.text
 
 

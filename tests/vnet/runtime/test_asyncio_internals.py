@@ -272,6 +272,7 @@ def test_an_abandoned_task_that_catches_all_in_a_loop_is_closed(loop: StandingLo
     async def swallows() -> None:
         while True:
             try:
+                loop.call_soon_threadsafe(len, "")
                 async with asyncio.timeout(9), asyncio.TaskGroup() as group:
                     group.create_task(asyncio.sleep(9))
                     await asyncio.sleep(9)

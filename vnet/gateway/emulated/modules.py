@@ -562,25 +562,25 @@ class ProgramModules:
     def _time(self) -> ModuleType:
         node = self.node
 
-        def ns(clock: int = time.CLOCK_REALTIME) -> int:
+        def ns(clock: int) -> int:
             look()
             return EPOCH_NS + node.now_ns if clock == time.CLOCK_REALTIME else self.steady_ns()
 
-        def seconds(clock: int = time.CLOCK_REALTIME) -> float:
+        def seconds(clock: int) -> float:
             return ns(clock) / NS_PER_S
 
         def utc(at: float | None = None) -> time.struct_time:
-            return time.gmtime(seconds() if at is None else at)
+            return time.gmtime(seconds(time.CLOCK_REALTIME) if at is None else at)
 
         own: dict[str, Any] = {
-            "time": lambda: seconds(),
-            "time_ns": lambda: ns(),
+            "time": partial(seconds, time.CLOCK_REALTIME),
+            "time_ns": partial(ns, time.CLOCK_REALTIME),
             **dict.fromkeys(["monotonic", "perf_counter"], partial(seconds, time.CLOCK_MONOTONIC)),
             **dict.fromkeys(["monotonic_ns", "perf_counter_ns"], partial(ns, time.CLOCK_MONOTONIC)),
             **dict.fromkeys(["process_time", "thread_time"], lambda: 0.0),  # computing costs no emulated time
             **dict.fromkeys(["process_time_ns", "thread_time_ns"], lambda: 0),
-            "clock_gettime": lambda clock: seconds(clock),
-            "clock_gettime_ns": lambda clock: ns(clock),
+            "clock_gettime": seconds,
+            "clock_gettime_ns": ns,
             "sleep": sleep,
             **dict.fromkeys(["gmtime", "localtime"], utc),
             "ctime": lambda at=None: time.asctime(utc(at)),

@@ -124,7 +124,7 @@ def test_a_deleted_way_is_no_road(tmp_path: Path) -> None:
     assert "deleted in JOSM" in refusal(write(tmp_path, "josm.osm", joined))
     history = text.replace('<way id="8" version="1"', '<way id="7" version="2"')
     assert refusal(write(tmp_path, "history.osm", history)) == "way 7 is there in two versions: no map of one day"
-    deleted = text.replace("</osm>", '<way id="7" version="2" visible="false"/></osm>')
+    deleted = text.replace('<way id="8"', '<way id="7" version="2" visible="false"/><way id="8"')
     assert refusal(write(tmp_path, "deleted.osm", deleted)) == "way 7 is there in two versions: no map of one day"
 
 

@@ -37,8 +37,9 @@ def write_osm(path: Path, roads: bool = True) -> Path:
         54: ([108, 109, 110, 108], {"landuse": "grass"}),
         55: ([108, 109, 110], {"building": "yes"}),
         56: ([108, 109, 999, 108], {"building": "yes"}),
+        57: ([108, 109, 110, 108], {"building": "yes"}),
     }
-    text = osm_xml({**(WAYS if roads else {}), **ways})
+    text = osm_xml({**(WAYS if roads else {}), **ways}).replace('<way id="57"', '<way id="57" visible="false"')
     head, brace, rest = text.partition("<way ")
     relation = '<relation id="9" version="1"><member type="way" ref="50" role="outer"/>'
     relation += '<member type="way" ref="51" role="inner"/>'
