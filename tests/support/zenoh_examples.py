@@ -135,7 +135,7 @@ def z_liveliness(zenoh: Any, open_session: Open, settle: Settle) -> list[Any]:
     kept = second.liveliness().declare_token("group/second")
     heard.append(told.get())
     settle()
-    replies = watching.liveliness().get("group/**", timeout=5.0)
+    replies = watching.liveliness().get("group/**", timeout=60.0)
     heard.append(sorted(str(reply.ok.key_expr) for reply in replies))
     token.undeclare()
     heard.append(told.get())

@@ -136,5 +136,5 @@ class _Interpreter:
         self._heard.append(("replies", *sorted(told, key=repr)))
 
     def _tokens(self, session: Any, key: str) -> None:
-        replies = session.liveliness().get(key, timeout=5.0)
+        replies = session.liveliness().get(key, timeout=60.0)
         self._heard.append(("tokens", *sorted({self._told(reply.ok)[:3] for reply in replies})))
