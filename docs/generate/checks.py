@@ -27,7 +27,7 @@ FROM_THE_FOLDER = (
     ),
     [
         "`replay`",
-        "The same scenario gives the same trace, states and metrics. Judged with `--check-determinism`.",
+        "The same scenario gives the same trace, states, metrics and events. Judged with `--check-determinism`.",
         "a row differs; the first is shown, with its frame, vehicle and line of the program",
         "a repetition failed",
         "the run ran once",

@@ -120,7 +120,10 @@ def always(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Resul
 
 
 def never(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:
-    """Judge that a predicate is true at no moment; unknown if it has nothing to say at any."""
+    """Judge that a predicate is true at no moment; unknown if it has nothing to say at any.
+
+    A run without any event is valid for `at="event"`.
+    """
     return _held(run, name, predicate, at, False)
 
 
@@ -246,7 +249,7 @@ def _held(run: Run, name: str, predicate: Predicate, at: str, wanted: bool) -> R
     failed = [moment for moment, held in asked if held is not wanted]
     if failed:
         return _failed(run, name, failed, "is false" if wanted else "is true", of=len(asked))
-    if not asked:
+    if not asked and (wanted or at != EVENT or answers):
         values = "".join(f": none has a value {value!r}" for value in sorted(missing)[:1])
         return Result(name, "unknown", f"the predicate had nothing to say at any moment{values}")
     of = f"{len(asked):,} of " if len(asked) < len(answers) else ""

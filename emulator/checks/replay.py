@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from emulator.records.events import Event, EventKind
 from emulator.records.parting import first_difference, first_frame
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import AGAIN
@@ -23,8 +24,10 @@ CALLS = "logs/calls"
 LONGEST_LINE = 1000
 LONGEST = 100
 """Characters that are shown of a call."""
-TABLES = ("trace", "states", "metrics")
-ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outcome", "arrival_ns")
+TABLES = ("trace", "states", "metrics", "events")
+"""Of the events those that programs tell (`node.event`)."""
+EVENTS = pa.schema({"time_ns": pa.int64(), "node": pa.string(), "name": pa.string(), "values": pa.string()})
+ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "time_ns", "node", "name", "outcome", "arrival_ns")
 """The columns that are shown of a differing row, beside those that differ."""
 
 
@@ -99,9 +102,16 @@ def _told(call: Call | None, time_ns: int) -> str:
     return printable(f"{call[1]} from {call[3]}", LONGEST)
 
 
-def _tables(run: OpenedRun) -> tuple[pa.Table, pa.Table, pa.Table]:
+def _tables(run: OpenedRun) -> tuple[pa.Table, ...]:
     """The tables of a run, as `TABLES` calls them."""
-    return run.trace, run.states, run.metrics
+    return run.trace, run.states, run.metrics, events_table(run.events)
+
+
+def events_table(events: Sequence[Event]) -> pa.Table:
+    """Return what programs told by `node.event`, in the order of time and node."""
+    own = (event for event in events if event.kind == EventKind.event)
+    rows = sorted((event.time_ns, event.node or "", event.name, str(event.values)) for event in own)
+    return pa.table([list(column) for column in zip(*rows, strict=True)] or [[]] * len(EVENTS), schema=EVENTS)
 
 
 def _with_columns(ours: pa.Table, theirs: pa.Table) -> tuple[pa.Table, pa.Table]:
@@ -130,7 +140,7 @@ def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> CheckResult:
         index = first_difference(first, second)
         if index is not None:
             return _difference(name, first, second, index)
-    text = f"two runs agree: {len(tables[0][1]):,} rows of the trace, all states and metrics"
+    text = f"two runs agree: {len(tables[0][1]):,} rows of the trace, all states, metrics and events of programs"
     return named("replay", valid(text, rows_each=len(tables[0][1])))
 
 

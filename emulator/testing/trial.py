@@ -29,7 +29,7 @@ import pyarrow.compute as pc
 from emulator.cells.cells import BROKEN, WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
-from emulator.checks.replay import compare_tables, first_call
+from emulator.checks.replay import compare_tables, events_table, first_call
 from emulator.drivers.determinism import calls_recorded, scattered
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.session import Local, Session
@@ -139,7 +139,8 @@ def _difference_of_another(emulation: Emulation) -> str:
 def _tables(emulation: Emulation) -> tuple[pa.Table, ...]:
     """Return the tables that `TABLES` names."""
     metrics = emulation.metrics
-    return emulation.engine.trace.to_table(), metrics.states_table(), metrics.metrics_table()
+    events = events_table(emulation.folder.events)
+    return emulation.engine.trace.to_table(), metrics.states_table(), metrics.metrics_table(), events
 
 
 def _greatest(emulation: Emulation) -> tuple[float, str]:

@@ -72,6 +72,13 @@ def test_a_predicate_that_has_nothing_to_say_is_unknown(run: Run) -> None:
     assert always(run, "missing", lambda m: None if m["no_such"] is None else False).verdict == "unknown"
 
 
+def test_what_never_happens_is_valid_in_a_run_without_any_event() -> None:
+    """A live run has vnet's own events, as `joined`, and is valid; the same run simulated may have none."""
+    quiet = cast(Run, SimpleNamespace(events=[], scenario=SimpleNamespace(fault=[])))
+    assert never(quiet, "crash", lambda m: m.event == "crashed", at="event").verdict == "valid"
+    assert always(quiet, "crash", lambda m: m.event == "crashed", at="event").verdict == "unknown"
+
+
 def test_eventually_is_of_each_vehicle_and_within_a_time(run: Run) -> None:
     assert eventually(run, "late", lambda m: m["count"] >= 1.9).figures == {"slowest_s": 1.9}
     short = eventually(run, "late", lambda m: m["count"] >= 1.9, within_s=1.0)

@@ -13,7 +13,8 @@ import pytest
 from rich.console import Console
 
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
-from emulator.checks.replay import compare
+from emulator.checks.replay import compare, events_table
+from emulator.records.events import Event
 from emulator.records.tables import STATES
 from emulator.terminal.summary import print_checks, print_offending
 from tests.emulator.checks.test_faults import with_cells
@@ -47,10 +48,23 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
 
 
 def compared(recorded: RecordedRun, **again: pa.Table) -> CheckResult:
-    tables = {name: getattr(recorded, name) for name in ("trace", "states", "metrics")}
+    tables = {name: getattr(recorded, name) for name in ("trace", "states", "metrics")} | {
+        "events": events_table(recorded.events)
+    }
     found = compare([(name, table, again.get(name, table)) for name, table in tables.items()])
     assert isinstance(found, CheckResult)
     return found
+
+
+def test_programs_that_tell_other_events_are_invalid(recorded: RecordedRun) -> None:
+    first, again = (
+        [Event(10**9, "event", "v02", {"name": "braked", "details": {"force": force}})] for force in (0.1, 0.2)
+    )
+    assert compared(replace(recorded, events=first), events=events_table(first)).verdict is Verdict.VALID
+    found = compared(replace(recorded, events=first), events=events_table(again))
+    assert found.verdict is Verdict.INVALID and "row 0 of the events: values" in found.text
+    assert [row["name"] for row in found.figures["rows"]] == ["braked", "braked"]
+    assert compared(recorded, events=events_table(first)).verdict is Verdict.INVALID
 
 
 def test_runs_that_agree_are_valid_though_a_number_is_none(recorded: RecordedRun) -> None:
