@@ -25,7 +25,7 @@ LONGEST_LINE = 1000
 LONGEST = 100
 """Characters that are shown of a call."""
 TABLES = ("trace", "states", "metrics", "events")
-"""Of the events those that programs tell (`node.event`)."""
+"""The tables that are compared; events are those that programs tell by `node.event`."""
 EVENTS = pa.schema({"time_ns": pa.int64(), "node": pa.string(), "name": pa.string(), "values": pa.string()})
 ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "time_ns", "node", "name", "outcome", "arrival_ns")
 """The columns that are shown of a differing row, beside those that differ."""

@@ -126,13 +126,15 @@ def radio_metrics(
     codes, place = np.unique(pairs.link, return_inverse=True)
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(recorded.node_ids, codes, count, figures)
-    busy = _busy(recorded, math.ceil(round(from_s * NS_PER_S) / WINDOW_NS)) if has_busy else np.zeros((0, count))
+    busy = (
+        busy_ratios(recorded, math.ceil(round(from_s * NS_PER_S) / WINDOW_NS)) if has_busy else np.zeros((0, count))
+    )
     vehicles = _vehicles_table(recorded, codes, count, figures, busy)
     totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(busy[~np.isnan(busy)])}
     return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
 
 
-def _busy(recorded: RecordedRun, first: int) -> Array:
+def busy_ratios(recorded: RecordedRun, first: int = 0) -> Array:
     """Return the channel busy ratios (W, N) of windows from the `first` on; NaN for a vehicle that is not there."""
     busy = recorded.busy_ratio[first:]
     if not recorded.moves or not len(busy):

@@ -45,7 +45,7 @@ def _numbers(source: Source, name: str) -> Drawing:
         raise NothingToShow("reported in one period only")
     curve = partial(points, time_s, usual=usual_periods(value))
     if source.is_boolean(name):
-        share = Line("", *curve(100 * _mean(value)), BLUE)
+        share = Line("", *curve(100 * row_means(value)), BLUE)
         made = time_figure([share], f"{title_of(name)} (%)", source.end_s, source.spans, True)
         made.axes.set_ylim(0, 105)
         text = "Share of the vehicles that report it that say true."
@@ -53,7 +53,7 @@ def _numbers(source: Source, name: str) -> Drawing:
     node = int(np.isfinite(value).sum(axis=0).argmax())
     who = source.node_ids[node]
     several = value.shape[1] > 1
-    lines = [Line("mean of the vehicles" if several else who, *curve(_mean(value)), BLUE)]
+    lines = [Line("mean of the vehicles" if several else who, *curve(row_means(value)), BLUE)]
     if several:
         lines.append(Line(who, *curve(value[:, node]), RED, DASHES[1]))
     made = time_figure(lines, label_of(name), source.end_s, source.spans, linear=True)
@@ -127,7 +127,7 @@ def text_shares(source: Source, name: str) -> tuple[Array, list[str]]:
 def mean_over_time(source: Source, name: str) -> tuple[Array, Array]:
     """Return times (n,) in seconds and the mean over the vehicles, of a boolean in per cent, as `points` does."""
     value = source.value(name)
-    mean = _mean(value) * (100 if source.is_boolean(name) else 1)
+    mean = row_means(value) * (100 if source.is_boolean(name) else 1)
     return points(source.times_s, mean, usual_periods(value))
 
 
@@ -136,7 +136,7 @@ def is_number(source: Source, name: str) -> bool:
     return name in source.drawn_names and not is_text(source.states.schema.field(name).type)
 
 
-def _mean(value: Array) -> Array:
+def row_means(value: Array) -> Array:
     """Return the mean (periods,) of what is finite in each period; NaN where nothing is."""
     known = np.isfinite(value)
     count = known.sum(axis=1)

@@ -28,8 +28,9 @@ from emulator.pages.page import Table, table
 from emulator.pages.palette import PALETTE
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import DRAWN, Outcome
-from emulator.records.radio_metrics import rows_of_pairs, unicast_figures
+from emulator.records.radio_metrics import busy_ratios, rows_of_pairs, unicast_figures
 from emulator.report.drawing import DASHES, TIME, WIDE_RANGE, Drawing, Line, faults_note, time_figure
+from emulator.report.program_figures import row_means
 from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError, printable
 from vnet.types import Array, IntArray
@@ -106,13 +107,13 @@ def busy(source: Source) -> Drawing:
     """Draw the channel busy ratio of the vehicles."""
     if source.scenario.radio.mac is None:
         raise NothingToShow("no MAC configured ([radio.mac])")
-    if not len(source.busy_ratio):
+    percent = 100 * busy_ratios(source)
+    if not len(percent):
         raise VnetError("the run was over within the first window")
-    percent = 100 * source.busy_ratio
     end_s = np.arange(1, len(percent) + 1) * WINDOW_NS / 1e9
     lines = [
-        Line("mean", end_s, percent.mean(axis=1), BLUE),
-        Line("busiest", end_s, percent.max(axis=1), RED, DASHES[1]),
+        Line("mean", end_s, row_means(percent), BLUE),
+        Line("busiest", end_s, np.fmax.reduce(percent, axis=1), RED, DASHES[1]),
     ]
     made = time_figure(lines, "channel busy ratio (%)", source.end_s, source.spans, linear=True)
     text = "Share of the time in which vehicles sensed the medium busy, in windows of 100 ms."

@@ -15,6 +15,9 @@ from hypothesis import strategies as st
 from emulator.checks.judge import RecordedRun
 from emulator.records.radio_metrics import radio_metrics, rows_of_pairs, unicast_figures
 from emulator.records.tables import STATES
+from emulator.report import radio_figures
+from emulator.report.drawing import Line
+from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.exchange_programs import COPYING, exchange_run
@@ -239,7 +242,9 @@ def test_a_beacon_that_all_hear_is_as_old_as_its_period_and_its_way(tmp_path: Pa
     assert [row["from_m"] for row in told.distances.to_pylist()] == [0.0, 50.0, 100.0]
 
 
-def test_how_busy_a_vehicle_finds_the_medium_is_of_the_time_in_which_it_is_there(tmp_path: Path) -> None:
+def test_how_busy_a_vehicle_finds_the_medium_is_of_the_time_in_which_it_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     vehicles = {"a": [(0, 9, still(0))], "b": [(0, 9, still(100))], "c": [(6, 9, still(50))]}
     path = write_trips(tmp_path / "t.csv", vehicles)
     run_scenario(tmp_path / "run", scenario_of_trips(path, 9.0, radio={"mac": {"kind": "80211p"}}))
@@ -247,6 +252,10 @@ def test_how_busy_a_vehicle_finds_the_medium_is_of_the_time_in_which_it_is_there
     told = {row["node"]: row["busy_ratio_mean"] for row in radio_metrics(recorded).vehicles.to_pylist()}
     assert told["c"] == pytest.approx(recorded.busy_ratio[60:90, recorded.number["c"]].mean())
     assert told["c"] > told["a"] > 0, "three send while it is there, and two before"
+    drawn: list[Line] = []
+    monkeypatch.setattr(radio_figures, "time_figure", lambda lines, *_, **__: drawn.extend(lines))
+    radio_figures.busy(Source(tmp_path / "run"))
+    assert drawn[0].value[:60] == pytest.approx(100 * recorded.busy_ratio[:60, :2].mean(axis=1))
 
 
 def test_frames_that_are_lost_on_their_way_to_who_is_down_are_no_attempts(tmp_path: Path) -> None:
