@@ -33,6 +33,8 @@ NetworksOption = Annotated[
 OutOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="For the results; an interrupted run goes on there.")
 ]
+WholeOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="For the results.")]
+"""Of a study that keeps nothing of a run that is interrupted."""
 LiveOption = Annotated[
     bool, typer.Option("--live", metavar="", help="Run over Zenoh, a process a vehicle, and not simulated.")
 ]
@@ -266,7 +268,7 @@ def decomposition(
     networks: NetworksOption = None,
     seeds: SeedsOption = 5,
     duration: DurationOption = 100.0,
-    out: OutOption = None,
+    out: WholeOption = None,
 ) -> None:
     """Decomposition: what loss, hops, caps and shares each cost, by oracles that give them back one at a time."""
     from studies import decomposition as study
@@ -314,7 +316,7 @@ def consensus(networks: NetworksOption = None, seeds: SeedsOption = 3, out: OutO
 def capacity(
     seconds: Annotated[float, typer.Option(min=1, max=DAY_S, help="Emulated seconds of each network.")] = 5.0,
     seeds: SeedsOption = 2,
-    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="For the results.")] = None,
+    out: WholeOption = None,
 ) -> None:
     """Capacity of an 802.11p channel: packet delivery ratio against the number of senders in range."""
     from studies import capacity as study

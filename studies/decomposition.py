@@ -23,7 +23,16 @@ from agents.cooperative.information_estimator import PASSED_SHARE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.paper import PAPER_RANGE_M, counted_from
-from studies.reports import Result, markdown_table, mean_and_error, paired_ratio, select, unique
+from studies.reports import (
+    Result,
+    in_seeds,
+    markdown_table,
+    mean_and_error,
+    paired_ratio,
+    select,
+    unique,
+    with_error,
+)
 from vnet.types import Array, Mask
 
 LOSS = 0.1
@@ -319,14 +328,15 @@ def report(results: Sequence[Result], duration_s: float) -> str:
         for network in networks:
             found = select(results, network=network, rules=name)
             ratio, error = paired_ratio([each["rmse_m"] for each in found], [each["bound_m"] for each in found])
-            row += [f"{ratio:.2f} ± {error:.2f}", mean_and_error([each["anees"] for each in found], 2)]
+            row += [with_error(ratio, error, ".2f"), mean_and_error([each["anees"] for each in found], 2)]
         rows.append(row)
-    anees = [mean_and_error([each["bound_anees"] for each in select(results, network=n)], 2) for n in networks]
+    one = [select(results, network=network, rules=next(iter(ORACLES))) for network in networks]
+    anees = [mean_and_error([each["bound_anees"] for each in found], 2) for found in one]
     rows.append(["the bound", *[cell for each in anees for cell in ("1", each)]])
     return (
         "# Decomposition: what each oracle gives back\n\n"
         f"{markdown_table(header, rows)}\n\n"
-        f"RMSE of c relative to its bound, of {duration_s:g} s from {counted_from(duration_s):g} s on; "
-        f"{len(unique(results, 'seed'))} seeds, ± standard error; {100 * LOSS:g} % loss. Gaussian filters with the "
+        f"RMSE of c relative to its bound, of {duration_s:g} s from {counted_from(duration_s):.3g} s on; "
+        f"{in_seeds(len(unique(results, 'seed')))}; {100 * LOSS:g} % loss. Gaussian filters with the "
         "rules of the cooperative program, without defence and particles; oracles may send any number of bytes.\n"
     )

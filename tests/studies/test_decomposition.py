@@ -10,6 +10,7 @@ import pytest
 from agents.cooperative.cmm.kalman_bound import KalmanBound, LaneModel
 from studies import decomposition
 from studies.decomposition import FLOODED, Exchange, Rules, Worlds
+from studies.reports import mean_and_error
 from vnet.types import Mask
 
 PERIODS, SEEDS = 30, 2
@@ -85,3 +86,8 @@ def test_a_network_is_decomposed_and_shown() -> None:
     assert {row["rules"] for row in rows} == set(decomposition.ORACLES)
     text = decomposition.report(rows, 4.0)
     assert all(name in text for name in (*decomposition.ORACLES, "the bound", "2 seeds"))
+    anees = [row["bound_anees"] for row in rows if row["rules"] == "no frame lost"]
+    assert f"| {mean_and_error(anees, 2)} |" in text, (
+        "the bound of a seed counts once, not for each of the rules"
+    )
+    assert "nan" not in decomposition.report([row for row in rows if row["seed"] == 1], 4.0)
