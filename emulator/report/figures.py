@@ -37,6 +37,7 @@ from emulator.report.map_figures import map_charts
 from emulator.report.program_figures import Drawers, program_charts
 from emulator.report.radio_figures import ages, busy, latency, outcomes, totals
 from emulator.report.source import NothingToShow, Source, maybe
+from emulator.world.radio_inputs import LinkTable
 from emulator.world.world import components
 from vnet.errors import VnetError, printable
 from vnet.types import Array, IntArray
@@ -70,7 +71,8 @@ def links(source: Source) -> Drawing:
     total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
     distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
     physical, binned = source.scenario.radio.is_physical, source.moves or source.scenario.radio.is_physical
-    labels = 1 + (len(used) > MOST_LINKS) + (not physical) + binned
+    alike = not physical and not isinstance(source.radio_inputs.links, LinkTable)
+    labels = 1 + (len(used) > MOST_LINKS) + alike + binned
     made = canvas("distance (km)", "delivery ratio (%)", legend_rows=int(np.ceil(labels / 3)))
     if len(used) <= MOST_LINKS:
         dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4, "markeredgewidth": 0}
@@ -82,7 +84,7 @@ def links(source: Source) -> Drawing:
     if (source.attempt > 0).any():
         text += " Frames to one vehicle are not counted."
     lowest = float(share.min())
-    if not physical:
+    if alike:
         low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
         lowest, text = min(lowest, low), text + band + _why_less(source, cast)
     farthest_km = float(distance_km.max())

@@ -12,7 +12,7 @@ import pytest
 from emulator.api import simulate_into
 from emulator.records.metrics import reference_series
 from emulator.records.recorded_run import RecordedRun
-from emulator.report.figures import degrees
+from emulator.report.figures import degrees, links
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
 from emulator.stream import scene_message
@@ -65,6 +65,8 @@ def test_the_bound_and_the_scene_have_those_in_one_component_that_ever_are_linke
     scene = scene_message(recorded.world, recorded.scenario, recorded.scenario_text)
     assert np.frombuffer(scene["component"], "<i2").tolist() == [0, 0, 0]
     assert "one component" in degrees(Source(run)).caption
+    _, labels = links(Source(run)).canvas.axes.get_legend_handles_labels()
+    assert labels == ["a link"], "links that lose as a table says have no one ratio to expect"
 
 
 def test_selectors_by_degree_follow_the_links(run: Path) -> None:
