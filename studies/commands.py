@@ -34,7 +34,7 @@ OutOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="For the results; an interrupted run goes on there.")
 ]
 WholeOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="For the results.")]
-"""Of a study that keeps nothing of a run that is interrupted."""
+"""The same of a study that cannot go on with an interrupted run."""
 LiveOption = Annotated[
     bool, typer.Option("--live", metavar="", help="Run over Zenoh, a process a vehicle, and not simulated.")
 ]

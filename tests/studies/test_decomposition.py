@@ -87,7 +87,5 @@ def test_a_network_is_decomposed_and_shown() -> None:
     text = decomposition.report(rows, 4.0)
     assert all(name in text for name in (*decomposition.ORACLES, "the bound", "2 seeds"))
     anees = [row["bound_anees"] for row in rows if row["rules"] == "no frame lost"]
-    assert f"| {mean_and_error(anees, 2)} |" in text, (
-        "the bound of a seed counts once, not for each of the rules"
-    )
+    assert f"| {mean_and_error(anees, 2)} |" in text, "the bound of a seed counts once, not for each of the rules"
     assert "nan" not in decomposition.report([row for row in rows if row["seed"] == 1], 4.0)
