@@ -8,6 +8,7 @@ to what a screen can show.
 from __future__ import annotations
 
 import io
+import logging
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -35,6 +36,9 @@ INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GR
 )
 CURVES = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 """Colours of curves, in their order."""
+for _library in map(logging.getLogger, ("matplotlib", "PIL")):
+    if _library.level == logging.NOTSET:  # a program may have asked for all that anybody logs
+        _library.setLevel(logging.WARNING)
 _VARIABLE = {colour.light: f"var(--{name})" for name, colour in PALETTE.items()}
 
 WIDTH_PX, PLOT_PX = 400, 190

@@ -120,6 +120,13 @@ class RunHarness:
     # Its course.
 
     async def __aenter__(self) -> RunHarness:
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:  # as within trio
+            instead = 'with anyio a fixture anyio_backend returns "asyncio"'
+            raise VnetError(f"an emulation needs asyncio, which does not run this test; {instead}") from None
+        if self._run.started:
+            raise VnetError("an emulation can be entered once: vnet_emulation(…) makes another one")
         await self._wait(self._run.start())
         return self
 

@@ -1,5 +1,6 @@
 """Pages escape, cut and make printable what others wrote, and their templates are shipped."""
 
+import logging
 import re
 import tomllib
 from collections import Counter
@@ -131,6 +132,13 @@ def test_templates_mark_nothing_as_safe_and_load_nothing() -> None:
         text = path.read_text()
         assert not re.search(r"\|\s*safe\b|autoescape|Markup|xmlattr", text), path.name
         assert not re.search(r"https?:|//[a-z]|@import|url\(", text), path.name
+
+
+def test_a_program_that_logs_all_gets_nothing_of_the_drawing(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG):
+        logging.getLogger("matplotlib.font_manager").debug("findfont: score")
+        logging.getLogger("theirs").debug("said")
+    assert caplog.messages == ["said"]
 
 
 def test_every_file_of_the_packages_is_shipped() -> None:

@@ -117,6 +117,7 @@ async def test_fails(vnet_emulation):
 
 
 WRONG_STEPS = {
+    "await emu.__aenter__()": "*VnetError: an emulation can be entered once*",
     "emu.check('peer_cap')": "*peer_cap is unknown: not exercised: *",
     "emu.check('speed')": "*VnetError: no check is called 'speed'; there are: conservation, *",
     "emu.check('conservation', within_s=1)": "*none of these checks measured a recovery",
@@ -213,10 +214,14 @@ def test_never_started(vnet_emulation):
         with pytest.raises(Exception, match="the run has not started"):
             use()
 
+def test_without_asyncio(vnet_emulation):
+    with pytest.raises(Exception, match="needs asyncio"):
+        vnet_emulation(BEACON, vehicles=2).__aenter__().send(None)
+
 async def test_of_nobody():
     pass
 """)
-    result.assert_outcomes(passed=2, failed=1)
+    result.assert_outcomes(passed=3, failed=1)
     result.stdout.fnmatch_lines(["*async def functions are not natively supported*"])
 
 
