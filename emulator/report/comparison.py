@@ -24,7 +24,7 @@ from emulator.records.run_folder import check_is_run
 from emulator.records.verdicts import CheckResult, Record, Verdict
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
 from emulator.report.program_figures import MOST_CHARTS, is_number, mean_over_time
-from emulator.report.radio_figures import bin_width_ns, broadcasts, decided, latencies_ms
+from emulator.report.radio_figures import bin_width_ns, broadcasts, latencies_ms, outcomes_in_bins
 from emulator.report.source import NothingToShow, Source
 from emulator.scenario.loading import parse_toml
 from vnet.errors import VnetError, printable
@@ -345,12 +345,10 @@ def _delivered(comparison: Comparison) -> Drawing:
     width_s = width_ns / NS_PER_S
 
     def ratio(source: Source) -> Any:
-        names, code, decided_ns = decided(broadcasts(source))
-        index = decided_ns // width_ns
-        total = np.bincount(index)
-        good = np.bincount(index, weights=np.array([name == "delivered" for name in names])[code])
+        names, counts = outcomes_in_bins(source, broadcasts(source), width_ns)
+        good = counts[:, [name == "delivered" for name in names]].sum(axis=1)
         with np.errstate(invalid="ignore"):
-            return (np.arange(len(total)) + 0.5) * width_s, 100 * good / total
+            return (np.arange(len(counts)) + 0.5) * width_s, 100 * good / counts.sum(axis=1)
 
     caption = f"Share of the broadcasts' attempted receptions that was delivered, in bins of {width_s:.3g} s."
     drawing = _over_time(comparison, ratio, "packet delivery ratio (%)", caption)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from emulator.pages.canvas import (
     BLUE,
@@ -58,13 +57,21 @@ def broadcasts(source: Source) -> pa.Table:
     return source.trace.take(rows)
 
 
-def decided(trace: pa.Table) -> tuple[list[str], NDArray[np.intp], IntArray]:
-    """Return the names of outcomes, and each row's index among them and time of its decision in ns."""
+def outcomes_in_bins(source: Source, trace: pa.Table, width_ns: int) -> tuple[list[str], IntArray]:
+    """Return the names of outcomes and how many rows of a trace have each (bins, names), in bins of the run's time.
+
+    A frame's receptions are all in one bin: by when its transmission ended, with `[radio.mac]`, else by when it was
+    sent. So the delivered have the share of their frames also where a fault delays them.
+    """
     column = trace["outcome"].combine_chunks()
-    code = np.asarray(column.indices.to_numpy(), dtype=np.intp)
-    left = "left_ns" if "left_ns" in trace.column_names else "sent_ns"
-    decided_ns = pc.coalesce(trace["arrival_ns"], trace[left]).to_numpy()
-    return column.dictionary.to_pylist(), code, np.asarray(decided_ns, dtype=np.int64)
+    names = column.dictionary.to_pylist()
+    of_frame = (
+        pc.coalesce(trace["left_ns"], trace["sent_ns"]) if "left_ns" in trace.column_names else trace["sent_ns"]
+    )
+    bins = max(1, int(np.ceil(source.end_s * NS_PER_S / width_ns - 1e-9)))
+    index = np.minimum(of_frame.to_numpy() // width_ns, bins - 1)  # of whole numbers: an edge stays on its side
+    counts = np.bincount(index * len(names) + column.indices.to_numpy(), minlength=bins * len(names))
+    return names, counts.reshape(bins, len(names))
 
 
 def bin_width_ns(source: Source) -> int:
@@ -76,12 +83,10 @@ def bin_width_ns(source: Source) -> int:
 
 def outcomes(source: Source) -> Drawing:
     """Draw the shares of the outcomes against time, stacked."""
-    names, code, decided_ns = decided(in_range(source))
     width_ns = bin_width_ns(source)
     width_s = width_ns / NS_PER_S
-    bins = max(1, int(np.ceil(source.end_s / width_s - 1e-9)))
-    index = np.minimum(decided_ns // width_ns, bins - 1)  # of whole numbers: times on an edge stay on their side
-    counts = np.bincount(index * len(names) + code, minlength=bins * len(names)).reshape(bins, len(names))
+    names, counts = outcomes_in_bins(source, in_range(source), width_ns)
+    bins = len(counts)
     share = 100 * counts / np.maximum(1, counts.sum(axis=1, keepdims=True))
     shown = [number for number, name in enumerate(names) if counts[:, number].any() and name in OUTCOME_COLOURS]
     made = canvas(TIME, "share of receptions (%)", int(np.ceil(len(shown) / 3)), source.spans, source.end_s)
@@ -97,7 +102,7 @@ def outcomes(source: Source) -> Drawing:
     legend(made)
     rate = counts.sum(axis=1) / np.maximum(np.diff(edges), 1e-9)
     text = (
-        f"Outcomes of the {len(code):,} attempted receptions (a frame at a receiver in range), in bins of "
+        f"Outcomes of the {counts.sum():,} attempted receptions (a frame at a receiver in range), in bins of "
         f"{width_s:g} s: {rate.min():,.0f} to {rate.max():,.0f} a second."
     )
     return Drawing(made, text + faults_note(made, source))

@@ -19,11 +19,13 @@ from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 from emulator.report.comparison import Comparison, comparison_page
 from emulator.report.index import write_index
+from emulator.report.radio_figures import outcomes_in_bins
 from emulator.report.source import Source
 from emulator.report.write import key_figures, write_report
 from tests.support.command_line import app
 from tests.support.forked_commands import NO_CHARTS
 from tests.support.paths import ROOT
+from tests.support.recorded import recorded
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
@@ -162,6 +164,22 @@ def test_a_shared_medium_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "busy" not in without.ids
     assert re.search(r"Not shown .*Channel busy ratio.*: .*no busy\.parquet in it", without.text)
     assert "age of information" in without.text, "the rest of the radio's figures stay"
+
+
+def test_a_fault_that_delays_takes_nothing_from_the_share_that_is_delivered(tmp_path: Path) -> None:
+    delay = {"kind": "delay", "at_s": 0.5, "duration_s": 0.5, "delay_ms": 700.0}
+    scenario = {
+        "run": {"duration_s": 2.0, "settle_s": 0.0},
+        "network": {"vehicles": 4},
+        "radio": {"range_m": 1e6, "loss": 0.3},
+        "program": {"entry": "agents.beacon:main"},
+        "fault": [delay],
+    }
+    late = Source(recorded(scenario, tmp_path / "late"))
+    punctual = Source(recorded(scenario | {"fault": []}, tmp_path / "punctual"))
+    names, counts = outcomes_in_bins(late, late.trace, 100_000_000)
+    assert counts.shape == (20, len(names)) and counts.sum() == len(late.trace)
+    assert counts.tolist() == outcomes_in_bins(punctual, punctual.trace, 100_000_000)[1].tolist()
 
 
 def test_what_others_wrote_is_text(beacon: Path) -> None:
