@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +134,8 @@ class RadioScene:
         self._range_m: float | None = scene["range_m"]
         periods = round(WINDOW_S / self._period_s)
         self._tried, self._delivered = SlidingSum(periods), SlidingSum(periods)
+        self._apart: deque[Sequence[NDArray[Any]]] = deque(maxlen=max(1, periods))
+        """Of each period of late the links with frames: their lengths (m), frames tried, and delivered."""
         self._latency, self._sent, self._received = SlidingSum(periods), SlidingSum(periods), SlidingSum(periods)
         self._latency_bins = LEAST_LATENCY_BINS
         self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods)
@@ -147,8 +149,14 @@ class RadioScene:
         self._load(period)
         self._busy(period)
         if self._count <= LARGEST_MATRIX:
-            for window, counts in zip((self._tried, self._delivered), period.counts(), strict=True):
-                window.add(counts)
+            tried, delivered = period.counts()
+            self._tried.add(tried)
+            self._delivered.add(delivered)
+            position_m = period.points("position_m").astype(float)
+            used = np.nonzero(tried)
+            distance_m = np.hypot(*(position_m[used[0]] - position_m[used[1]]).T)
+            known = np.isfinite(distance_m)  # who has left is nowhere
+            self._apart.append((distance_m[known], tried[used][known], delivered[used][known]))
             self._ages.period(period, self._end_ms(period))
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
         self._sent.add(period.numbers("sent_bytes").astype(float))
@@ -209,13 +217,13 @@ class RadioScene:
             rate = window.total / span_s / 1e3
             canvas.bars(f"radio/bytes/{name}", rate, np.arange(self._count) + 0.2 * side, 0.4, colour)
         if self._count <= LARGEST_MATRIX:
-            self._links(period)
+            self._links()
             self._age(self._end_ms(period))
 
     def _end_ms(self, period: PeriodArrays) -> float:
         return (period.time_ns + self._period_ns) / 1e6
 
-    def _links(self, period: PeriodArrays) -> None:
+    def _links(self) -> None:
         """Delivery by link, by vehicle and by distance."""
         tried, delivered = self._tried.total, self._delivered.total
         vehicles, heard = np.arange(self._count), 100 * delivered.sum(axis=1) / np.maximum(1, tried.sum(axis=1))
@@ -223,11 +231,8 @@ class RadioScene:
         share = np.divide(delivered, tried, out=np.full(tried.shape, np.nan), where=tried > 0)
         axes = ("receiver", "sender")
         self._canvas.log("radio/links", rr.Tensor(share.astype(np.float32), dim_names=axes, value_range=(0, 1)))
-        position = period.points("position_m").astype(float)
-        distance_m = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
-        tried = np.where(np.isfinite(distance_m), tried, 0)  # who has left is nowhere
-        distance_m = np.nan_to_num(distance_m)
-        farthest_m = self._range_m or float(distance_m[tried > 0].max(initial=1.0))
+        distance_m, tried, delivered = (np.concatenate(each) for each in zip(*self._apart, strict=True))
+        farthest_m = self._range_m or float(distance_m.max(initial=1.0))
         shares, middles_m, width_m = delivery_by_distance(distance_m, tried, delivered, farthest_m)
         self._canvas.bars("radio/distance", 100 * np.nan_to_num(shares), middles_m, 0.95 * width_m, GREEN)
 
@@ -237,9 +242,8 @@ def delivery_by_distance(
 ) -> tuple[Floats, Floats, float]:
     """Shares delivered by distance: (DISTANCE_BINS,), NaN where nobody tried; the bins' middles and width (m)."""
     width_m = farthest_m / DISTANCE_BINS
-    place = np.minimum((distance_m / width_m).astype(int), DISTANCE_BINS - 1)[tried > 0]
-    tries = np.bincount(place, tried[tried > 0], DISTANCE_BINS)
-    hits = np.bincount(place, delivered[tried > 0], DISTANCE_BINS)
+    place = np.minimum((distance_m / width_m).astype(int), DISTANCE_BINS - 1)
+    tries, hits = (np.bincount(place, each, DISTANCE_BINS) for each in (tried, delivered))
     share = np.divide(hits, tries, out=np.full(DISTANCE_BINS, np.nan), where=tries > 0)
     middles_m = (np.arange(DISTANCE_BINS) + 0.5) * width_m
     return share.astype(np.float32), middles_m.astype(np.float32), width_m

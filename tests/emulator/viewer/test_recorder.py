@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from rerun.chunk import RrdReader
 from emulator.radio.outcomes import Outcome
 from emulator.viewer.drawing import OUTCOME_COLOURS, PeriodArrays, ellipses, link_states
 from emulator.viewer.recorder import Recorder
-from emulator.viewer.scenes import STROKES, describe
+from emulator.viewer.scenes import STROKES, RadioScene, describe
 from emulator.viewer.sinks import Sinks, is_closed
 from tests.emulator.test_playback import watch
+from tests.support.motion import along, scenario_of_trips, write_trips
 from tests.support.recordings import Entity, read_back, rrd
 from vnet.errors import VnetError
 
@@ -182,6 +184,19 @@ def test_a_link_is_delivered_if_a_frame_got_through_and_else_what_befell_most(to
     period = PeriodArrays({"pairs": np.array(rows, dtype="<i4").tobytes()}, ["a", "b"])
     sender, receiver, state = link_states(period)
     assert list(zip(sender, receiver, state, strict=True)) == [(0, 1, Outcome.delivered), (1, 0, Outcome.peer_cap)]
+
+
+def test_frames_count_at_the_distance_that_they_were_sent_over(tmp_path: Path) -> None:
+    """Two approach each other at 60 m/s; below 500 m they hear each other, and beyond 550 m they do not."""
+    courses = {"a": [(0, 14, along(0, 30))], "b": [(0, 14, along(1200, -30, 10))]}
+    steady = {"path_loss": {"kind": "log_distance"}, "loss": 0.0}
+    scenario = scenario_of_trips(write_trips(tmp_path / "t.csv", courses), 14.0, radio=steady)
+    told, canvas = watch(scenario, tmp_path / "run").told, MagicMock()
+    scene = RadioScene(canvas, told[0][1])
+    for period in periods(told):
+        scene.period(period)
+    drawn = [call.args[1:3] for call in canvas.bars.call_args_list if call.args[0] == "radio/distance"]
+    assert {*np.concatenate([shares[m < 450] for shares, m in drawn]).tolist()} == {0.0, 100.0}
 
 
 def test_faults_and_the_dead_have_their_spans(entities: dict[str, Entity]) -> None:
