@@ -211,17 +211,19 @@ def _draw_vehicles(made: Canvas, position: Array, colour: str = BLUE, size: floa
 
 
 def _draw_names(made: Canvas, node_ids: Sequence[str], position: Array) -> str:
-    """Write each vehicle's name on a side where no other name is; returns what has no room, in words."""
+    """Write each vehicle's name within the axes where no other one is; returns what has no room, in words."""
     from matplotlib.transforms import Bbox
 
     taken: list[Bbox] = []
+    area = made.axes.bbox
     there = np.flatnonzero(np.isfinite(position).all(axis=1))
     for number in there.tolist():
         name, (x, y) = printable(node_ids[number], 12), made.axes.transData.transform(position[number])
         width, height = NAME_PX[0] * len(name), NAME_PX[1]
         for right, up in ((4.0, 1.0), (4.0, -1 - height), (-4 - width, 1.0), (-4 - width, -1 - height)):
             box = Bbox.from_bounds(x + right, y + up, width, height)
-            if not box.count_overlaps(taken):
+            inside = area.x0 <= box.x0 and box.x1 <= area.x1 and area.y0 <= box.y0 and box.y1 <= area.y1
+            if inside and not box.count_overlaps(taken):
                 taken.append(box)
                 look: dict[str, Any] = {"fontsize": 9, "color": INK, "va": "bottom"}
                 made.axes.annotate(name, position[number], (right, up), textcoords="offset points", **look)
