@@ -89,7 +89,7 @@ def radio(
             for name, table in tables.items():
                 with atomically(out / f"{name}.parquet") as part:
                     pq.write_table(table, part, compression="zstd")
-        _print(metrics, unicast_figures(recorded), SafeConsole())
+        _print(metrics, unicast_figures(recorded, within_m, from_s), SafeConsole())
 
 
 def _print(metrics: RadioMetrics, unicast: UnicastFigures | None, console: Console) -> None:

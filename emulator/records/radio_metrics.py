@@ -122,14 +122,16 @@ def radio_metrics(
     Without `has_busy` the channel busy ratio is left empty, whatever there is.
     """
     count = len(recorded.node_ids)
-    pairs = _pairs(recorded, count, within_m, round(from_s * NS_PER_S))
+    from_ns = round(from_s * NS_PER_S)
+    pairs = _pairs(recorded, count, within_m, from_ns)
     codes, place = np.unique(pairs.link, return_inverse=True)
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(recorded.node_ids, codes, count, figures)
     busy = (
         busy_ratios(recorded, math.ceil(round(from_s * NS_PER_S) / WINDOW_NS)) if has_busy else np.zeros((0, count))
     )
-    vehicles = _vehicles_table(recorded, codes, count, figures, busy)
+    original = _chosen(recorded, np.flatnonzero(recorded.copy == 0), within_m, from_ns)
+    vehicles = _vehicles_table(recorded, original, codes, count, figures, busy)
     totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(busy[~np.isnan(busy)])}
     return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
 
@@ -160,11 +162,7 @@ def rows_of_pairs(recorded: RecordedRun) -> NDArray[np.intp]:
 
 
 def _pairs(recorded: RecordedRun, count: int, within_m: float, from_ns: int) -> _Pairs:
-    rows = rows_of_pairs(recorded)
-    if from_ns > 0:
-        rows = rows[recorded.sent_ns[rows] >= from_ns]
-    if within_m < math.inf:
-        rows = rows[_distances_m(recorded, rows) <= within_m]
+    rows = _chosen(recorded, rows_of_pairs(recorded), within_m, from_ns)
     link = recorded.sender[rows] * count + recorded.receiver[rows]
     if (np.diff(recorded.sent_ns[rows]) >= 0).all():  # as runs write it; few links are sorted by their bits
         order = np.argsort(link.astype(np.uint16) if count <= 256 else link, kind="stable")
@@ -180,6 +178,13 @@ def _pairs(recorded: RecordedRun, count: int, within_m: float, from_ns: int) -> 
     delivered = recorded.outcome_is("delivered")[rows]
     distance_m = _distances_m(recorded, rows)
     return _Pairs(link, seq, sent_ns, recorded.arrival_ns[rows], delivered, distance_m, contact)
+
+
+def _chosen(recorded: RecordedRun, rows: NDArray[np.intp], within_m: float, from_ns: int) -> NDArray[np.intp]:
+    """Return those of some rows of the trace that were enqueued from then on, and whose receivers are so near."""
+    if from_ns > 0:
+        rows = rows[recorded.sent_ns[rows] >= from_ns]
+    return rows[_distances_m(recorded, rows) <= within_m] if within_m < math.inf else rows
 
 
 def _distances_m(recorded: RecordedRun, rows: NDArray[np.intp]) -> Array:
@@ -298,7 +303,12 @@ def _links_table(node_ids: list[str], codes: NDArray[np.intp], count: int, figur
 
 
 def _vehicles_table(
-    recorded: RecordedRun, codes: NDArray[np.intp], count: int, figures: dict[str, Array], busy: Array
+    recorded: RecordedRun,
+    original: NDArray[np.intp],
+    codes: NDArray[np.intp],
+    count: int,
+    figures: dict[str, Array],
+    busy: Array,
 ) -> pa.Table:
     sender, receiver = divmod(codes, max(count, 1))
 
@@ -310,7 +320,6 @@ def _vehicles_table(
         total = np.bincount(receiver[known], figures[name][known], count)
         return _ratio(total, np.bincount(receiver[known], minlength=count).astype(float))
 
-    original = recorded.copy == 0
     frames = np.unique(recorded.frame[original], return_index=True)[1]
     columns = {
         "frames": np.bincount(recorded.sender[original][frames], minlength=count),
@@ -402,9 +411,15 @@ class UnicastFigures:
         return f"{self.sent:,} sent, {self.acknowledged:,} acknowledged: {share}; {self.retries:,} retries"
 
 
-def unicast_figures(recorded: RecordedRun) -> UnicastFigures | None:
-    """Return the figures of a run without what faults send again; None without frames to single vehicles."""
+def unicast_figures(
+    recorded: RecordedRun, within_m: float = math.inf, from_s: float = 0.0
+) -> UnicastFigures | None:
+    """Return the figures of a run without what faults send again; None without frames to single vehicles.
+
+    Frames to receivers farther than `within_m`, and those that were enqueued before `from_s`, are left out.
+    """
     rows = np.flatnonzero((recorded.attempt > 0) & sent_by_programs(recorded))
+    rows = _chosen(recorded, rows, within_m, round(from_s * NS_PER_S))
     if not len(rows):
         return None
     frame = recorded.frame[rows]

@@ -281,7 +281,7 @@ SAMPLES = Table(
         "time_ns": Column(INT, "when it was handed to the radio"),
         "sender": Column(TEXT, ID),
         "seq": Column(INT, "number of its first frame, as in the trace"),
-        "frames": Column(pa.int32(), "number of its frames"),
+        "frames": Column(pa.int32(), "number of its frames with a receiver in range"),
         "kind": Column(TEXT, "put, delete, query, reply, error, or tokens"),
         "key": Column(TEXT, "its key, a query's selector, or the keys of tokens"),
         "payload_bytes": Column(INT, "bytes of its payload"),

@@ -135,7 +135,7 @@ class RadioScene:
         periods = round(WINDOW_S / self._period_s)
         self._tried, self._delivered = SlidingSum(periods), SlidingSum(periods)
         self._apart: deque[Sequence[NDArray[Any]]] = deque(maxlen=max(1, periods))
-        """Of each period of late the links with frames: their lengths (m), frames tried, and delivered."""
+        """The links with frames in each of the last periods: lengths (m), frames tried, and frames delivered."""
         self._latency, self._sent, self._received = SlidingSum(periods), SlidingSum(periods), SlidingSum(periods)
         self._latency_bins = LEAST_LATENCY_BINS
         self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods)

@@ -189,6 +189,7 @@ def test_near_and_later_receptions_are_those_of_a_trace_without_the_others(
     told = radio_metrics(evidence_of(*trace), within_m=within_m, from_s=from_s)
     expected = radio_metrics(evidence_of(some, position_m, moves))
     assert told.links.equals(expected.links) and told.totals == expected.totals
+    assert told.vehicles.equals(expected.vehicles) and told.distances.equals(expected.distances)
 
 
 @pytest.mark.slow
@@ -293,3 +294,8 @@ def test_figures_of_frames_to_one_vehicle_are_what_the_program_was_told(tmp_path
     assert figures.sent == len(told)
     assert figures.acknowledged == sum(each["delivered"] for each in told)
     assert figures.retries == sum(each["attempts"] - 1 for each in told)
+    rows = [row for row in recorded.trace.to_pylist() if row["attempt"] and not row["copy"]]
+    late = unicast_figures(recorded, from_s=0.5)
+    assert late is not None and late.sent < figures.sent
+    assert late.sent == len({(row["sender"], row["seq"]) for row in rows if row["sent_ns"] >= 5e8})
+    assert unicast_figures(recorded, within_m=0.0) is None
