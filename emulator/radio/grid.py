@@ -37,6 +37,7 @@ class Wanted(NamedTuple):
     """Resources that a vehicle looks for: `length` subchannels in a slot from `first` to `last`.
 
     It will use them again every `period` slots, `times` times in all. It transmits anyway in the slots `booked`.
+    A resource that it `checks` again is in slot `first`, and stays unless others have reserved it.
     """
 
     node: int
@@ -46,6 +47,7 @@ class Wanted(NamedTuple):
     period: int
     times: int
     booked: frozenset[int] = frozenset()
+    checks: bool = False
 
 
 class Candidates(NamedTuple):
@@ -220,6 +222,7 @@ class SensedGrid:
         if wanted.booked:
             free[[slot - wanted.first for slot in wanted.booked if 0 <= slot - wanted.first < len(free)]] = False
         monitored = free & ~self._unmonitored(now, wanted)
+        monitored[0] |= wanted.checks & free[0]
         least = int(np.ceil(self._mac.candidate_share * strongest_dbm.size))
         if monitored.sum() * strongest_dbm.shape[1] < least:
             monitored = free

@@ -432,7 +432,9 @@ class Sidelink(Mac):
             return
         sent = booking.sent or flow.queue[0][1]  # the first use of a grant is that of the frame it was selected for
         times = 10 * grant.counter if grant is not None else 1
-        wanted = Wanted(station.node, booking.slot, booking.last, booking.length, booking.period, times)
+        wanted = Wanted(
+            station.node, booking.slot, booking.last, booking.length, booking.period, times, checks=True
+        )
         station.booked -= booking.slots
         if grant is not None:
             flow.grant = None  # whose own slots are free to it

@@ -199,9 +199,17 @@ def test_queue_frames_counts_the_frames_of_all_flows() -> None:
     assert [row["outcome"] for row in rows].count("queue_full") == 1
 
 
-def test_re_evaluation_leaves_a_resource_alone_that_nobody_has_reserved() -> None:
-    rows = [beacons(engine(line(0, 50), **with_mac(NR, re_evaluation=checks)), 1, 5.0) for checks in (False, True)]
-    assert rows[0] == rows[1]
+@pytest.mark.parametrize(
+    ("options", "end_s"),
+    [({}, 5.0), ({"scheduling": "dynamic", "retransmit": True, "scs_khz": 15, "t2_ms": 10}, 30.0)],
+    ids=["default", "of few slots many repeat its own"],
+)
+def test_re_evaluation_leaves_a_resource_alone_that_nobody_has_reserved(
+    options: dict[str, Any], end_s: float
+) -> None:
+    macs = [with_mac(NR, re_evaluation=checks, **options) for checks in (False, True)]
+    one, other = (beacons(engine(line(0, 50), **mac), 1, end_s) for mac in macs)
+    assert one == other
 
 
 @pytest.mark.parametrize("again", [False, True])
