@@ -200,6 +200,8 @@ def run_for_agents(
         if not (place / "access.json").exists():
             options.access.save(place, options.listen, place.resolve())
         who, file = ("hosts", "host-NAME.json") if options.access.hosts else ("agents", "NODE.json")
+        if scenario.has_gateways:  # whose programs have endpoints of their own
+            who, file = "observers", "observer.json"
         return f"credentials of the {who}: {place}/credentials/{file}"
 
     _run_live(session, request, create)

@@ -262,6 +262,10 @@ def test_a_program_that_never_connects_and_a_port_that_is_taken_are_named(vnet: 
     both = '["python", "talker.py", "{id}"]', '[["python", "talker.py", "{id}"], ["sleep", "100"]]'
     done = vnet("run", scenario(tmp_path, both), "--set", "run.join_timeout_s=4")
     assert re.search(r"vehicles have not connected within 4 s: v01 at \S+ \('sleep 100'\), v02 at", done.stderr)
+    by_hand = "--listen=tcp/127.0.0.1:0", "--set=run.join_timeout_s=1"
+    done = vnet("emulator", scenario(tmp_path), *by_hand)
+    assert done.status == 2 and "endpoints.json in the run's folder" in done.stderr
+    assert "VNET_ENDPOINT" not in done.stderr and "agents" not in done.stderr
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

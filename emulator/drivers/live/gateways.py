@@ -56,7 +56,8 @@ ENDPOINTS = "endpoints.json"
 """File of a run's folder with the endpoint of each vehicle."""
 HIGHEST_PORT = 65_535
 HOW = "ZENOH_CONFIG, VNET_ENDPOINT and {endpoint} have it, for Zenoh 1; in Python zenoh.open() finds it by itself"
-"""Hint for those whose program does not connect."""
+BY_HAND = f"{ENDPOINTS} in the run's folder has all endpoints, for Zenoh 1"
+"""Hints for those whose program does not connect: started by vnet, or by hand."""
 _ESTABLISHED = "01"
 """State of a connection in proc_net(5)."""
 TURNS_S = 0.1
@@ -216,8 +217,9 @@ class Gateways:
             numbered = sorted(self.endpoints, key=self._emulation.number.__getitem__)
             endpoints = {node: self.endpoints[node] for node in numbered}
             (path / ENDPOINTS).write_text(json.dumps(endpoints, indent=1) + "\n")
-        if not self._starts:
-            where = [f"{node} at {self.endpoints[node]}" for node in self._vehicles]
+        awaited = [node for node, vehicle in self._vehicles.items() if not vehicle.is_ready]
+        if awaited and not self._starts:
+            where = [f"{node} at {self.endpoints[node]}" for node in awaited]
             self.on_state(f"waiting for programs of {first_names(where)} ({ENDPOINTS} has all)")
 
     def signal(self, name: str, number: signal.Signals) -> None:
@@ -596,7 +598,7 @@ class Gateways:
             return f"{len(nodes)} of {total} endpoints do not listen within {timeout_s:g} s: {first_names(nodes)}"
         return (
             f"programs of {len(where)} of {total} vehicles have not connected within {timeout_s:g} s: "
-            f"{first_names(where)}: {HOW}"
+            f"{first_names(where)}: {HOW if self._starts else BY_HAND}"
         )
 
 
