@@ -925,6 +925,29 @@ def test_what_virtual_time_does_not_have_is_refused_when_the_scenario_is_read(
         Scenario.model_validate({"program": {"kind": "zenoh", "command": words}, "fault": fault})
 
 
+def test_who_matches_is_told_as_by_zenoh_itself(drive: Drive) -> None:
+    """Zenoh 1.10.2: of queryables of others those that answer all keys, of one's own those that answer some."""
+    run = drive(
+        """
+        import zenoh
+        one, other = zenoh.open(zenoh.Config()), zenoh.open(zenoh.Config())
+        targets = zenoh.QueryTarget.BEST_MATCHING, zenoh.QueryTarget.ALL_COMPLETE
+        queriers = [one.declare_querier("a/*", target=target) for target in targets]
+        publisher = one.declare_publisher("a/x")
+        for session in other, one:
+            for key, complete in ("a/*", False), ("a/**", True), ("a/x", True):
+                for origin in zenoh.Locality.ANY, zenoh.Locality.SESSION_LOCAL:
+                    with session.declare_queryable(key, print, complete=complete, allowed_origin=origin):
+                        print(*[int(each.matching_status.matching) for each in queriers], end=" ")
+                    with session.declare_subscriber(key, print, allowed_origin=origin):
+                        print(int(publisher.matching_status.matching))
+        """,
+        radio={"keys": []},
+    )
+    others, own = ["1 0 1", "0 0 0", "1 1 1", "0 0 0", "0 0 1", "0 0 0"], ["1 0 1", "1 1 1", "1 0 1"]
+    assert printed(run) == [*others, *(line for line in own for _ in range(2))]
+
+
 def test_what_is_closed_ends_what_waits_as_at_zenoh_itself(drive: Drive) -> None:
     run = drive("""
         import threading, time, zenoh

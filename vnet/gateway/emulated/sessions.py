@@ -384,7 +384,7 @@ class Publisher(Sending):
         }
         check({**self._qos, "reliability": reliability})
         super().__init__(session, key_expr)
-        self.matches = partial(session.vehicle.matches_subscriber, self.key_expr)
+        self.matches = partial(session.vehicle.matches_subscriber, self.session, self.key_expr)
         self.encoding = encoding_of(encoding)
         self.congestion_control = congestion_control or zenoh.CongestionControl.DEFAULT
         self.priority = priority or zenoh.Priority.DEFAULT
@@ -423,7 +423,7 @@ class Querier(Sending):
         check_taken(zenoh.Session.declare_querier, options)
         super().__init__(session, key_expr)
         all_complete = target == zenoh.QueryTarget.ALL_COMPLETE
-        self.matches = partial(session.vehicle.matches_queryable, self.key_expr, all_complete)
+        self.matches = partial(session.vehicle.matches_queryable, self.session, self.key_expr, all_complete)
         self.accept_replies = accept_replies or zenoh.ReplyKeyExpr.DEFAULT
         self._options = {**options, "target": target, "accept_replies": accept_replies}
         check(self._options)

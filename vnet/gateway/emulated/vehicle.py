@@ -137,17 +137,23 @@ class Vehicle(RadioSide[Asking]):
             for tell in list(self.on_matching):
                 tell()
 
-    def matches_subscriber(self, key: zenoh.KeyExpr) -> bool:
+    def matches_subscriber(self, session: object, key: zenoh.KeyExpr) -> bool:
         """Return whether anybody may take what is put there: over the radio nobody knows."""
-        return self.crosses(str(key)) or bool(self._subscribers_of(str(key)))
+        there = self._subscribers_of(str(key))
+        return self.crosses(str(key)) or any(each.session is session or each.is_remote for each in there)
 
-    def matches_queryable(self, key: zenoh.KeyExpr, complete: bool) -> bool:
-        """Return whether anybody may answer a query there."""
+    def matches_queryable(self, session: object, key: zenoh.KeyExpr, complete: bool) -> bool:
+        """Return whether anybody may answer a query there, as a session of Zenoh 1.10 says of its queriers.
+
+        A queryable of another session counts if it answers all keys; one of its own may answer some of them.
+        """
         if self._is_asked_by_radio(key, complete):
             return True
-        if complete:
-            return any(each.is_complete and each.key.includes(key) for each in self._entities["queryable"])
-        return any(each.key.intersects(key) for each in self._entities["queryable"])
+        return any(
+            each.key.includes(key) if complete or each.session is not session else each.key.intersects(key)
+            for each in self._entities["queryable"]
+            if (each.is_complete or not complete) and (each.session is session or each.is_remote)
+        )
 
     # Samples.
 
