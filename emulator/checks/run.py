@@ -63,11 +63,35 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     ]
     if not gone and not recorded.event(EventKind.started):
         return unknown("no event says that the run started")
+    if not gone and (away := _not_back(recorded)):
+        rows = [{"node": recorded.node_ids[node], "since_ns": since_ns} for node, since_ns in away.items()]
+        since = f"{rows[0]['since_ns'] / NS_PER_S:g} s, when a fault on it ended"
+        return unknown(f"{first_names([row['node'] for row in rows])}: not up again since {since}", rows=rows)
     if not gone:
         who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
         return valid(f"{who} to the end")
     listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
     return invalid(in_words(kinds_of(gone)), gone=listed)
+
+
+def _not_back(recorded: RecordedRun) -> dict[int, int]:
+    """Return the nodes that no fault keeps down and that are down all the same at the end, and since when.
+
+    That is of real time, where a program of another kind than vnet's own may wait before it connects.
+    """
+    ends_ns: dict[int, int] = {}
+    for planned in recorded.plan if recorded.scenario.run.pacing == "realtime" else ():
+        if isinstance(planned.fault, ProcessFault) and planned.fault.ends:
+            for node in np.flatnonzero(planned.nodes).tolist():
+                ends_ns[node] = max(ends_ns.get(node, 0), planned.end_ns)
+    here = recorded.places.present()[-1] if recorded.moves else np.ones(len(recorded.node_ids), dtype=bool)
+    late = [
+        node
+        for node, end_ns in ends_ns.items()
+        if end_ns + START_UP_NS < recorded.closed_ns and here[node] and node not in recorded.deaths_ns
+    ]
+    down = recorded.is_down(np.array(late, dtype=np.intp), np.full(len(late), recorded.closed_ns - 1))
+    return {node: ends_ns[node] for node, is_down in sorted(zip(late, down.tolist(), strict=True)) if is_down}
 
 
 def check_no_exceptions(recorded: RecordedRun) -> Finding:

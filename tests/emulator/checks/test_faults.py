@@ -632,6 +632,23 @@ def test_a_death_that_a_fault_wanted_is_none() -> None:
         assert verdict(replace(recorded, events=[*recorded.events, died]), "agents_alive") is expected
 
 
+def test_who_never_comes_back_after_a_fault_in_real_time_was_not_there_to_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    recorded = with_fault("restart")
+    run = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
+    back = replace(recorded, scenario=recorded.scenario.model_copy(update={"run": run}))
+    gone = replace(back, events=[event for event in back.events if event.kind != "restarted"])
+    assert verdict(gone, "agents_alive") is Verdict.VALID, "it may be on its way"
+    monkeypatch.setattr("emulator.checks.run.START_UP_NS", 0)
+    assert verdict(back, "agents_alive") is Verdict.VALID
+    (planned,) = recorded.plan
+    killed = [recorded.node_ids[node] for node in np.flatnonzero(planned.nodes)]
+    found = result(gone, "agents_alive")
+    assert isinstance(found, CheckResult) and found.verdict is Verdict.UNKNOWN
+    assert found.figures["rows"] == [{"node": node, "since_ns": planned.end_ns} for node in killed]
+
+
 @pytest.mark.parametrize("node", ["v01", "emulator"])
 def test_growing_memory_is_a_note_of_agents_alone(node: str) -> None:
     recorded = with_fault("loss")
