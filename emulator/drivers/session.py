@@ -7,6 +7,7 @@ programs are (`Local`, or `LiveOptions` for processes over Zenoh), in the files 
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import os
 import shlex
 import subprocess
@@ -14,10 +15,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import closing, nullcontext, redirect_stdout
 from contextvars import copy_context
 from dataclasses import dataclass
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from queue import SimpleQueue
@@ -37,7 +39,7 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.faults import refuse_router_restart
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world
-from vnet.errors import ProgramError
+from vnet.errors import ProgramError, VnetError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.environment import SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
@@ -125,6 +127,9 @@ class Session:
         self._give: Callable[[int | None], Any] = self._horizons.put
         self._went_at: float | None = None
         self._lockstep: Lockstep | None = None
+        self._stop = threading.Event()
+        self._interrupt: Callable[[], Any] = self._interrupt_local
+        self._thread: threading.Thread | None = None
 
     @property
     def folder(self) -> RunFolder:
@@ -185,7 +190,9 @@ class Session:
         """Get ready for time 0. The future, here and in `go`, is done when the run is held or over."""
         self.started = True
         run = copy_context().run  # of what a test has set for the programs that it imports
-        threading.Thread(target=run, args=(self._run_held,), name=f"vnet {self.command}", daemon=True).start()
+        name = f"vnet {self.command}"
+        self._thread = threading.Thread(target=run, args=(self._run_held,), name=name, daemon=True)
+        self._thread.start()
         return self.stands
 
     def go(self, horizon_ns: int | None) -> Future[None]:
@@ -197,11 +204,31 @@ class Session:
         self._give(horizon_ns)
         return self.stands
 
-    def hold(self) -> int:
-        """Have a run that is on its way held where it stands; returns that emulated time (ns)."""
+    def wait(self, patience_s: float) -> None:
+        """Wait until the run is held or over; one whose programs do not yield for so long is interrupted.
+
+        Raises VnetError if that does not end it either.
+        """
+        wait([self.stands], patience_s)
+        if not self.stands.done():
+            self._interrupt()
+            wait([self.stands], patience_s if self.live is None else None)  # a live run kills who does not end
+        if not self.stands.done():
+            raise VnetError(f"a program has not yielded for {2 * patience_s:g} s, and cannot be interrupted")
+        self.stands.result()
+
+    def _interrupt_local(self) -> None:
+        """Interrupt programs on the run's thread as Ctrl-C would on the main one."""
+        self._stop.set()
+        assert self._thread is not None
+        thread = ctypes.c_ulong(self._thread.ident or 0)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(KeyboardInterrupt))
+
+    def hold(self, patience_s: float) -> int:
+        """Have a run that is on its way held where it stands; returns that emulated time (ns). See `wait`."""
         if self._lockstep is not None:
             self._lockstep.is_to_hold = True
-        self.stands.result()
+        self.wait(patience_s)
         if self.over or self._lockstep is None:
             return self.emulation.ended_ns or 0
         return self._lockstep.horizon_ns or 0
@@ -209,11 +236,9 @@ class Session:
     def _run_held(self) -> None:
         try:
             if self.live is None:
-                simulate(self.emulation, self._hold)
+                simulate(self.emulation, self._hold, self._stop)
             else:
-                from emulator.drivers.live import run_live
-
-                asyncio.run(run_live(self.emulation, self.live, before_horizon=self._hold_live))
+                asyncio.run(self._run_live())
         except BaseException as error:
             self.over = True
             self.stands.set_exception(error)
@@ -225,6 +250,14 @@ class Session:
         self._lockstep = lockstep
         self._stand()
         lockstep.horizon_ns = self._horizons.get()
+
+    async def _run_live(self) -> None:
+        from emulator.drivers.live import run_live
+
+        task, loop = asyncio.current_task(), asyncio.get_running_loop()
+        assert task is not None and self.live is not None
+        self._interrupt = partial(loop.call_soon_threadsafe, task.cancel)
+        await run_live(self.emulation, self.live, before_horizon=self._hold_live)
 
     async def _hold_live(self, lockstep: Lockstep) -> None:
         self._lockstep = lockstep

@@ -131,7 +131,7 @@ def _ending_between_windows(
     mine = [each for each, by in before.items() if by is signal.default_int_handler]
     if isinstance(processes, Pipes) and before.get(signal.SIGTERM) is signal.SIG_DFL:
         mine.append(signal.SIGTERM)
-    processes.no_signal_raises = lambda: not any(map(can_raise, before))
+    processes.no_signal_raises = lambda: not (stop.is_set() or any(map(can_raise, before)))
     with signals_handled(ask, *mine):  # others see to the rest
         yield
 

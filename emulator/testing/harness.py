@@ -41,6 +41,8 @@ from vnet.units import NS_PER_S
 
 CRASHES = "agents_alive", "no_exceptions"
 """Checks that fail a test which has not asked how its run ended."""
+PATIENCE_S = 5.0
+"""Time on the wall clock that programs have to yield once their test is over."""
 
 
 class RunHarness:
@@ -136,7 +138,11 @@ class RunHarness:
         if kind is not None:
             await asyncio.to_thread(self.close)
             return
-        judgement = await asyncio.to_thread(self._judge)
+        try:
+            judgement = await asyncio.to_thread(self._judge)
+        except asyncio.CancelledError:  # by Ctrl-C; asyncio waits for its threads before pytest goes on
+            await asyncio.to_thread(self._run.wait, PATIENCE_S)
+            raise
         promised = {PREFIX + name for name in self._promises} - self._named
         broken = [each for each in judgement.checks if each.name in promised and _fails(each, allow_unknown=False)]
         if not self._ended_by_test:
@@ -330,13 +336,14 @@ class RunHarness:
     def close(self) -> None:
         """End the run, if it is on, whatever state it is in, and keep what can be kept of it.
 
-        It ends where it stands; faults that are planned for later act all the same before.
+        It ends where it stands; faults that are planned for later act all the same before. It is interrupted if a
+        program does not yield for `PATIENCE_S`.
         """
         broken = self._run.stands.done() and self._run.stands.exception() is not None
         if not self._run.started or broken:
             return
         if self._judgement is None:
-            self._now_ns = self._run.hold()
+            self._now_ns = self._run.hold(PATIENCE_S)
             for planned in list(self._emulation.faults.faults):
                 if planned.acts_at(self._now_ns) and not self._run.over:
                     self._emulation.heal(planned.label, max(self._now_ns - 1, planned.start_ns))

@@ -32,6 +32,16 @@ async def proud(node: Node) -> None:
         node.report((float("nan"), 0.0) if alone else fix.position_m, fix.covariance_m2)
 
 
+async def busy(node: Node) -> None:
+    """A beacon whose first vehicle computes for ever after 0.5 s; it presses Ctrl-C for a process before."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        if fix.time_ns == 5 * PERIOD_NS and node.id == "v01":
+            os.kill(node.options["pid"], signal.SIGINT)
+            while True:
+                pass
+
+
 async def faulty(node: Node) -> None:
     """A beacon whose first two vehicles address memory that is not there."""
     async for fix in node.gnss:
