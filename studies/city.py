@@ -56,9 +56,12 @@ def place(
 
     `section` are the other keys of `map`.
 
-    Raises VnetError unless both trips and roads are given, and from files that are there.
+    Raises VnetError unless both trips and roads are given, and from files that are there; and for options of theirs
+    without them.
     """
     if trips is None and roads is None:
+        if any(section.values()) or impossible_trips != "leave_out":
+            raise VnetError("--map-sigma, --map-aside, --map-datum…, --refuse-impossible need --trips and --map")
         return {"network": {"kind": "city", "vehicles": VEHICLES}}
     for option, path in (("--trips", trips), ("--map", roads)):
         if path is None:

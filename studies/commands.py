@@ -255,9 +255,9 @@ def roads(
     with one_line_errors():
         folder = _folder(out, "roads")
         places = study.cities(study.CITIES)
-        if trips is not None or roads is not None:
-            section = _map_section(map_sigma, map_aside, map_datum, map_datum_sigma)
-            places["trips"] = driving.place(trips, roads, section)
+        driven = driving.place(trips, roads, _map_section(map_sigma, map_aside, map_datum, map_datum_sigma))
+        if "map" in driven:
+            places["trips"] = driven
         cells = study.roads_cells(places, range(1, seeds + 1), duration, rate)
         results = _run(cells, folder, "roads", only)
         _show(study.report(results, duration, rate), folder / "roads.md")

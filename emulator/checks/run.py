@@ -64,9 +64,10 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     if not gone and not recorded.event(EventKind.started):
         return unknown("no event says that the run started")
     if not gone and (away := _not_back(recorded)):
-        rows = [{"node": recorded.node_ids[node], "since_ns": since_ns} for node, since_ns in away.items()]
-        since = f"{rows[0]['since_ns'] / NS_PER_S:g} s, when a fault on it ended"
-        return unknown(f"{first_names([row['node'] for row in rows])}: not up again since {since}", rows=rows)
+        names = [recorded.node_ids[node] for node in away]
+        rows = [{"node": node, "since_ns": since_ns} for node, since_ns in zip(names, away.values(), strict=True)]
+        since = f"{min(away.values()) / NS_PER_S:g} s, when a fault ended"
+        return unknown(f"{first_names(names)}: not up again since {since}", rows=rows)
     if not gone:
         who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
         return valid(f"{who} to the end")

@@ -182,8 +182,7 @@ BUSY = Table(
         "time_ns": Column(INT, "when the 100 ms began"),
         "node": Column(NAME, ID),
         "busy_ratio": Column(FLOAT, "the share of them in which it sent, or sensed `radio.mac.carrier_sense_dbm` "
-                                    "or more (sidelink: the busy share of subchannels); 0 of one that is not "
-                                    "in the network"),
+                                    "or more (sidelink: of subchannels); 0 of the absent"),
     },
     which=": how busy the medium was that they share, with `[radio.mac]`", is_due=_with_mac,
 )

@@ -14,6 +14,7 @@ from studies import city
 from tests.emulator.world.maps.test_city_map import driving
 from tests.support.cells import compute_here
 from tests.support.command_line import app
+from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
 
@@ -55,6 +56,13 @@ def test_every_mechanism_drives_once_and_leaves_a_table_and_pictures(
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)  # nobody looks at it again
     monkeypatch.setattr("emulator.cells.cells.each_done", lambda missing, *_: iter([1 / 0] if missing else []))
     assert run_small(monkeypatch, files) == text, "what is finished is not run again"
+
+
+def test_options_of_trips_and_their_map_are_refused_without_them() -> None:
+    assert city.place(None, None, {"sigma_m": 0.0}) == {"network": {"kind": "city", "vehicles": city.VEHICLES}}
+    for section, impossible in ({"sigma_m": 3.0}, "leave_out"), ({}, "refuse"):
+        with pytest.raises(VnetError, match="need --trips and --map"):
+            city.place(None, None, section, impossible)
 
 
 def test_errors_are_those_of_the_place() -> None:
