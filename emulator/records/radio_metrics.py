@@ -127,9 +127,7 @@ def radio_metrics(
     codes, place = np.unique(pairs.link, return_inverse=True)
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(recorded.node_ids, codes, count, figures)
-    busy = (
-        busy_ratios(recorded, math.ceil(round(from_s * NS_PER_S) / WINDOW_NS)) if has_busy else np.zeros((0, count))
-    )
+    busy = busy_ratios(recorded, math.ceil(from_ns / WINDOW_NS)) if has_busy else np.zeros((0, count))
     original = _chosen(recorded, np.flatnonzero(recorded.copy == 0), within_m, from_ns)
     vehicles = _vehicles_table(recorded, original, codes, count, figures, busy)
     totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(busy[~np.isnan(busy)])}
