@@ -19,7 +19,7 @@ from tests.system.conftest import TIMEOUT_S, killed_at_last
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
 LONG: dict[str, dict[str, Any]] = {
-    "run": {"duration_s": 15.0, "name": "watched"},
+    "run": {"duration_s": 30.0, "name": "watched"},
     "program": {"entry": "agents.beacon:main"},
 }
 
