@@ -23,6 +23,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextvars
+import faulthandler
 import gc
 import importlib
 import inspect
@@ -60,6 +61,7 @@ _SEED_BYTES = 16
 _system_bytes, _seed, _system_entropy = os.urandom, random.Random.seed, os.getrandom
 _python_state, _numpy_state = random._inst, np.random.mtrand._rand
 _set_threshold, _signal, _basic_config = gc.set_threshold, signal.signal, logging.basicConfig
+_watch_later = faulthandler.dump_traceback_later
 _OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
 """Functions of `numpy.random` that are no methods of its generator, and the methods that they call."""
 
@@ -319,6 +321,17 @@ def _signal_set(number: int, handler: Any) -> Any:
     return signal.getsignal(number)
 
 
+_is_watched = False
+"""True if a program has armed a watchdog."""
+
+
+def _watched_later(*arguments: Any, **options: Any) -> None:
+    """Arm a watchdog; that of a program ends with the programs, and not what vnet does after them."""
+    global _is_watched
+    _is_watched = _is_watched or present_node() is not None
+    _watch_later(*arguments, **options)
+
+
 def _threshold_set(*thresholds: int) -> None:
     """Leave it to a loop in virtual time when garbage is collected, where its program asks."""
     if _drawing() is None or not hasattr(asyncio._get_running_loop(), "start_at"):
@@ -348,6 +361,7 @@ _STAND_INS: list[tuple[Any, str, Any, Any]] = [
     *_of_chance(),
     (gc, "set_threshold", _set_threshold, _threshold_set),
     (signal, "signal", _signal, _signal_set),
+    (faulthandler, "dump_traceback_later", _watch_later, _watched_later),
     (logging, "basicConfig", _basic_config, _configure_logging),
 ]
 _OTHER = {id(own): other for owner, _, own, other in _STAND_INS if owner is not tempfile}
@@ -368,11 +382,14 @@ def attach() -> None:
 
 def detach() -> None:
     """Give the names their own values back when no programs run any more."""
-    global _users
+    global _users, _is_watched
     with _lock:
         _users -= 1
         if _users == 0:
             _set_names(own=True)
+            if _is_watched:
+                faulthandler.cancel_dump_traceback_later()
+            _is_watched = False
 
 
 def _set_names(own: bool) -> None:

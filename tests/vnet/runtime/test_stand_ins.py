@@ -2,6 +2,7 @@
 
 import asyncio
 import copy
+import faulthandler
 import gc
 import importlib
 import os
@@ -156,6 +157,17 @@ def test_a_program_in_virtual_time_leaves_to_the_loop_when_garbage_is_collected(
     monkeypatch.setattr(asyncio.SelectorEventLoop, "start_at", 0, raising=False)
     as_node(Fake(1), lambda: gc.set_threshold(7))
     assert gc.get_threshold() == before
+
+
+def test_the_watchdog_of_a_program_ends_with_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    cancelled: list[bool] = []
+    monkeypatch.setattr("faulthandler.cancel_dump_traceback_later", lambda: cancelled.append(True))
+    monkeypatch.setattr(own_asyncio, "_watch_later", lambda *_, **__: None)
+    for use, ends in ((lambda: None, []), (lambda: faulthandler.dump_traceback_later(60, exit=True), [True])):
+        as_node(Fake(1), use)
+        own_asyncio.detach()
+        own_asyncio.attach()
+        assert cancelled == ends, "that of others stays"
 
 
 def test_a_seed_of_a_program_is_its_nodes_alone() -> None:
