@@ -925,6 +925,31 @@ def test_what_virtual_time_does_not_have_is_refused_when_the_scenario_is_read(
         Scenario.model_validate({"program": {"kind": "zenoh", "command": words}, "fault": fault})
 
 
+@pytest.mark.parametrize(
+    ("held", "handled"),
+    [
+        ("asyncio.create_task(fails())", False),
+        ("asyncio.get_running_loop().run_in_executor(None, int, 'x')", False),
+        ("asyncio.create_task(fails())", True),
+    ],
+)
+def test_what_has_failed_in_a_task_that_the_program_holds_is_judged_at_its_end(
+    drive: Drive, held: str, handled: bool
+) -> None:
+    text = f"""
+        import asyncio
+        async def fails():
+            raise LookupError("fails")
+        async def main():
+            global task
+            task = {held}
+            await asyncio.sleep(1)
+            {"await asyncio.wait([task]); task.exception()" if handled else ""}
+        asyncio.run(main())
+        """
+    assert bool(events(drive(text), "exception")) is not handled
+
+
 def test_who_matches_is_told_as_by_zenoh_itself(drive: Drive) -> None:
     """Zenoh 1.10.2: of queryables of others those that answer all keys, of one's own those that answer some."""
     run = drive(

@@ -168,6 +168,8 @@ async def run_program(vehicle: Vehicle, words: Sequence[str], environment: Mappi
             ended = ProgramError(f"{' '.join(words)} ended with {leave.code!r}")
             raise ended.with_traceback(leave.__traceback__) from leave
     finally:
+        if not isinstance(sys.exception(), GeneratorExit):
+            modules.threads.tell_failed()
         if not isinstance(sys.exception(), asyncio.CancelledError):
             modules.threads.stop_where_they_are()
             for session in modules.sessions:

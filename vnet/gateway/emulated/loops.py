@@ -6,6 +6,7 @@ A loop waits where it asks its selector, in the thread of the program that runs 
 from __future__ import annotations
 
 import signal
+import weakref
 from collections.abc import Callable
 from itertools import count
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 from greenlet import GreenletExit
 
 from vnet.gateway.emulated.strands import Lock, Threads, fail
-from vnet.runtime.asyncio_internals import abandon_pending, close_abandoned
+from vnet.runtime.asyncio_internals import abandon_pending, close_abandoned, disclaim, is_unretrieved
 from vnet.runtime.outside_loop import collector
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.units import NS_PER_S
@@ -58,6 +59,18 @@ def prepare_asyncio(
                 close_abandoned(task, module)
 
     threads.close_tasks = close_tasks
+    failed: weakref.WeakSet[Any] = weakref.WeakSet()
+
+    def set_exception(self: Any, error: Any) -> None:
+        given_exception(self, error)
+        failed.add(self)
+
+    def tell_failed() -> None:
+        for future in sorted(filter(is_unretrieved, failed), key=number_of):
+            fail(disclaim(future), "in a task or a future of asyncio")
+
+    given_exception, module.Future.set_exception = module.Future.set_exception, set_exception
+    threads.tell_failed = tell_failed
 
     class Loop(module.BaseEventLoop):  # type: ignore[misc]
         def __init__(self, selector: object = None) -> None:

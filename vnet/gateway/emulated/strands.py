@@ -437,6 +437,8 @@ class Threads:
         self._main_task: asyncio.Task[Any] | None = None
         self.on_interrupt: Callable[[], object] = lambda: None
         """Does what `_thread.interrupt_main` does."""
+        self.tell_failed: Callable[[], object] = lambda: None
+        """Tells what has failed in asyncio, that the program holds and has not asked for."""
         self.close_tasks: Callable[[], object] = lambda: None
         """Closes what the program's loops of asyncio have left; Python would run its `finally` at any time."""
 
