@@ -21,6 +21,8 @@ NOT_THE_PROGRAM = (
     *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")),
 )
 """Folders of code that is no program: vnet, the standard library, installed packages."""
+LONGEST = 8000
+"""Characters that are kept of a message, its first ones, and of a traceback, its last ones."""
 _GROUP: Any = getattr(builtins, "BaseExceptionGroup", ())
 """None before Python 3.11."""
 
@@ -31,7 +33,7 @@ def error_line(error: BaseException) -> str:
         first, *others = leaves(error)
         return f"{error_line(first)} (and {len(others)} more in its group)" if others else error_line(first)
     try:
-        text = " ".join(str(error).encode(errors="backslashreplace").decode().split())
+        text = " ".join(str(error)[:LONGEST].encode(errors="backslashreplace").decode().split())
     except Exception as another:  # of the exception's own __str__
         text = f"(its text cannot be made: {type(another).__name__})"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
@@ -77,7 +79,7 @@ def write_report(path: str, error: BaseException, status: object, place: str) ->
         "error": error_line(error),
         "status": "" if status is None else repr(status),
         "place": own_line(error) or place,
-        "details": "".join(traceback.format_exception(type(error), error, error.__traceback__)),
+        "details": "".join(traceback.format_exception(type(error), error, error.__traceback__))[-LONGEST:],
     }
     content = {name: text.encode(errors="backslashreplace").decode() for name, text in report.items()}
     with suppress(OSError):

@@ -19,15 +19,13 @@ from typing import Any
 from vnet.errors import sendable
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
-from vnet.runtime.error_text import error_line, line_of, own_line
+from vnet.runtime.error_text import LONGEST, error_line, line_of, own_line
 from vnet.runtime.outside_loop import ExecutorJob, ProcessEndedError, collector
 from vnet.runtime.own_asyncio import NOBODY, current_node, present_node
 from vnet.runtime.ready_queue import node_of
 from vnet.runtime.virtual_time import SkewedLoop
 from vnet.transport.wire import Unhandled
 
-LONGEST_TRACEBACK = 8000
-"""Characters of a traceback that is kept: its last ones."""
 MOST_HELD = 1000
 """Exceptions that a process keeps until its end; of a flood, the first ones."""
 FIRST_CLEANING = 1000
@@ -247,7 +245,7 @@ class UnhandledExceptions:
         node = self._fallback if failure.owner is None else failure.owner.id
         line = own_line(error)
         place = f"{failure.place} ({line})" if line else failure.place
-        details = sendable("".join(traceback.format_exception(error)))[-LONGEST_TRACEBACK:]
+        details = sendable("".join(traceback.format_exception(error)))[-LONGEST:]
         return Unhandled(node, failure.time_ns, error_line(error), place, details)
 
 

@@ -555,3 +555,15 @@ def test_a_crash_in_a_library_is_told_at_the_program_s_own_line() -> None:
     (kind,) = kinds_of(event for event in emulation.folder.events if event.kind == "crashed")
     line = crashes_in_a_library.__code__.co_firstlineno + 2
     assert f"{Path(__file__).name}:{line}" in str(kind)
+
+
+async def crashes_at_length(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    raise ValueError("x" * 100_000)
+
+
+def test_of_a_long_message_the_beginning_is_told() -> None:
+    """Live, one of more than 64 MiB would be refused as a message, and the crash told as a hang."""
+    emulation = run_together(scenario_of([], entry(crashes_at_length)))
+    event = next(event for event in emulation.folder.events if event.kind == "crashed")
+    assert event.details["error"].startswith("ValueError: xxx") and len(str(event.details)) < 20_000
