@@ -1,7 +1,8 @@
 """The hears-all bound of a run, its reference: one Kalman filter a component that hears every fix without loss.
 
 It is told more than any vehicle: the world's laws, each vehicle's lane, and which fixes are outliers. So no program
-that learns from the same fixes can be expected to do better. It exists where vehicles stand on straight lanes.
+that learns from the positions of the same fixes, for vehicles that may drive, can be expected to do better. What
+their speeds tell, as that vehicles stand, it leaves aside. It exists where vehicles stand on straight lanes.
 """
 
 from __future__ import annotations

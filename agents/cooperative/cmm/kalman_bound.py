@@ -19,6 +19,7 @@ from vnet.types import Array
 PRECISE_M2 = 0.64
 """Variance (m²) of a fix below which its receiver is precise (0.8 m): the movement of c between fixes, which is the
 same for all vehicles, shows in their increments about c, and their sum claims too much (Bar-Shalom 1981)."""
+USUAL_PERIOD_S = 0.1
 LATERAL_SIGMA_M = 0.38
 """Deviation (m) of a lateral offset: that of 0.4 m after reflection at ±0.85 m."""
 UNKNOWN_ALONG_M = 1e4
@@ -163,14 +164,23 @@ def common_step(sigma_m: float, tau_s: float, walk_m: float | None, dt_s: float)
     return keep, sigma_m**2 * (1 - keep**2)
 
 
-def precise_m2(sigma_m: float, tau_s: float, walk_m: float | None) -> float:
+def precise_m2(
+    sigma_m: float,
+    tau_s: float,
+    walk_m: float | None,
+    lateral_tau_s: float = LaneModel.lateral_tau_s,
+    period_s: float = USUAL_PERIOD_S,
+) -> float:
     """Return the variance (m²) of a fix below which its receiver is precise; see `PRECISE_M2`.
 
-    That is of a c of 3 m and 600 s. It grows with what is added to c in a second; a slower c does not change it.
+    That is of a c of 3 m and 600 s, of offsets in the lane that last for 20 s, and of ten fixes a second. It grows
+    with what is added to c in a second, with the time for which offsets last, in which c moves, and with the number
+    of fixes, which together say as much as a better one. What is slower, shorter or rarer does not change it.
     """
     usual = LaneModel()
     usual_m2 = common_step(usual.common_sigma_m, usual.common_tau_s, None, 1.0)[1]
-    return PRECISE_M2 * max(1.0, common_step(sigma_m, tau_s, walk_m, 1.0)[1] / usual_m2)
+    more = common_step(sigma_m, tau_s, walk_m, 1.0)[1] / usual_m2, lateral_tau_s / usual.lateral_tau_s
+    return PRECISE_M2 * math.prod(max(1.0, each) for each in (*more, USUAL_PERIOD_S / period_s))
 
 
 def lane_axes(heading_rad: Array | float) -> Array:

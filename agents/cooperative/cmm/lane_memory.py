@@ -457,7 +457,9 @@ class LaneExchange:
         self._own = own
         self._period_s = period_s
         self._model = own.model  # without multipath, of which no fix has told yet
-        self._precise_m2 = precise_m2(own.model.common_sigma_m, own.model.common_tau_s, own.model.common_walk_m)
+        model = own.model
+        law = model.common_sigma_m, model.common_tau_s, model.common_walk_m, model.lateral_tau_s
+        self._precise_m2 = precise_m2(*law, period_s)
         self._memory = CommonMemory(self._model, period_s)
         self.has_joined = False
         self._waits = False

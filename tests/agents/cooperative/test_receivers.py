@@ -264,6 +264,22 @@ def test_in_a_city_a_common_error_that_moves_fast_is_followed(tmp_path: Path) ->
     assert max(figures[name] or 0 for name in ("common_error_rmse_m", "common_error_anees")) < 2
 
 
+@pytest.mark.parametrize(("rate_hz", "lateral_tau_s"), [(40.0, 20.0), (10.0, 200.0)])
+def test_many_fixes_and_offsets_that_last_claim_no_more_than_precise_ones(
+    tmp_path: Path, rate_hz: float, lateral_tau_s: float
+) -> None:
+    """Both show how c moves between fixes, as precise receivers do: as coarse ones they had 2.7 and 1.8."""
+    scenario = {
+        "run": {"duration_s": 20.0},
+        "network": {"vehicles": 8, "layout": "dense"},
+        "world": {"gnss": {"rate_hz": rate_hz}, "lateral": {"tau_s": lateral_tau_s}},
+        "radio": {"loss": 0.1},
+        "program": {"entry": "agents.cooperative:main", "options": {"lateral_tau_s": lateral_tau_s}},
+    }
+    anees = emulator.simulate(scenario, seed=4, out=tmp_path / "run").figures["common_error_anees"]
+    assert anees is not None and 0.4 < anees < 1.4
+
+
 def test_offset_and_multipath_make_one_process() -> None:
     lane = LaneModel()
     both = OffsetAndMultipath.of(lane, 1.0, 60.0)
