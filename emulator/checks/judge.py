@@ -358,7 +358,7 @@ CHECKS: list[Check] = [
         RUN,
         "No process died and no program crashed, except those that a fault ended.",
         invalid="one did",
-        unknown="no event says that the run started; or in real time a vehicle did not come back after a fault",
+        unknown="no event says that the run started; or in real time a vehicle has not come up",
         without_positions=WithoutPositions.JUDGE,
     ),
     Check(

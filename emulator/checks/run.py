@@ -66,8 +66,8 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     if not gone and (away := _not_back(recorded)):
         names = [recorded.node_ids[node] for node in away]
         rows = [{"node": node, "since_ns": since_ns} for node, since_ns in zip(names, away.values(), strict=True)]
-        since = f"{min(away.values()) / NS_PER_S:g} s, when a fault ended"
-        return unknown(f"{first_names(names)}: not up again since {since}", rows=rows)
+        since = f"{min(away.values()) / NS_PER_S:g} s, when a fault ended or it entered"
+        return unknown(f"{first_names(names)}: not up since {since}", rows=rows)
     if not gone:
         who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
         return valid(f"{who} to the end")
@@ -76,23 +76,30 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
 
 
 def _not_back(recorded: RecordedRun) -> dict[int, int]:
-    """Return the nodes that no fault keeps down and that are down all the same at the end, and since when.
+    """Return the nodes that should be up at the end and are down all the same, and since when they should be up.
 
     That is of real time, where a program of another kind than vnet's own may wait before it connects.
     """
-    ends_ns: dict[int, int] = {}
-    for planned in recorded.plan if recorded.scenario.run.pacing == "realtime" else ():
+    if recorded.scenario.run.pacing != "realtime":
+        return {}
+    due_ns: dict[int, int] = {}
+    for planned in recorded.plan:
         if isinstance(planned.fault, ProcessFault) and planned.fault.ends:
             for node in np.flatnonzero(planned.nodes).tolist():
-                ends_ns[node] = max(ends_ns.get(node, 0), planned.end_ns)
-    here = recorded.places.present()[-1] if recorded.moves else np.ones(len(recorded.node_ids), dtype=bool)
+                due_ns[node] = max(due_ns.get(node, 0), planned.end_ns)
+    if recorded.moves:
+        here = recorded.places.present()
+        for node in np.flatnonzero(here[-1] & ~here.all(axis=0)).tolist():
+            entered_ns = (int(np.flatnonzero(~here[:, node])[-1]) + 1) * recorded.scenario.period_ns
+            due_ns[node] = max(due_ns.get(node, 0), entered_ns)
+        due_ns = {node: time_ns for node, time_ns in due_ns.items() if here[-1, node]}
     late = [
         node
-        for node, end_ns in ends_ns.items()
-        if end_ns + START_UP_NS < recorded.closed_ns and here[node] and node not in recorded.deaths_ns
+        for node, time_ns in due_ns.items()
+        if time_ns + START_UP_NS < recorded.closed_ns and node not in recorded.deaths_ns
     ]
     down = recorded.is_down(np.array(late, dtype=np.intp), np.full(len(late), recorded.closed_ns - 1))
-    return {node: ends_ns[node] for node, is_down in sorted(zip(late, down.tolist(), strict=True)) if is_down}
+    return {node: due_ns[node] for node, is_down in sorted(zip(late, down.tolist(), strict=True)) if is_down}
 
 
 def check_no_exceptions(recorded: RecordedRun) -> Finding:

@@ -20,6 +20,7 @@ from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
 from tests.support.exchange_programs import exchange_run
+from tests.support.motion import scenario_of_trips, still, write_trips
 from vnet.node import Node
 
 NEEDED: dict[str, dict[str, Any]] = {
@@ -647,6 +648,21 @@ def test_who_never_comes_back_after_a_fault_in_real_time_was_not_there_to_the_en
     found = result(gone, "agents_alive")
     assert isinstance(found, CheckResult) and found.verdict is Verdict.UNKNOWN
     assert found.figures["rows"] == [{"node": node, "since_ns": planned.end_ns} for node in killed]
+
+
+def test_who_never_comes_up_after_it_has_entered_was_not_there_either(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicles = {"a": [(0, 4, still(0))], "b": [(1, 4, still(50))]}
+    scenario = scenario_of_trips(write_trips(tmp_path / "t.csv", vehicles), 4.0)
+    recorded = run_scenario(tmp_path / "run", scenario)
+    run = scenario.run.model_copy(update={"pacing": "realtime"})
+    there = replace(recorded, scenario=scenario.model_copy(update={"run": run}))
+    monkeypatch.setattr("emulator.checks.run.START_UP_NS", 10**9)
+    assert verdict(there, "agents_alive") is Verdict.VALID
+    found = result(replace(there, events=[e for e in there.events if e.kind != "entered"]), "agents_alive")
+    assert isinstance(found, CheckResult) and found.verdict is Verdict.UNKNOWN
+    assert found.figures["rows"] == [{"node": "b", "since_ns": 10**9}]
 
 
 @pytest.mark.parametrize("node", ["v01", "emulator"])
