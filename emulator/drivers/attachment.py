@@ -81,11 +81,11 @@ class Attachment:
             login = options.access.credentials(EMULATOR)
             session = stack.enter_context(open_client(self._connect, login, self._lease_ms))
         run, hosts = self._run, options.access.hosts
+        control = zenoh.CongestionControl
+        full = control.DROP if self._drops else control.BLOCK  # one host that is cut off must not stall the others
         self._host_rx = {
             host: stack.enter_context(
-                session.declare_publisher(
-                    keys.host_rx(run, host), congestion_control=zenoh.CongestionControl.BLOCK, express=True
-                )
+                session.declare_publisher(keys.host_rx(run, host), congestion_control=full, express=True)
             )
             for host in hosts
         }
