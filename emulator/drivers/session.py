@@ -15,8 +15,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, wait
-from contextlib import closing, nullcontext, redirect_stdout
+from concurrent.futures import Future, InvalidStateError, wait
+from contextlib import closing, nullcontext, redirect_stdout, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
@@ -214,8 +214,15 @@ class Session:
             self._interrupt()
             wait([self.stands], patience_s if self.live is None else None)  # a live run kills who does not end
         if not self.stands.done():
-            raise VnetError(f"a program has not yielded for {2 * patience_s:g} s, and cannot be interrupted")
+            self._settle(
+                VnetError(f"a program has not yielded for {2 * patience_s:g} s, and cannot be interrupted")
+            )
         self.stands.result()
+
+    def _settle(self, error: BaseException | None = None) -> None:
+        """Let all go who wait for the run to stand, unless they have been told that it does not."""
+        with suppress(InvalidStateError):
+            self.stands.set_result(None) if error is None else self.stands.set_exception(error)
 
     def _interrupt_local(self) -> None:
         """Interrupt programs on the run's thread as Ctrl-C would on the main one."""
@@ -241,7 +248,7 @@ class Session:
                 asyncio.run(self._run_live())
         except BaseException as error:
             self.over = True
-            self.stands.set_exception(error)
+            self._settle(error)
         else:
             self.over = True
             self._stand()
@@ -270,7 +277,7 @@ class Session:
     def _stand(self) -> None:
         if self._went_at is not None:
             self.wall_s += time.monotonic() - self._went_at
-        self.stands.set_result(None)
+        self._settle()
 
 
 def _folder(folder: Folder, scenario: Scenario, world: World) -> RunFolder:

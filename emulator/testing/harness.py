@@ -11,7 +11,7 @@ import math
 import shlex
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -135,13 +135,15 @@ class RunHarness:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            await asyncio.to_thread(self.close)
+        if kind is not None:  # Ctrl-C stays what it is, whatever the run comes to
+            with suppress(VnetError) if issubclass(kind, asyncio.CancelledError) else nullcontext():
+                await asyncio.to_thread(self.close)
             return
         try:
             judgement = await asyncio.to_thread(self._judge)
         except asyncio.CancelledError:  # by Ctrl-C; asyncio waits for its threads before pytest goes on
-            await asyncio.to_thread(self._run.wait, PATIENCE_S)
+            with suppress(VnetError):
+                await asyncio.to_thread(self._run.wait, PATIENCE_S)
             raise
         promised = {PREFIX + name for name in self._promises} - self._named
         broken = [each for each in judgement.checks if each.name in promised and _fails(each, allow_unknown=False)]

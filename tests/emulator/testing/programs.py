@@ -4,6 +4,7 @@ import asyncio
 import ctypes
 import os
 import signal
+import time
 
 from vnet import Node
 
@@ -33,11 +34,12 @@ async def proud(node: Node) -> None:
 
 
 async def busy(node: Node) -> None:
-    """A beacon whose first vehicle computes for ever after 0.5 s; it presses Ctrl-C for a process before."""
+    """A beacon whose first vehicle presses Ctrl-C for a process after 0.5 s, and then never yields again."""
     async for fix in node.gnss:
         await node.radio.broadcast(b"here")
         if fix.time_ns == 5 * PERIOD_NS and node.id == "v01":
             os.kill(node.options["pid"], signal.SIGINT)
+            time.sleep(node.options["sleeps_s"])
             while True:
                 pass
 
