@@ -21,8 +21,8 @@ NOT_THE_PROGRAM = (
     *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")),
 )
 """Folders of code that is no program: vnet, the standard library, installed packages."""
-LONGEST = 8000
-"""Characters that are kept of a message, its first ones, and of a traceback, its last ones."""
+LONGEST, MOST_FRAMES = 8000, 30
+"""Characters that are kept of a message, its first ones, and frames of a traceback, its last ones."""
 _GROUP: Any = getattr(builtins, "BaseExceptionGroup", ())
 """None before Python 3.11."""
 
@@ -37,6 +37,12 @@ def error_line(error: BaseException) -> str:
     except Exception as another:  # of the exception's own __str__
         text = f"(its text cannot be made: {type(another).__name__})"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def traceback_text(error: BaseException, trace: TracebackType | None) -> str:
+    """Return a traceback as Python prints it, without its first frames and the ends of long messages."""
+    lines = traceback.format_exception(type(error), error, trace)
+    return "".join(line if len(line) <= LONGEST else f"{line[:LONGEST]} …\n" for line in lines[-MOST_FRAMES:])
 
 
 def leaves(error: Any) -> list[BaseException]:
@@ -79,7 +85,7 @@ def write_report(path: str, error: BaseException, status: object, place: str) ->
         "error": error_line(error),
         "status": "" if status is None else repr(status),
         "place": own_line(error) or place,
-        "details": "".join(traceback.format_exception(type(error), error, error.__traceback__))[-LONGEST:],
+        "details": traceback_text(error, error.__traceback__),
     }
     content = {name: text.encode(errors="backslashreplace").decode() for name, text in report.items()}
     with suppress(OSError):

@@ -14,7 +14,6 @@ import os
 import shutil
 import sys
 import threading
-import traceback
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -37,7 +36,7 @@ from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap, map_from_wire
 from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.arrivals import Mail, MailDelivery, MeasuredBusyRatios, News, NodeClocks, Window
-from vnet.runtime.error_text import LONGEST, error_line, line_of_caller, of_program, own_line
+from vnet.runtime.error_text import error_line, line_of_caller, of_program, own_line, traceback_text
 from vnet.runtime.outside_loop import ProcessEndedError
 from vnet.runtime.own_asyncio import Task, current_node, present_node
 from vnet.runtime.programs import Program, Programs, context_of
@@ -526,8 +525,7 @@ class Host:
         if isinstance(error, SystemExit) and not error.code:
             self._over(node, "finished")
         elif self._runs(node) and not self._closing:
-            lines = traceback.format_exception(type(error), error, of_program(error.__traceback__))
-            details = sendable("".join(lines[-30:])[-LONGEST:])
+            details = sendable(traceback_text(error, of_program(error.__traceback__)))
             self._over(node, "crashed", error_line(error), details, own_line(error))
         else:
             self._unhandled.add(node, error, "in main")

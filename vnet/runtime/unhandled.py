@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import traceback
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from typing import Any
 from vnet.errors import sendable
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
-from vnet.runtime.error_text import LONGEST, error_line, line_of, own_line
+from vnet.runtime.error_text import error_line, line_of, own_line, traceback_text
 from vnet.runtime.outside_loop import ExecutorJob, ProcessEndedError, collector
 from vnet.runtime.own_asyncio import NOBODY, current_node, present_node
 from vnet.runtime.ready_queue import node_of
@@ -245,7 +244,7 @@ class UnhandledExceptions:
         node = self._fallback if failure.owner is None else failure.owner.id
         line = own_line(error)
         place = f"{failure.place} ({line})" if line else failure.place
-        details = sendable("".join(traceback.format_exception(error)))[-LONGEST:]
+        details = sendable(traceback_text(error, error.__traceback__))
         return Unhandled(node, failure.time_ns, error_line(error), place, details)
 
 

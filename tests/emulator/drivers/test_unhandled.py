@@ -567,3 +567,4 @@ def test_of_a_long_message_the_beginning_is_told() -> None:
     emulation = run_together(scenario_of([], entry(crashes_at_length)))
     event = next(event for event in emulation.folder.events if event.kind == "crashed")
     assert event.details["error"].startswith("ValueError: xxx") and len(str(event.details)) < 20_000
+    assert event.details["where"].startswith("Traceback") and "crashes_at_length" in event.details["where"]

@@ -258,7 +258,7 @@ def test_ctrl_c_ends_a_test_whose_program_does_not_yield(
     pytester.makepyfile(f"""
 import os
 from emulator.testing import harness
-harness.PATIENCE_S = 0.5
+harness.PATIENCE_S = {0.5 if sleeps_s else 2.0}
 
 async def test_busy(vnet_emulation):
     options = {{"pid": os.getpid(), "sleeps_s": {sleeps_s}}}

@@ -931,6 +931,7 @@ def test_what_virtual_time_does_not_have_is_refused_when_the_scenario_is_read(
         ("asyncio.create_task(fails())", False),
         ("asyncio.get_running_loop().run_in_executor(None, int, 'x')", False),
         ("asyncio.create_task(fails())", True),
+        ("asyncio.get_running_loop().set_exception_handler(print) or asyncio.create_task(fails())", True),
     ],
 )
 def test_what_has_failed_in_a_task_that_the_program_holds_is_judged_at_its_end(
@@ -944,7 +945,7 @@ def test_what_has_failed_in_a_task_that_the_program_holds_is_judged_at_its_end(
             global task
             task = {held}
             await asyncio.sleep(1)
-            {"await asyncio.wait([task]); task.exception()" if handled else ""}
+            {"await asyncio.wait([task]); task.exception()" if handled and "print" not in held else ""}
         asyncio.run(main())
         """
     assert bool(events(drive(text), "exception")) is not handled

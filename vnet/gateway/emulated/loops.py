@@ -67,7 +67,8 @@ def prepare_asyncio(
 
     def tell_failed() -> None:
         for future in sorted(filter(is_unretrieved, failed), key=number_of):
-            fail(disclaim(future), "in a task or a future of asyncio")
+            if future.get_loop().get_exception_handler() is None:  # else it is told of what fails
+                fail(disclaim(future), "in a task or a future of asyncio")
 
     given_exception, module.Future.set_exception = module.Future.set_exception, set_exception
     threads.tell_failed = tell_failed
