@@ -249,7 +249,8 @@ def _held(run: Run, name: str, predicate: Predicate, at: str, wanted: bool) -> R
     failed = [moment for moment, held in asked if held is not wanted]
     if failed:
         return _failed(run, name, failed, "is false" if wanted else "is true", of=len(asked))
-    if not asked and (wanted or at != EVENT or answers):
+    is_quiet = at == EVENT and not answers  # nothing has happened, so nothing that never may
+    if not asked and (wanted or not is_quiet):
         values = "".join(f": none has a value {value!r}" for value in sorted(missing)[:1])
         return Result(name, "unknown", f"the predicate had nothing to say at any moment{values}")
     of = f"{len(asked):,} of " if len(asked) < len(answers) else ""

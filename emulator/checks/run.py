@@ -63,7 +63,7 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     ]
     if not gone and not recorded.event(EventKind.started):
         return unknown("no event says that the run started")
-    if not gone and (away := _not_back(recorded)):
+    if not gone and (away := _not_up(recorded)):
         names = [recorded.node_ids[node] for node in away]
         rows = [{"node": node, "since_ns": since_ns} for node, since_ns in zip(names, away.values(), strict=True)]
         since = f"{min(away.values()) / NS_PER_S:g} s, when a fault ended or it entered"
@@ -75,7 +75,7 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     return invalid(in_words(kinds_of(gone)), gone=listed)
 
 
-def _not_back(recorded: RecordedRun) -> dict[int, int]:
+def _not_up(recorded: RecordedRun) -> dict[int, int]:
     """Return the nodes that should be up at the end and are down all the same, and since when they should be up.
 
     That is of real time, where a program of another kind than vnet's own may wait before it connects.

@@ -15,7 +15,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, InvalidStateError, wait
+from concurrent.futures import Future, InvalidStateError
+from concurrent.futures import wait as wait_for
 from contextlib import closing, nullcontext, redirect_stdout, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
@@ -121,8 +122,6 @@ class Session:
         """True once a run that was stepped has come to its end."""
         self.stands: Future[None] = Future()
         """Done when a run that is stepped is held or over."""
-        self.started = False
-        """True once `start` was called."""
         self._horizons: SimpleQueue[int | None] = SimpleQueue()
         self._give: Callable[[int | None], Any] = self._horizons.put
         self._went_at: float | None = None
@@ -135,6 +134,11 @@ class Session:
     def folder(self) -> RunFolder:
         """The run's folder."""
         return self.emulation.folder
+
+    @property
+    def started(self) -> bool:
+        """True once `start` was called."""
+        return self._thread is not None
 
     def open(self) -> Session:
         """Make the run's folder, once the programs that run in this process have proved to load."""
@@ -188,7 +192,6 @@ class Session:
 
     def start(self) -> Future[None]:
         """Get ready for time 0. The future, here and in `go`, is done when the run is held or over."""
-        self.started = True
         run = copy_context().run  # of what a test has set for the programs that it imports
         name = f"vnet {self.command}"
         self._thread = threading.Thread(target=run, args=(self._run_held,), name=name, daemon=True)
@@ -209,10 +212,10 @@ class Session:
 
         Raises VnetError if that does not end it either.
         """
-        wait([self.stands], patience_s)
+        wait_for([self.stands], patience_s)
         if not self.stands.done():
             self._interrupt()
-            wait([self.stands], patience_s if self.live is None else None)  # a live run kills who does not end
+            wait_for([self.stands], patience_s if self.live is None else None)  # a live run kills who does not end
         if not self.stands.done():
             self._settle(
                 VnetError(f"a program has not yielded for {2 * patience_s:g} s, and cannot be interrupted")

@@ -20,6 +20,7 @@ PRECISE_M2 = 0.64
 """Variance (m²) of a fix below which its receiver is precise (0.8 m): the movement of c between fixes, which is the
 same for all vehicles, shows in their increments about c, and their sum claims too much (Bar-Shalom 1981)."""
 USUAL_PERIOD_S = 0.1
+"""Period of fixes for which that is the limit."""
 LATERAL_SIGMA_M = 0.38
 """Deviation (m) of a lateral offset: that of 0.4 m after reflection at ±0.85 m."""
 UNKNOWN_ALONG_M = 1e4

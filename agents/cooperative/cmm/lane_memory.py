@@ -457,10 +457,10 @@ class LaneExchange:
         self._own = own
         self._period_s = period_s
         self._model = own.model  # without multipath, of which no fix has told yet
-        model = own.model
+        model = self._model
         law = model.common_sigma_m, model.common_tau_s, model.common_walk_m, model.lateral_tau_s
         self._precise_m2 = precise_m2(*law, period_s)
-        self._memory = CommonMemory(self._model, period_s)
+        self._memory = CommonMemory(model, period_s)
         self.has_joined = False
         self._waits = False
         self._waited = 0
