@@ -19,7 +19,7 @@ from agents.cooperative.cmm.kalman_bound import KalmanBound, LaneModel, lane_axe
 from agents.cooperative.cmm.own_vehicle import INCREMENT_SHARE
 from agents.cooperative.cmm.plausibility import INCREMENT_FACTOR, PRIOR_FACTOR, SELF_SHARE
 from agents.cooperative.hears_all import lane_model
-from agents.cooperative.information_estimator import PASSED_SHARE
+from agents.cooperative.information_estimator import LEARNED_S, PASSED_SHARE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.paper import PAPER_RANGE_M, counted_from
@@ -46,15 +46,17 @@ class Rules:
 
     loss: share of the frames that is lost. hops: hops that an increment goes, each takes a period; `FLOODED` for
     all, and then no priors are pooled: each increment counts once, wherever it is heard. hears_all: a vehicle hears
-    all others of its component. increment_share: share of what a fix says that is told. passed_share: share of an
-    increment that is passed on which is added. self_share: weight that a vehicle keeps for its own prior. is_cut:
-    increments and priors are cut at some times the own.
+    all others of its component. increment_share: share of what a fix says that is told. learned_s: time in which c
+    moves by the error that increments have in common. passed_share: share of an increment that is passed on which
+    is added. self_share: weight that a vehicle keeps for its own prior. is_cut: increments and priors are cut at
+    some times the own.
     """
 
     loss: float = LOSS
     hops: int = 2
     hears_all: bool = False
     increment_share: float = INCREMENT_SHARE
+    learned_s: float = LEARNED_S
     passed_share: float = PASSED_SHARE
     self_share: float = SELF_SHARE
     is_cut: bool = True
@@ -63,7 +65,7 @@ class Rules:
 ORACLES: Mapping[str, Rules] = {
     "the program's rules": Rules(),
     "no frame lost": Rules(loss=0.0),
-    "no share, no cut": Rules(increment_share=1.0, passed_share=1.0, self_share=0.0, is_cut=False),
+    "no share, no cut": Rules(increment_share=1.0, learned_s=0.0, passed_share=1.0, self_share=0.0, is_cut=False),
     "a third hop": Rules(hops=3),
     "all hops, each increment once": Rules(hops=FLOODED),
     "all hops, once, no frame lost": Rules(hops=FLOODED, loss=0.0),
@@ -250,8 +252,9 @@ class Exchange:
             shares = heard * np.minimum(1.0, limit[:, :, None] / traces[:, None])
             of_priors = _trace(priors)
             weights = weights * np.minimum(1.0, PRIOR_FACTOR * of_priors[:, :, None] / of_priors[:, None])
-        pooled = own_weight * priors + weights @ priors + increments + shares @ increments
-        pooled = pooled + self._passed_on(heard, weights, limit)
+        added = increments + shares @ increments + self._passed_on(heard, weights, limit)
+        left = 1 / (1 + self._world.model.common_step(rules.learned_s)[1] * _trace(added) / 2)
+        pooled = own_weight * priors + weights @ priors + left[..., None] * added
         self._used.insert(0, np.maximum(heard, self._own))
         self._increments.insert(0, increments)
         del self._used[rules.hops :], self._increments[rules.hops :]

@@ -55,7 +55,9 @@ def test_alone_a_vehicle_is_the_bound() -> None:
 
 def test_where_all_hear_all_nothing_is_counted_twice_and_nothing_is_missing() -> None:
     found = world(np.ones((4, 4), dtype=bool))
-    pooled, flooded = (run(found, Rules(loss=0.0, hops=hops, is_cut=False)).filters for hops in (2, FLOODED))
+    pooled, flooded = (
+        run(found, Rules(loss=0.0, learned_s=0.0, hops=hops, is_cut=False)).filters for hops in (2, FLOODED)
+    )
     np.testing.assert_allclose(pooled.mean, flooded.mean, atol=1e-6)
     np.testing.assert_allclose(pooled.covariance, flooded.covariance, rtol=1e-6, atol=1e-9)
 

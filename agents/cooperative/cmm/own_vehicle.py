@@ -7,6 +7,7 @@ error: the *increment*.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,6 +43,8 @@ SAME_LANE_RAD = 0.02
 """Distance (m) and angle (rad) within which two lanes of a map are taken for the same."""
 MAX_LANES = 8
 """Number of lanes that compete, the nearest."""
+SAME_HEADING_RAD = math.radians(10.0)
+"""Angle within which headings of consecutive fixes agree."""
 SAME_MULTIPATH = 0.2
 """Share by which what a receiver states of its multipath may change before the model does."""
 
@@ -152,7 +155,7 @@ class OwnVehicle:
         if not was_placed:
             if not self._agree(before, fix, since_s):
                 return NOTHING
-            self._place(fix)
+            self._place(fix, before)
             self._taken, self._untaken_s = before, 0.0
         self._untaken_s += since_s
         noise_m2, increment = fix.white_covariance_m2, None
@@ -163,7 +166,7 @@ class OwnVehicle:
             self._outliers_s += since_s
             if self._outliers_s < max(LOST_S, LOST_FIXES * since_s) or not self._agree(before, fix, since_s):
                 return NOTHING
-            self._place(fix)
+            self._place(fix, before)
             increment = self._filter.take(fix.position_m, noise_m2)
             assert increment is not None, "without a gate each fix is taken"
         self._outliers_s = 0.0
@@ -229,12 +232,20 @@ class OwnVehicle:
         self._latest, self._outliers_s = [], 0.0
         self.prior = belief
 
-    def _place(self, fix: Observation) -> None:
-        """Seek the lanes on which the vehicle may be; without any its fixes say nothing about c."""
+    def _place(self, fix: Observation, before: list[tuple[float, Observation]]) -> None:
+        """Seek the lanes on which the vehicle may be; without any its fixes say nothing about c.
+
+        The heading counts if those of the two fixes `before` agree: of a vehicle that stands it may be any.
+        """
+        towards_rad = fix.heading_rad
+        for _, other in before:
+            if towards_rad is not None and other.heading_rad is not None:
+                turn_rad = math.remainder(other.heading_rad - towards_rad, math.tau)
+                towards_rad = towards_rad if abs(turn_rad) < SAME_HEADING_RAD else None
         belief = self.belief
         expected_m = fix.position_m - belief[0]
         variance_m2 = np.trace(belief[1]) + np.trace(fix.covariance_m2)
-        lanes = candidate_lanes(self._lanes, expected_m, fix.heading_rad, 3 * float(np.sqrt(variance_m2)))
+        lanes = candidate_lanes(self._lanes, expected_m, towards_rad, 3 * float(np.sqrt(variance_m2)))
         self._is_placed = True
         if not len(lanes):
             self._filter = OwnKalman.start(expected_m, 0.0, self._unknown, belief)

@@ -21,8 +21,9 @@ INCREMENT_GATE = 16.0
 SUM_GATE = 4.0
 """Largest squared deviation of an origin's sum of many increments: the errors of what was believed partly cancel,
 and one honest sum in ten thousand deviates by 3.5 (N2) to 4.5 (N1)."""
-COMPARED_GATE = 1.0
-"""The same, less what most sums deviate by."""
+COMPARED_GATE = 3.0
+"""The same, less what most sums deviate by, and relative to the sum's own covariance: one honest sum in fifty
+deviates by more, in small networks and large ones."""
 FAR = 4.0
 """So many times the deviation that the gate of a sum lets through is far beyond it."""
 PRIOR_GATE = 4.0
@@ -42,7 +43,13 @@ SPREAD_FLOOR_M = 0.05
 MAJORITY = 4
 """Least number of priors or increments of which a majority can be told."""
 MEMORY_S = 10.0
-"""Time (s) in which an origin's sums decay."""
+"""Time (s) in which an origin's leans decay."""
+SUM_MEMORY_S = 30.0
+"""Time (s) in which its sums decay: c returns slowly from where one pulls, so even a small pull must be noticed."""
+COMMON_EVERY_S = 1.0
+"""Time (s) after which what most sums deviate by is found again."""
+COMMON_ROUNDS = 3
+"""Rounds of weighing in which it is found, from the latest on."""
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a normal vector in the plane, in deviations an axis."""
 MAX_ORIGINS = 1024
@@ -157,6 +164,34 @@ def _sum_gate(count: float, gate_of_many: float) -> float:
     return INCREMENT_GATE + (gate_of_many - INCREMENT_GATE) * min(1.0, count / MANY)
 
 
+def _in_common(sums: Sequence[Sums], off: tuple[float, float]) -> tuple[float, float] | None:
+    """Return by what (x, y) most `sums` deviate, in deviations of the belief, found from `off` on.
+
+    Beyond its own deviation a sum weighs less in proportion (Huber 1964), so that a few do not draw it. None if the
+    sums do not tell.
+    """
+    off_x, off_y = off
+    for _ in range(COMMON_ROUNDS):
+        s_xx = s_xy = s_yx = s_yy = s_x = s_y = 0.0
+        for _, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, _ in sums:
+            more = 1e-4 * (n_a + n_d) + 1e-9
+            n_a += more
+            n_d += more
+            r_x, r_y = n_x - n_xx * off_x - n_xy * off_y, n_y - n_yx * off_x - n_yy * off_y
+            squared = (n_d * r_x * r_x - 2 * n_b * r_x * r_y + n_a * r_y * r_y) / (n_a * n_d - n_b * n_b)
+            weight = 1 / math.sqrt(squared) if squared > 1 else 1.0
+            s_xx += weight * n_xx
+            s_xy += weight * n_xy
+            s_yx += weight * n_yx
+            s_yy += weight * n_yy
+            s_x += weight * n_x
+            s_y += weight * n_y
+        if not (determinant := s_xx * s_yy - s_xy * s_yx):
+            return None
+        off_x, off_y = (s_yy * s_x - s_xy * s_y) / determinant, (s_xx * s_y - s_yx * s_x) / determinant
+    return off_x, off_y
+
+
 class Origins:
     """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
 
@@ -164,6 +199,7 @@ class Origins:
         self._sums: dict[int, Sums] = {}
         self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
         self._common_m: tuple[float, float] | None = None  # by most sums the belief is off by this
+        self._common_again_s = -math.inf
 
     def __len__(self) -> int:
         """Number of origins whose increments are summed up."""
@@ -180,12 +216,12 @@ class Origins:
         """Return the share (n,) of each increment (n,) of the origins `codes` that is used.
 
         It is 1 within the gates. Beyond that of one increment it is the gate relative to the squared deviation;
-        beyond that of the origin's sum the root of this, so that the influence stays, and far beyond it less, so
-        that it descends (Hampel 1974). To drop it would err where few contradict each other for long and are right:
-        three vehicles on nearly parallel lanes, or on a map. What is beyond is summed up all the same: who has lied
-        is believed again when it has decayed. Each is compared with the belief (x, P) when it came: c itself moves
-        by half a metre in the sum's memory. What the sums within the gates have in common is the belief's error and
-        does not count; sums about lanes (`is_about_lanes`) have nothing in common, because their beliefs differ.
+        beyond that of the origin's sum the square of this, as the influence must descend (Hampel 1974). Where few
+        are heard, it is the root, and far beyond the gate less: three vehicles on nearly parallel lanes, or on a
+        map, contradict each other for long and are right. What is beyond is summed up all the same: who has lied is
+        believed again when it has decayed. Each is compared with the belief (x, P) when it came: c itself moves by
+        half a metre in the sum's memory. What most sums deviate by is the belief's error and does not count; sums
+        about lanes (`is_about_lanes`) have nothing in common, because their beliefs differ.
         """
         sums = self._sums
         if len(sums) + len(codes) > MAX_ORIGINS:
@@ -197,7 +233,6 @@ class Origins:
         off_x, off_y = common_m or (0.0, 0.0)
         off_x /= c_xx
         off_y = (off_y - c_yx * off_x) / c_yy
-        within, s_xx, s_xy, s_yx, s_yy, s_x, s_y = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         then_s, keep, keep_2 = now_s, 1.0, 1.0
         nothing: Sums = (now_s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         shares = []
@@ -207,18 +242,19 @@ class Origins:
             x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
             since_s, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count = sums.get(code, nothing)
             if since_s != then_s:  # for most the same
-                then_s, keep = since_s, math.exp((since_s - now_s) / MEMORY_S)
+                then_s, keep = since_s, math.exp((since_s - now_s) / SUM_MEMORY_S)
                 keep_2 = keep * keep  # covariances of sums whose parts have decayed
             n_xx, n_xy, n_yx, n_yy = m_xx + keep * n_xx, m_xy + keep * n_xy, m_yx + keep * n_yx, m_yy + keep * n_yy
             n_x, n_y, count = x + keep * n_x, y + keep * n_y, 1.0 + keep * count
             n_a, n_b, n_d = a + keep_2 * n_a, b + keep_2 * n_b, d + keep_2 * n_d
             sums[code] = now_s, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count
             # rᵀ S⁻¹ r with S = Λ + (Λ C)(Λ C)ᵀ, of the sum and of the increment, written out: a function would be
-            # called most of all. A lane says nothing along itself: a ten thousandth of the trace is added to S, so
-            # that rounding there is not counted.
-            n_a += n_xx * n_xx + n_xy * n_xy
-            n_b += n_xx * n_yx + n_xy * n_yy
-            n_d += n_yx * n_yx + n_yy * n_yy
+            # called most of all. Less what is common, a sum has its own errors alone, Λ. A lane says nothing along
+            # itself: a ten thousandth of the trace is added to S, so that rounding there is not counted.
+            if common_m is None:
+                n_a += n_xx * n_xx + n_xy * n_xy
+                n_b += n_xx * n_yx + n_xy * n_yy
+                n_d += n_yx * n_yx + n_yy * n_yy
             more = 1e-4 * (n_a + n_d) + 1e-9
             n_a += more
             n_d += more
@@ -237,21 +273,15 @@ class Origins:
                 gate = _sum_gate(count, gate)
             if -INCREMENT_GATE < alone < INCREMENT_GATE and -gate < in_sum < gate:
                 shares.append(1.0)
-                within += 1
-                s_xx += n_xx
-                s_xy += n_xy
-                s_yx += n_yx
-                s_yy += n_yy
-                s_x += n_x
-                s_y += n_y
             else:
-                of_sum = gate / max(abs(in_sum), _TINY)
-                shares.append(min(1.0, INCREMENT_GATE / max(abs(alone), _TINY), math.sqrt(of_sum), FAR * of_sum))
-        if not is_about_lanes:
-            self._common_m = None
-            if within >= MAJORITY and (determinant := s_xx * s_yy - s_xy * s_yx):
-                x, y = (s_yy * s_x - s_xy * s_y) / determinant, (s_xx * s_y - s_yx * s_x) / determinant
-                self._common_m = c_xx * x, c_yx * x + c_yy * y
+                of_sum = min(1.0, gate / max(abs(in_sum), _TINY))
+                of_sum = min(math.sqrt(of_sum), FAR * of_sum) if common_m is None else of_sum * of_sum
+                shares.append(min(of_sum, INCREMENT_GATE / max(abs(alone), _TINY)))
+        if not is_about_lanes and now_s >= self._common_again_s:
+            self._common_again_s = now_s + COMMON_EVERY_S
+            recent = [known for known in sums.values() if now_s - known[0] < COMMON_EVERY_S]
+            common = _in_common(recent, (off_x, off_y)) if len(recent) >= MAJORITY else None
+            self._common_m = common and (c_xx * common[0], c_yx * common[0] + c_yy * common[1])
         return shares
 
     def without_lean(

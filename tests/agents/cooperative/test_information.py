@@ -15,7 +15,7 @@ from agents.cooperative.attacker import Attack, InformationAttacker, Lie
 from agents.cooperative.cmm.information import Five, Information
 from agents.cooperative.cmm.plausibility import moved, scaled_by
 from agents.cooperative.frame import FrameError, name_of_code, short_name
-from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator
+from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator, _pooled
 from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
 from agents.cooperative.options import Options
 from tests.agents.cooperative.cmm.test_city_roads import road_map
@@ -236,6 +236,16 @@ def test_on_a_map_an_increment_goes_on_until_all_have_used_it_once(lost: float, 
     assert sum(e.rejected["forged"] for e in network.estimators) == 0
     if not lost:
         assert {e.imported for e in network.estimators} == {11}
+
+
+@given(count=st.integers(1, 2000), said=st.floats(1e-3, 1e3), common_m2=st.floats(1e-4, 1.0))
+def test_many_increments_say_no_more_than_their_common_error_allows(
+    count: int, said: float, common_m2: float
+) -> None:
+    increment = said, 0.0, said, 3 * said, -2 * said
+    pooled = _pooled([], [], [increment] * count, common_m2)
+    assert pooled.matrix[0, 0] == pytest.approx(1 / (1 / (count * said) + common_m2))
+    assert pooled.moments()[0].tolist() == pytest.approx([3.0, -2.0])
 
 
 def test_what_pooled_priors_hold_is_not_added_again() -> None:

@@ -113,7 +113,7 @@ receivers = st.builds(
     tau_s=st.floats(20, 200),
     outliers=st.sampled_from([0.0, 0.02, 0.1]),
     headless=st.sampled_from([0.0, 0.5, 1.0]),
-)
+).filter(lambda each: each.sigma_m > 0.03 or not each.headless)  # particles are too few for it: docs/estimator.md
 
 
 @settings(max_examples=8, deadline=None, derandomize=True)

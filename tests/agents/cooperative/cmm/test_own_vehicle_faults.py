@@ -166,3 +166,12 @@ def test_outliers_off_the_map_are_no_turns(speed_m_s: float) -> None:
         if (position := own.position_m()) is not None:
             squares_m2.append(float(np.sum((position[0] + own.estimate_m - truth_m) ** 2)) / 2)
     assert np.sqrt(np.mean(squares_m2)) < 0.5
+
+
+def test_headings_that_disagree_hide_no_lane() -> None:
+    """The heading of a vehicle that stands may be any."""
+    own, rng = vehicle(), np.random.default_rng(5)
+    own.restart(Information.of(COMMON_M, 0.05 * np.eye(2)))
+    for heading_rad in [3.0, -1.0, np.pi / 2] + [0.5] * 200:  # the lane leads east
+        own.step(0.1, replace(fix(rng, np.array([20.0, 0.0])), heading_rad=heading_rad))
+    assert own.lane is not None
