@@ -26,6 +26,7 @@ from emulator.records.manifest import differing_files, read_manifest
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, UnicastFigures, radio_metrics, unicast_figures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import check_is_run
+from emulator.scenario.sections import DAY_S, FAR_M
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError
@@ -67,12 +68,15 @@ class Payloads(StrEnum):
 
 def radio(
     run: RunArgument = LATEST,
-    bin_m: Annotated[float, typer.Option("--bin", min=0.1, help="Width of the bins of distance in m.")] = BIN_M,
+    bin_m: Annotated[
+        float, typer.Option("--bin", min=0.1, max=FAR_M, help="Width of the bins of distance in m.")
+    ] = BIN_M,
     within_m: Annotated[
         float, typer.Option("--within", min=0, help="Receivers farther than this, in m, count as out of range.")
     ] = math.inf,
     from_s: Annotated[
-        float, typer.Option("--from", min=0, help="Only frames that were enqueued from this time on, in s.")
+        float,
+        typer.Option("--from", min=0, max=DAY_S, help="Only frames that were enqueued from this time on, in s."),
     ] = 0.0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for links.parquet, vehicles.parquet and distances.parquet.")
@@ -145,7 +149,7 @@ def export(
     every_s: Annotated[
         float | None,
         typer.Option(
-            "--every", min=0, max=86_400, help="Of links: seconds for each loss; 0: each frame. Default: 1."
+            "--every", min=0, max=DAY_S, help="Of links: seconds for each loss; 0: each frame. Default: 1."
         ),
     ] = None,
     definitions: Annotated[

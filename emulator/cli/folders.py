@@ -18,6 +18,7 @@ from rich.text import Text
 from emulator.cli.options import LATEST, ChecksOption, RunArgument, path_of
 from emulator.records.run_folder import VERDICT_FILE
 from emulator.scenario.program import from_here, split_file
+from emulator.scenario.sections import DAY_S
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError, did_you_mean, printable, shown
@@ -88,7 +89,7 @@ def trace(
         if decode is not None and not recorded.scenario.run.keep_payloads:
             raise VnetError(f"--decode {decode}: {run} has kept no payloads; set run.keep_payloads = true")
         content = _raw if decode is None else _decoded_by(_load(decode))
-        end_ns = None if end is None else round(end * NS_PER_S)
+        end_ns = None if end is None or end > DAY_S else round(end * NS_PER_S)
         rows = (_row(entry, content) for entry in frame_log(recorded, node, round(start * NS_PER_S), end_ns))
         console, first = SafeConsole(), list(islice(rows, 1))  # before anything is printed, if there is no trace
         if not console.is_terminal:

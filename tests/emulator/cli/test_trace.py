@@ -76,6 +76,28 @@ def test_it_shows_who_sent_what_to_whom(kept: Path, capsys: pytest.CaptureFixtur
     ]
 
 
+@pytest.mark.parametrize("end", ["inf", "1e300", "86401"])
+def test_an_end_after_that_of_every_run_is_the_run_s_own(
+    kept: Path, capsys: pytest.CaptureFixture[str], end: str
+) -> None:
+    assert trace(capsys, str(kept), "--to", end) == trace(capsys, str(kept))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["trace", "--from", "inf"],
+        *(["radio", option, value] for option in ("--from", "--bin") for value in ("inf", "1e300")),
+    ],
+)
+def test_a_beginning_or_a_bin_beyond_all_bounds_is_refused_in_one_line(
+    kept: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    assert run_app(app, [*words, str(kept)]) == 2
+    captured = capsys.readouterr()
+    assert not captured.out and captured.err.count("\n") == 1 and words[1] in captured.err
+
+
 def decode(payload: bytes) -> list[str]:
     return payload.decode().split()
 
