@@ -31,6 +31,7 @@ from docs.examples.its2.standard_messages import (
 )
 from emulator import SensedTruth
 from tests.support.paths import ROOT
+from vnet import Fix
 from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
@@ -200,6 +201,19 @@ def test_a_message_with_a_flipped_bit_or_cut_short_is_a_message_or_none() -> Non
             for decoded in (decode_cpm(read, schema()), decode_vam(read, schema(), 0)):
                 assert decoded is None or isinstance(decoded, Message)
             assert isinstance(station.decode(read), station.Message | None)
+
+
+@given(st.lists(st.tuples(st.integers(2, 100), st.booleans()), min_size=1, max_size=5))
+def test_while_there_are_fixes_cams_are_at_most_a_second_apart(gaps: list[tuple[int, bool]]) -> None:
+    """Each gap of so many periods without a fix, after which it may have moved, is followed by 3 s of fixes."""
+    rules, period, east_m, sent = station.CamRules(), 0, 0.0, 0
+    for gap, has_moved in [(1, False), *gaps]:
+        period, east_m = period + gap, east_m + 100.0 * has_moved
+        first = period
+        for period in range(first, first + 30):
+            if rules.is_due(Fix(period * 100_000_000, np.array([east_m, 0.0]), np.eye(2), 0.0, 0.0)):
+                sent = period
+            assert period - max(sent, first) < 10 or sent == period
 
 
 def test_a_vehicle_and_a_building_hide_what_is_behind() -> None:

@@ -183,7 +183,7 @@ class CamRules:
         if passed_s < SHORTEST_S - 1e-9:
             return False
         if self._has_changed(fix):
-            self.interval_s, self.in_a_row = passed_s, 0
+            self.interval_s, self.in_a_row = min(passed_s, LONGEST_S), 0
         elif passed_s >= self.interval_s - 1e-9:
             self.in_a_row += 1
             if self.in_a_row >= IN_A_ROW:
