@@ -4,14 +4,18 @@ import importlib.util
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pycrate_asn1dir.ITS_CAM_2 import CAM_PDU_Descriptions
+from pycrate_asn1dir.ITS_DENM_3 import DENM_PDU_Descriptions
 
 import emulator
 from docs.examples.its import station
@@ -29,6 +33,7 @@ from docs.examples.its2.standard_messages import (
     encode_vam,
     schema,
 )
+from docs.examples.its2.vulnerable import is_due
 from emulator import SensedTruth
 from tests.support.paths import ROOT
 from vnet import Fix
@@ -49,8 +54,8 @@ MESSAGES = st.builds(
     station=st.integers(0, 2**32 - 1),
     time_ns=st.integers(0, 10**5).map(lambda ms: ms * 1_000_000),
     position_m=st.tuples(LENGTH_M, LENGTH_M),
-    heading_rad=st.floats(0, 6.28),
-    speed_m_s=st.floats(0, 60),
+    heading_rad=st.none() | st.floats(0, 6.28),
+    speed_m_s=st.none() | st.floats(0, 60),
     objects=st.lists(
         st.builds(
             Seen,
@@ -87,7 +92,9 @@ def assert_close(one: Message, other: Message | None) -> None:
     assert other is not None
     assert (one.station, len(one.objects)) == (other.station, len(other.objects))
     np.testing.assert_allclose(one.position_m, other.position_m, atol=0.02)
-    assert abs(np.angle(np.exp(1j * (one.heading_rad - other.heading_rad)))) < 0.002
+    assert (one.heading_rad is None) == (other.heading_rad is None)
+    if one.heading_rad is not None and other.heading_rad is not None:
+        assert abs(np.angle(np.exp(1j * (one.heading_rad - other.heading_rad)))) < 0.002
     for sent, read in zip(one.objects, other.objects, strict=True):
         np.testing.assert_allclose(sent.position_m, read.position_m, atol=0.03)
         np.testing.assert_allclose(sent.velocity_m_s, read.velocity_m_s, atol=0.006)
@@ -113,9 +120,9 @@ def test_a_vam_is_read_by_a_second_codec_and_written_with_the_same_bytes(second:
     payload = encode_vam(message, schema())
     second.VAM.from_uper(payload)
     value = second.VAM.get_val()
-    assert value["vam"]["vamParameters"]["vruHighFrequencyContainer"]["speed"]["speedValue"] == round(
-        100 * message.speed_m_s
-    )
+    moves = value["vam"]["vamParameters"]["vruHighFrequencyContainer"]
+    assert moves["speed"]["speedValue"] == (16383 if message.speed_m_s is None else round(100 * message.speed_m_s))
+    assert (moves["heading"]["value"] == 3601) == (message.heading_rad is None)
     second.VAM.set_val(value)
     assert second.VAM.to_uper() == payload
     decoded = decode_vam(payload, schema(), message.time_ns + 60_000_000_000)
@@ -168,15 +175,85 @@ def test_a_bsm_is_read_by_a_second_codec_and_written_with_the_same_bytes(tmp_pat
 
 
 def test_what_a_cpm_cannot_say_is_left_out() -> None:
-    near = Seen((10.0, 0.0), (1.0, 0.0))
+    near, farthest = Seen((10.0, 0.0), (1.0, 0.0)), Seen((1310.70, -1310.71), (1.0, 0.0))
     unsayable = (
         Seen((2000.0, 0.0), (0, 0)),
         Seen((0, -1311.0), (0, 0)),
+        Seen((1310.71, 0), (0, 0)),
         Seen((0, 0), (-170.0, 0)),
         Seen((0, 0), (0, 0), 2.1),
     )
-    decoded = decode_cpm(encode_cpm(Message(1, 0, (0.0, 0.0), objects=(*unsayable, near)), schema()), schema())
-    assert decoded is not None and [seen.position_m[0] for seen in decoded.objects] == [pytest.approx(10, abs=0.03)]
+    message = Message(1, 0, (0.0, 0.0), objects=(*unsayable, near, farthest))
+    decoded = decode_cpm(encode_cpm(message, schema()), schema())
+    assert decoded is not None and len(decoded.objects) == 2
+    for seen, told in zip(decoded.objects, (near, farthest), strict=True):
+        np.testing.assert_allclose(seen.position_m, told.position_m, atol=0.03)
+
+
+NOWHERE = {"latitude": 900_000_001, "longitude": 1_800_000_001}
+"""A position of which the sender knows nothing."""
+
+
+def test_a_message_without_a_position_is_none() -> None:
+    """That of others; a BSM without a time is none, either."""
+    at, types, cam, denm = (0.0, 0.0), schema(), CAM_PDU_Descriptions.CAM, DENM_PDU_Descriptions.DENM
+    cam.from_uper(station.encode_cam(station.Message(1, at), 0))
+    value = cam.get_val()
+    value["cam"]["camParameters"]["basicContainer"]["referencePosition"].update(NOWHERE)
+    cam.set_val(value)
+    assert station.decode(cam.to_uper()) is None
+    denm.from_uper(station.encode_denm(station.Message(1, at, cause=station.EMERGENCY_BRAKE), 1, 0))
+    value = denm.get_val()
+    value["denm"]["management"]["eventPosition"].update(NOWHERE)
+    denm.set_val(value)
+    assert station.decode(denm.to_uper()) is None
+    value = types.decode("VAM", encode_vam(Message(1, 0, at), types))
+    value["vam"]["vamParameters"]["basicContainer"]["referencePosition"].update(NOWHERE)
+    assert decode_vam(types.encode("VAM", value), types, 0) is None
+    value = types.decode("CollectivePerceptionMessage", encode_cpm(Message(1, 0, at), types))
+    value["payload"]["managementContainer"]["referencePosition"].update(NOWHERE)
+    assert decode_cpm(types.encode("CollectivePerceptionMessage", value), types) is None
+    types = schema(STAND_IN)
+    frame = types.decode("MessageFrame", encode_bsm(Message(1, 0, at), 0, types))
+    for unknown in ({"lat": 900_000_001}, {"long": 1_800_000_001}, {"secMark": 65535}):
+        value = types.decode("BasicSafetyMessage", frame["value"])
+        value["coreData"].update(unknown)
+        bsm = frame | {"value": types.encode("BasicSafetyMessage", value)}
+        assert decode_bsm(types.encode("MessageFrame", bsm), types) is None
+
+
+@pytest.mark.parametrize(
+    ("part", "wrong"),
+    [
+        ("position", {"xCoordinate": {"value": 131071, "confidence": 4096}}),
+        ("position", {"yCoordinate": {"value": -131072, "confidence": 4096}}),
+        *(("velocity", {"xVelocity": {"value": value, "confidence": 127}}) for value in (-16383, 16382, 16383)),
+    ],
+)
+def test_an_object_whose_place_or_velocity_is_not_told_is_left_out(part: str, wrong: dict[str, Any]) -> None:
+    types, seen = schema(), Seen((10.0, 0.0), (1.0, 0.0))
+    value = types.decode(
+        "CollectivePerceptionMessage", encode_cpm(Message(1, 0, (0.0, 0.0), objects=(seen,)), types)
+    )
+    container = value["payload"]["cpmContainers"][1]
+    perceived = types.decode("PerceivedObjectContainer", container["containerData"])
+    told = perceived["perceivedObjects"][0][part]
+    (told[1] if part == "velocity" else told).update(wrong)
+    container["containerData"] = types.encode("PerceivedObjectContainer", perceived)
+    decoded = decode_cpm(types.encode("CollectivePerceptionMessage", value), types)
+    assert decoded is not None and decoded.objects == ()
+
+
+def test_no_cam_tells_a_heading_that_its_station_does_not_know(tmp_path: Path) -> None:
+    its = ROOT / "docs" / "examples" / "its" / "its.toml"
+    emulator.simulate(its, duration_s=0.3, set={"world.gnss.heading": False}, out=tmp_path / "run")
+    payloads = pq.read_table(tmp_path / "run" / "payloads.parquet")["payload"].to_pylist()
+    messages = [station.decode(payload) for payload in payloads]
+    assert messages and all(message is not None and message.heading_rad is None for message in messages)
+    known, unknown = (Fix(0, np.zeros(2), np.eye(2), heading_rad, 0.0) for heading_rad in (2.0, None))
+    for last, now in ((known, unknown), (unknown, known)):
+        assert not station.CamRules(last, in_a_row=1).is_due(replace(now, time_ns=200_000_000))
+        assert not is_due(replace(now, time_ns=200_000_000), last)
 
 
 def test_a_vam_of_a_clock_that_is_ahead_has_its_time() -> None:

@@ -29,27 +29,36 @@ START_MS = 694_310_405_000
 PASSENGER_CAR = 5
 EMERGENCY_BRAKE = 99, 1
 """Cause and subcause of a DENM: dangerous situation, emergency electronic brake lights engaged."""
+UNKNOWN_HEADING, UNKNOWN_SPEED, UNKNOWN_LATITUDE, UNKNOWN_LONGITUDE = 3601, 16383, 900_000_001, 1_800_000_001
+"""The standards' values for what a station does not know."""
 UNKNOWN_ALTITUDE = {"altitudeValue": 800001, "altitudeConfidence": "unavailable"}
 
 
 @dataclass(frozen=True)
 class Message:
-    """Content of a message, as far as this example uses it. A DENM has a `cause`, and a CAM has none."""
+    """Content of a message, as far as this example uses it. A DENM has a `cause`, and a CAM has none.
+
+    A heading and a speed that the station does not know, and those of a DENM, are None.
+    """
 
     station: int
     position_m: tuple[float, float]
-    heading_rad: float = 0.0
-    speed_m_s: float = 0.0
+    heading_rad: float | None = None
+    speed_m_s: float | None = None
     cause: tuple[int, int] | None = None
 
 
 def encode_cam(message: Message, time_ns: int) -> bytes:
     """Return a CAM with the containers that each one must have."""
-    to_north_deg = math.degrees(math.pi / 2 - message.heading_rad) % 360
+    heading, speed = UNKNOWN_HEADING, UNKNOWN_SPEED
+    if message.heading_rad is not None:
+        heading = round(10 * (math.degrees(math.pi / 2 - message.heading_rad) % 360)) % 3600
+    if message.speed_m_s is not None:
+        speed = min(round(100 * message.speed_m_s), 16382)
     unavailable = {"curvatureValue": 1023, "curvatureConfidence": "unavailable"}
     high_frequency = {
-        "heading": {"headingValue": round(10 * to_north_deg) % 3600, "headingConfidence": 10},
-        "speed": {"speedValue": min(round(100 * message.speed_m_s), 16382), "speedConfidence": 10},
+        "heading": {"headingValue": heading, "headingConfidence": 127 if heading == UNKNOWN_HEADING else 10},
+        "speed": {"speedValue": speed, "speedConfidence": 127 if speed == UNKNOWN_SPEED else 10},
         "driveDirection": "forward",
         "vehicleLength": {"vehicleLengthValue": 45, "vehicleLengthConfidenceIndication": "noTrailerPresent"},
         "vehicleWidth": 18,
@@ -92,7 +101,7 @@ def encode_denm(message: Message, number: int, time_ns: int) -> bytes:
 def decode(payload: bytes) -> Message | None:
     """Return a message; None for bytes that are none, which the radio may well deliver.
 
-    None, too, for a DENM that ends an event, and for a CAM of a roadside unit.
+    None, too, for a DENM that ends an event, for a CAM of a roadside unit, and for a message without a position.
     """
     known = {CAM: CAM_PDU_Descriptions.CAM, DENM: DENM_PDU_Descriptions.DENM}
     if len(payload) < 2 or payload[0] != VERSION or payload[1] not in known:
@@ -107,16 +116,17 @@ def decode(payload: bytes) -> Message | None:
         if "situation" not in value["denm"]:
             return None
         management, event = value["denm"]["management"], value["denm"]["situation"]["eventType"]
-        return Message(
-            station, _metres(management["eventPosition"]), cause=(event["causeCode"], event["subCauseCode"])
-        )
+        position_m = _metres(management["eventPosition"])
+        cause = event["causeCode"], event["subCauseCode"]
+        return None if position_m is None else Message(station, position_m, cause=cause)
     parameters = value["cam"]["camParameters"]
     kind, high_frequency = parameters["highFrequencyContainer"]
-    if kind != "basicVehicleContainerHighFrequency":
+    position_m = _metres(parameters["basicContainer"]["referencePosition"])
+    if kind != "basicVehicleContainerHighFrequency" or position_m is None:
         return None
-    heading_rad = math.radians(90 - high_frequency["heading"]["headingValue"] / 10) % math.tau
-    speed_m_s = high_frequency["speed"]["speedValue"] / 100
-    return Message(station, _metres(parameters["basicContainer"]["referencePosition"]), heading_rad, speed_m_s)
+    heading, speed = high_frequency["heading"]["headingValue"], high_frequency["speed"]["speedValue"]
+    heading_rad = None if heading == UNKNOWN_HEADING else math.radians(90 - heading / 10) % math.tau
+    return Message(station, position_m, heading_rad, None if speed == UNKNOWN_SPEED else speed / 100)
 
 
 def shown(payload: bytes) -> str:
@@ -124,7 +134,8 @@ def shown(payload: bytes) -> str:
     message = decode(payload)
     if message is None:
         return "no CAM or DENM"
-    kind = f"CAM, {message.speed_m_s:.1f} m/s" if message.cause is None else f"DENM, cause {message.cause}"
+    speed = "speed unknown" if message.speed_m_s is None else f"{message.speed_m_s:.1f} m/s"
+    kind = f"CAM, {speed}" if message.cause is None else f"DENM, cause {message.cause}"
     return f"{kind}, station {message.station} at {message.position_m[0]:.0f}, {message.position_m[1]:.0f} m"
 
 
@@ -151,7 +162,9 @@ def _position(position_m: tuple[float, float]) -> dict[str, Any]:
     }
 
 
-def _metres(position: dict[str, Any]) -> tuple[float, float]:
+def _metres(position: dict[str, Any]) -> tuple[float, float] | None:
+    if position["latitude"] == UNKNOWN_LATITUDE or position["longitude"] == UNKNOWN_LONGITUDE:
+        return None
     north_m = (position["latitude"] / 1e7 - ORIGIN_DEG[0]) * DEGREE_M
     east_m = (position["longitude"] / 1e7 - ORIGIN_DEG[1]) * DEGREE_M * math.cos(math.radians(ORIGIN_DEG[0]))
     return east_m, north_m
@@ -196,12 +209,16 @@ class CamRules:
     def _has_changed(self, fix: Fix) -> bool:
         assert self.last is not None
         east_m, north_m = (fix.position_m - self.last.position_m).tolist()
-        turned = (fix.heading_rad or 0.0) - (self.last.heading_rad or 0.0)
         return (
-            abs(math.remainder(turned, math.tau)) > HEADING_RAD
+            abs(math.remainder(_change(fix.heading_rad, self.last.heading_rad), math.tau)) > HEADING_RAD
             or math.hypot(east_m, north_m) > POSITION_M
-            or abs((fix.speed_m_s or 0.0) - (self.last.speed_m_s or 0.0)) > SPEED_M_S
+            or abs(_change(fix.speed_m_s, self.last.speed_m_s)) > SPEED_M_S
         )
+
+
+def _change(now: float | None, before: float | None) -> float:
+    """Return a change; 0 where one of the two is not known."""
+    return 0.0 if now is None or before is None else now - before
 
 
 async def main(node: Node) -> None:
@@ -219,7 +236,7 @@ async def main(node: Node) -> None:
             if message.cause is not None and not warned:
                 node.event("warned", station=message.station, cause=message.cause[0])
                 warned = 1
-        here = Message(station, tuple(fix.position_m.tolist()), fix.heading_rad or 0.0, fix.speed_m_s or 0.0)
+        here = Message(station, tuple(fix.position_m.tolist()), fix.heading_rad, fix.speed_m_s)
         if rules.is_due(fix):
             await node.radio.broadcast(encode_cam(here, fix.time_ns))
             sent += 1

@@ -129,7 +129,7 @@ async def main(node: Node) -> None:
         node.report(fix.position_m, fix.covariance_m2, seen_m=_row(places))
         if node.options.get("shares", True) and (fix.time_ns // node.period_ns + station) % EVERY == 0:
             await asyncio.sleep(apart_s)
-            told = Message(station, fix.time_ns, here, fix.heading_rad or 0.0, objects=seen)
+            told = Message(station, fix.time_ns, here, fix.heading_rad, objects=seen)
             await node.radio.broadcast(encode_cpm(told, types), period_ms=EVERY * node.period_ns / 1e6)
 
 

@@ -24,7 +24,7 @@ async def main(node: Node) -> None:
             if (heard := decode_bsm(packet.payload, types)) is not None:
                 others.add(heard.station)
         here_m = float(fix.position_m[0]), float(fix.position_m[1])
-        told = Message(station, fix.time_ns, here_m, fix.heading_rad or 0.0, fix.speed_m_s or 0.0)
+        told = Message(station, fix.time_ns, here_m, fix.heading_rad, fix.speed_m_s)
         await node.radio.broadcast(encode_bsm(told, count, types))
         count += 1
         node.report(fix.position_m, fix.covariance_m2, others=len(others))

@@ -34,6 +34,10 @@ BSM = 20
 """`messageId` of a BSM in a `MessageFrame`."""
 NOT_KNOWN = 127
 """Confidence of speeds and angles: unavailable."""
+UNKNOWN_HEADING, UNKNOWN_SPEED = 3601, 16383
+UNKNOWN_BSM_HEADING, UNKNOWN_BSM_SPEED, UNKNOWN_SECOND = 28800, 8191, 65535
+UNKNOWN_LATITUDE, UNKNOWN_LONGITUDE = 900_000_001, 1_800_000_001
+"""The standards' values for what a station does not know."""
 Xy = tuple[float, float]
 
 
@@ -67,13 +71,16 @@ class Seen:
 
 @dataclass(frozen=True)
 class Message:
-    """Content of a message, as far as the examples use it: its sender and, in a CPM, what that sees of others."""
+    """Content of a message, as far as the examples use it: its sender and, in a CPM, what that sees of others.
+
+    A heading and a speed that it does not tell are None.
+    """
 
     station: int
     time_ns: int
     position_m: Xy
-    heading_rad: float = 0.0
-    speed_m_s: float = 0.0
+    heading_rad: float | None = None
+    speed_m_s: float | None = None
     objects: tuple[Seen, ...] = ()
 
 
@@ -105,7 +112,7 @@ def encode_cpm(message: Message, types: Any) -> bytes:
 def _is_sayable(message: Message, seen: Seen) -> bool:
     """Return whether an object is within the ranges of its fields, which asn1tools does not check."""
     offsets_m = [there_m - here_m for there_m, here_m in zip(seen.position_m, message.position_m, strict=True)]
-    is_near = all(abs(offset_m) <= 1310.71 for offset_m in offsets_m)  # false for NaN, too
+    is_near = all(-1310.715 < offset_m < 1310.705 for offset_m in offsets_m)  # false for NaN, too
     return is_near and all(abs(each) <= 163.81 for each in seen.velocity_m_s) and -2.047 <= seen.age_s <= 2.047
 
 
@@ -128,9 +135,9 @@ def _object(number: int, message: Message, seen: Seen) -> dict[str, Any]:
 
 @lru_cache(maxsize=1024)  # in a simulation all receivers decode the same bytes
 def decode_cpm(payload: bytes, types: Any) -> Message | None:
-    """Return a CPM; None for bytes that are none, which the radio may well deliver.
+    """Return a CPM; None for bytes that are none, which the radio may well deliver, and for one without a position.
 
-    Objects without a velocity along the axes are left out.
+    Objects whose place or velocity along the axes is not told, or is out of range, are left out.
     """
     if payload[:2] != bytes(CPM_HEADER.values()):
         return None
@@ -139,14 +146,23 @@ def decode_cpm(payload: bytes, types: Any) -> Message | None:
         of = {each["containerId"]: each["containerData"] for each in value["payload"]["cpmContainers"]}
         heading = types.decode("OriginatingVehicleContainer", of[VEHICLE_CONTAINER])["orientationAngle"]["value"]
         found = types.decode("PerceivedObjectContainer", of[OBJECT_CONTAINER])["perceivedObjects"]
+        management = value["payload"]["managementContainer"]
+        position_m = _metres(management["referencePosition"])
     except Exception:  # asn1tools has many kinds of errors for damaged bytes
         return None
-    management = value["payload"]["managementContainer"]
-    position_m = _metres(management["referencePosition"])
     time_ns = (management["referenceTime"] - START_MS) * 1_000_000
-    moving = [each for each in found if each.get("velocity", ("",))[0] == "cartesianVelocity"]
-    objects = tuple(_seen(each, position_m) for each in moving)
+    objects = tuple(_seen(each, position_m) for each in found if _is_told(each))
     return Message(value["header"]["stationId"], time_ns, position_m, _from_north(heading), objects=objects)
+
+
+def _is_told(found: dict[str, Any]) -> bool:
+    """Return whether an object's place and velocity along the axes are known and in range."""
+    kind, velocity = found.get("velocity", ("", {}))
+    return (
+        kind == "cartesianVelocity"
+        and all(-131072 < found["position"][f"{axis}Coordinate"]["value"] < 131071 for axis in "xy")
+        and all(-16383 < velocity[f"{axis}Velocity"]["value"] < 16382 for axis in "xy")
+    )
 
 
 def _seen(found: dict[str, Any], origin_m: Xy) -> Seen:
@@ -158,6 +174,9 @@ def _seen(found: dict[str, Any], origin_m: Xy) -> Seen:
 
 def encode_vam(message: Message, types: Any) -> bytes:
     """Return a VAM of a cyclist with the containers that each one must have."""
+    speed = UNKNOWN_SPEED
+    if message.speed_m_s is not None:
+        speed = min(round(100 * abs(message.speed_m_s)), 16382)
     ellipse = {"semiMajorAxisLength": 4095, "semiMinorAxisLength": 4095, "semiMajorAxisOrientation": 3601}
     basic = {
         "stationType": CYCLIST,
@@ -165,7 +184,7 @@ def encode_vam(message: Message, types: Any) -> bytes:
     }
     moves = {
         "heading": {"value": _to_north(message.heading_rad), "confidence": NOT_KNOWN},
-        "speed": {"speedValue": min(round(100 * abs(message.speed_m_s)), 16382), "speedConfidence": NOT_KNOWN},
+        "speed": {"speedValue": speed, "speedConfidence": NOT_KNOWN},
         "longitudinalAcceleration": {
             "longitudinalAccelerationValue": 161,
             "longitudinalAccelerationConfidence": 102,
@@ -179,23 +198,28 @@ def encode_vam(message: Message, types: Any) -> bytes:
 
 
 def decode_vam(payload: bytes, types: Any, now_ns: int) -> Message | None:
-    """Return a VAM of the last minute, or of 5 s to come by a slow clock; None for bytes that are none."""
+    """Return a VAM of the last minute, or of 5 s to come by a slow clock; None for bytes that are none.
+
+    None, too, for a VAM without a position.
+    """
     if payload[:2] != bytes(VAM_HEADER.values()):
         return None
     try:
         value = types.decode("VAM", payload)
+        parameters = value["vam"]["vamParameters"]
+        position_m = _metres(parameters["basicContainer"]["referencePosition"])
     except Exception:
         return None
     now_ms = START_MS + now_ns // 1_000_000
     age_ms = (now_ms - value["vam"]["generationDeltaTime"] + 5000) % 65536 - 5000
-    parameters = value["vam"]["vamParameters"]
     moves = parameters["vruHighFrequencyContainer"]
+    speed = moves["speed"]["speedValue"]
     return Message(
         station=value["header"]["stationId"],
         time_ns=(now_ms - age_ms - START_MS) * 1_000_000,
-        position_m=_metres(parameters["basicContainer"]["referencePosition"]),
+        position_m=position_m,
         heading_rad=_from_north(moves["heading"]["value"]),
-        speed_m_s=moves["speed"]["speedValue"] / 100,
+        speed_m_s=None if speed == UNKNOWN_SPEED else speed / 100,
     )
 
 
@@ -204,7 +228,11 @@ def encode_bsm(message: Message, count: int, types: Any) -> bytes:
 
     Raises VnetError in one line for `types` that have other fields.
     """
-    place = _place(message.position_m)
+    place, heading, speed = _place(message.position_m), UNKNOWN_BSM_HEADING, UNKNOWN_BSM_SPEED
+    if message.heading_rad is not None:
+        heading = round(math.degrees(math.pi / 2 - message.heading_rad) % 360 / 0.0125) % 28800
+    if message.speed_m_s is not None:
+        speed = min(round(abs(message.speed_m_s) / 0.02), 8190)
     core = {
         "msgCnt": count % 128,
         "id": (message.station % 2**32).to_bytes(4, "big"),
@@ -214,8 +242,8 @@ def encode_bsm(message: Message, count: int, types: Any) -> bytes:
         "elev": -4096,
         "accuracy": {"semiMajor": 255, "semiMinor": 255, "orientation": 65535},
         "transmission": "unavailable",
-        "speed": min(round(abs(message.speed_m_s) / 0.02), 8190),
-        "heading": round(math.degrees(math.pi / 2 - message.heading_rad) % 360 / 0.0125) % 28800,
+        "speed": speed,
+        "heading": heading,
         "angle": 127,
         "accelSet": {"long": 2001, "lat": 2001, "vert": -127, "yaw": 0},
         "brakes": {
@@ -232,30 +260,36 @@ def encode_bsm(message: Message, count: int, types: Any) -> bytes:
 
 
 def decode_bsm(payload: bytes, types: Any) -> Message | None:
-    """Return a BSM, its time within a minute; None for bytes that are none."""
+    """Return a BSM, its time within a minute; None for bytes that are none and a BSM without position or time."""
     try:
         frame = types.decode("MessageFrame", payload)
-        core = types.decode("BasicSafetyMessage", frame["value"])["coreData"] if frame["messageId"] == BSM else None
+        if frame["messageId"] != BSM:
+            return None
+        core = types.decode("BasicSafetyMessage", frame["value"])["coreData"]
+        position_m = _metres({"latitude": core["lat"], "longitude": core["long"]})
     except Exception:
         return None
-    if core is None:
+    if core["secMark"] == UNKNOWN_SECOND:
         return None
+    heading, speed = core["heading"], core["speed"]
     return Message(
         station=int.from_bytes(core["id"], "big"),
         time_ns=core["secMark"] * 1_000_000,
-        position_m=_metres({"latitude": core["lat"], "longitude": core["long"]}),
-        heading_rad=math.radians(90 - core["heading"] * 0.0125) % math.tau,
-        speed_m_s=core["speed"] * 0.02,
+        position_m=position_m,
+        heading_rad=None if heading == UNKNOWN_BSM_HEADING else math.radians(90 - heading * 0.0125) % math.tau,
+        speed_m_s=None if speed == UNKNOWN_BSM_SPEED else speed * 0.02,
     )
 
 
-def _to_north(heading_rad: float) -> int:
+def _to_north(heading_rad: float | None) -> int:
     """Return a heading from east as ETSI's tenths of a degree from north, clockwise."""
+    if heading_rad is None:
+        return UNKNOWN_HEADING
     return round(10 * (math.degrees(math.pi / 2 - heading_rad) % 360)) % 3600
 
 
-def _from_north(angle: int) -> float:
-    return math.radians(90 - angle / 10) % math.tau
+def _from_north(angle: int) -> float | None:
+    return None if angle == UNKNOWN_HEADING else math.radians(90 - angle / 10) % math.tau
 
 
 def _place(position_m: Xy) -> dict[str, Any]:
@@ -266,6 +300,9 @@ def _place(position_m: Xy) -> dict[str, Any]:
 
 
 def _metres(place: dict[str, Any]) -> Xy:
+    """Return a position in m east and north of the origin. Raises ValueError for one that is not known."""
+    if place["latitude"] == UNKNOWN_LATITUDE or place["longitude"] == UNKNOWN_LONGITUDE:
+        raise ValueError("without a position")
     north_m = (place["latitude"] / 1e7 - ORIGIN_DEG[0]) * DEGREE_M
     east_m = (place["longitude"] / 1e7 - ORIGIN_DEG[1]) * DEGREE_M * math.cos(math.radians(ORIGIN_DEG[0]))
     return east_m, north_m

@@ -22,7 +22,9 @@ def is_due(fix: Fix, last: Fix | None) -> bool:
     """Tell whether a VAM is sent at this fix, given that of the last one."""
     if last is None or fix.time_ns - last.time_ns >= LONGEST_S * 1e9:
         return True
-    turned_rad = math.remainder((fix.heading_rad or 0.0) - (last.heading_rad or 0.0), math.tau)
+    turned_rad = 0.0
+    if fix.heading_rad is not None and last.heading_rad is not None:
+        turned_rad = math.remainder(fix.heading_rad - last.heading_rad, math.tau)
     return (
         float(np.hypot(*(fix.position_m - last.position_m))) > POSITION_M
         or abs((fix.speed_m_s or 0.0) - (last.speed_m_s or 0.0)) > SPEED_M_S
@@ -31,10 +33,13 @@ def is_due(fix: Fix, last: Fix | None) -> bool:
 
 
 def braking_m_s2(fix: Fix, cyclist: Message) -> float:
-    """Return the acceleration that takes a car to the cyclist's speed `BEHIND_M` behind him; 0 if far away."""
-    passed_s = (fix.time_ns - cyclist.time_ns) / 1e9
-    gap_m = cyclist.position_m[0] + passed_s * cyclist.speed_m_s - float(fix.position_m[0]) - BEHIND_M
-    closing_m_s = (fix.speed_m_s or 0.0) - cyclist.speed_m_s
+    """Return the acceleration that takes a car to the cyclist's speed `BEHIND_M` behind him; 0 if far away.
+
+    A cyclist whose speed is not known counts as standing.
+    """
+    passed_s, speed_m_s = (fix.time_ns - cyclist.time_ns) / 1e9, cyclist.speed_m_s or 0.0
+    gap_m = cyclist.position_m[0] + passed_s * speed_m_s - float(fix.position_m[0]) - BEHIND_M
+    closing_m_s = (fix.speed_m_s or 0.0) - speed_m_s
     needed_m_s2 = closing_m_s**2 / (2 * max(gap_m, 0.1))
     return -needed_m_s2 if closing_m_s > 0 and needed_m_s2 > BRAKING_M_S2 / 2 else 0.0
 
@@ -50,7 +55,7 @@ async def main(node: Node) -> None:
             cyclist = decode_vam(packet.payload, types, fix.time_ns) or cyclist
         if node.id == node.options.get("cyclist") and is_due(fix, sent):
             here_m = float(fix.position_m[0]), float(fix.position_m[1])
-            told = Message(int(node.id[1:]), fix.time_ns, here_m, fix.heading_rad or 0.0, fix.speed_m_s or 0.0)
+            told = Message(int(node.id[1:]), fix.time_ns, here_m, fix.heading_rad, fix.speed_m_s)
             await node.radio.broadcast(encode_vam(told, types))
             sent, vams = fix, vams + 1
         if cyclist is not None and node.options.get("listens", True):
