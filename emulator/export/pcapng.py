@@ -48,18 +48,23 @@ _MOBILE, _HOPS, _RADIUS_M = 0x80, {CAM: 1, DENM: 10}, 1000
 _HEADER_BITS = 48
 _UNAVAILABLE = 900_000_001, 1_800_000_001
 """Latitude and longitude that are not available; larger ones are none."""
-_LEAST_BITS = {CAM: 256, DENM: 250}
-"""Bits of messages that have all that is read here."""
+_CAR, _ROADSIDE_UNIT, _MOST_TYPES = 5, 15, 31
+"""Types of stations, and the greatest that an address can say."""
 
 
 @dataclass(frozen=True)
 class Station:
-    """A sender as headers have it: position in 10⁻⁷ degrees, speed in cm/s, heading in 0.1 degrees from north."""
+    """A sender as headers have it: position in 10⁻⁷ degrees, speed in cm/s, heading in 0.1 degrees from north.
+
+    Attributes:
+        kind: station type, as a CAM has it.
+    """
 
     latitude: int
     longitude: int
     speed: int = 0
     heading: int = 0
+    kind: int = _CAR
 
 
 class Router:
@@ -76,7 +81,8 @@ class Router:
         kind = message[1]
         if kind == CAM:
             self._last[sender] = read
-        source = _long_position(sender, time_ns, self._last.get(sender, read))
+        station = self._last.get(sender, read)
+        source = _long_position(sender, time_ns, station)
         transport = struct.pack(">HH", _PORTS[kind], 0) + message
         if kind == CAM:
             header_type, extended = _SINGLE_HOP << 4, source + bytes(4)
@@ -85,15 +91,19 @@ class Router:
             header_type, extended = _GEO_BROADCAST << 4, struct.pack(">HH", seq & 0xFFFF, 0) + source + area
         hops = _HOPS[kind]
         basic = struct.pack(">BBBB", 1 << 4 | _COMMON_HEADER, 0, _LIFETIME[kind], hops)
+        flags = 0 if station.kind == _ROADSIDE_UNIT else _MOBILE
         common = struct.pack(
-            ">BBBBHBB", _BTP_B << 4, header_type, _TRAFFIC_CLASS[kind], _MOBILE, len(transport), hops, 0
+            ">BBBBHBB", _BTP_B << 4, header_type, _TRAFFIC_CLASS[kind], flags, len(transport), hops, 0
         )
         return basic + common + extended + transport
 
 
 def station_of(message: bytes) -> Station | None:
     """Return what a CAM says of its station, or where the event of a DENM is; None if it is neither."""
-    station = _read(message)
+    try:
+        station = _read(message)
+    except ValueError:  # it is cut short
+        return None
     if station is None or abs(station.latitude) > _UNAVAILABLE[0] or abs(station.longitude) > _UNAVAILABLE[1]:
         return None
     return station
@@ -102,21 +112,19 @@ def station_of(message: bytes) -> Station | None:
 def _read(message: bytes) -> Station | None:
     if len(message) < 2 or message[0] not in _VERSIONS or message[1] not in _PORTS:
         return None
-    kind = message[1]
-    if 8 * len(message) < _LEAST_BITS[kind]:
-        return None
     bits = _Bits(message)
-    if kind == CAM:
-        bits.skip(_HEADER_BITS + 16 + 3 + 1 + 8)  # delta time; options; station type
+    if message[1] == CAM:
+        bits.skip(_HEADER_BITS + 16 + 3 + 1)  # delta time; options
+        kind = bits.take(8)
         latitude, longitude = _position(bits)
         bits.skip(36 + 24)  # confidence, altitude
         if bits.take(2):  # another container than a vehicle's
-            return Station(latitude, longitude)
+            return Station(latitude, longitude, kind=kind)
         bits.skip(7)
         heading = bits.take(12)
         bits.skip(7)
         speed = bits.take(14)
-        return Station(latitude, longitude, 0 if speed == 16383 else speed, 0 if heading > 3600 else heading)
+        return Station(latitude, longitude, 0 if speed == 16383 else speed, 0 if heading > 3600 else heading, kind)
     bits.skip(_HEADER_BITS + 3 + 1)
     has_termination = bits.take(1)
     bits.skip(4 + 32 + 16 + 42 + 42 + has_termination)  # options, action, times of detection and reference
@@ -130,7 +138,7 @@ class _Bits:
         self._number, self._left = int.from_bytes(data, "big"), 8 * len(data)
 
     def take(self, count: int) -> int:
-        """Return the next `count` bits."""
+        """Return the next `count` bits. Raises ValueError if there are not so many."""
         self._left -= count
         return self._number >> self._left & (1 << count) - 1
 
@@ -144,8 +152,9 @@ def _position(bits: _Bits) -> tuple[int, int]:
 
 
 def _long_position(sender: int, time_ns: int, station: Station) -> bytes:
-    """Return a long position vector: address (a car's), time, place, speed and heading."""
-    address = struct.pack(">BB", 5 << 2, 0) + _address(sender)
+    """Return a long position vector: address with the station type, time, place, speed and heading."""
+    kind = station.kind if station.kind <= _MOST_TYPES else 0  # unknown
+    address = struct.pack(">BB", kind << 2, 0) + _address(sender)
     milliseconds = time_ns // 1_000_000 % 2**32
     place = struct.pack(">Iii", milliseconds, station.latitude, station.longitude)
     return address + place + struct.pack(">HH", 0x8000 | min(station.speed, 0x3FFF), station.heading)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pycrate_asn1dir.ITS_CAM_2 import CAM_PDU_Descriptions
 from typer.testing import CliRunner
 
 import emulator
@@ -93,6 +94,26 @@ def test_headers_are_as_the_standard_has_them() -> None:
     assert packet[56:] == struct.pack(">HH", 2002, 0) + denm
     assert station_of(b"\x02\x03" + bytes(60)) is None
     assert Station(1, 2) == Station(1, 2, 0, 0)
+
+
+@pytest.mark.slow
+@given(st.integers(0, 255), st.booleans())
+def test_a_cam_has_the_headers_of_its_station_type_also_with_the_least_that_it_may_say(
+    kind: int, is_vehicle: bool
+) -> None:
+    cam = CAM_PDU_Descriptions.CAM
+    cam.from_uper(encode_cam(Message(7, (0.0, 0.0), 0.0, 20.0), 0))
+    value = cam.get_val()
+    value["cam"]["camParameters"]["basicContainer"]["stationType"] = kind
+    if not is_vehicle:
+        value["cam"]["camParameters"]["highFrequencyContainer"] = ("rsuContainerHighFrequency", {})
+    cam.set_val(value)
+    message = cam.to_uper()
+    assert len(message) == (41 if is_vehicle else 26)
+    packet = Router().packet(0, 0, 0, message)
+    assert packet is not None and packet.endswith(message)
+    assert packet[12] == (kind if kind < 32 else 0) << 2
+    assert packet[7] == (0 if kind == 15 else 0x80), "a roadside unit is not mobile"
 
 
 @pytest.fixture(scope="module")
