@@ -6,6 +6,7 @@ import sys
 import webbrowser
 from collections.abc import Callable
 from importlib import import_module
+from inspect import isasyncgenfunction, iscoroutinefunction, isgeneratorfunction
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,6 +35,8 @@ LONGEST_CONTENT = 200
 """Characters of a content that are shown."""
 LONGEST_CELL = 100_000
 """Characters of a cell that are printed where no table is."""
+NO_PLAIN_FUNCTIONS = isasyncgenfunction, iscoroutinefunction, isgeneratorfunction
+"""Tests for functions that return no result when they are called."""
 MOST_BYTES = 32
 """Bytes of a payload that are shown where nothing decodes it."""
 
@@ -129,7 +132,7 @@ def _decoded_by(function: Callable[[bytes], Any]) -> Callable[[FrameEntry], str]
             return _raw(entry)
         try:
             return str(function(entry.payload))
-        except Exception as error:  # whatever the user's function cannot make sense of
+        except (Exception, SystemExit) as error:  # whatever the user's function cannot make sense of
             return f"{_raw(entry)} ({error_line(error)})"
 
     return content
@@ -150,8 +153,8 @@ def _load(entry: str) -> Callable[[bytes], Any]:
         function = getattr(import_module(module), name)
     except (Exception, SystemExit) as error:
         raise VnetError(f"--decode {entry}: cannot import: {error_line(error)}") from None
-    if not callable(function):
-        raise VnetError(f"--decode {entry}: is not a function of a payload: def {name}(payload)")
+    if not callable(function) or any(holds(function) for holds in NO_PLAIN_FUNCTIONS):
+        raise VnetError(f"--decode {entry}: is not a plain function of a payload: def {name}(payload)")
     return function  # type: ignore[no-any-return]
 
 

@@ -3,6 +3,8 @@
 import base64
 import io
 import json
+import sys
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -107,6 +109,39 @@ def test_a_function_decodes_and_may_fail(kept: Path, capsys: pytest.CaptureFixtu
     lines = trace(capsys, str(kept), "--node", "v01", "--to", "0.3", "--decode", function)
     assert lines[1][4] == "['v01', 'says', '0']"
     assert lines[-1][4].startswith("ff00 (UnicodeDecodeError: ")
+
+
+def leave(payload: bytes) -> str:
+    if payload == b"\xff\x00":
+        sys.exit(5)
+    return "stays"
+
+
+def test_a_function_that_exits_ends_nothing(kept: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = trace(capsys, str(kept), "--node", "v01", "--decode", f"{__name__}:leave")
+    assert len(lines) == len(trace(capsys, str(kept), "--node", "v01"))
+    assert {line[4] for line in lines if line[2] == "1"} == {"ff00 (SystemExit: 5)"}
+    assert lines[-1][4] == "stays"
+
+
+async def waits(payload: bytes) -> int:
+    return len(payload)
+
+
+def yields(payload: bytes) -> Iterator[int]:
+    yield len(payload)
+
+
+async def both(payload: bytes) -> AsyncIterator[int]:
+    yield len(payload)
+
+
+@pytest.mark.parametrize("name", ["waits", "yields", "both"])
+def test_what_returns_no_result_when_it_is_called_is_refused_in_one_line(
+    name: str, kept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (line,) = trace(capsys, str(kept), "--decode", f"{__name__}:{name}", status=2)
+    assert name in line[0] and "plain function" in line[0]
 
 
 def test_without_payloads_there_are_digests(bare: Path, capsys: pytest.CaptureFixture[str]) -> None:
