@@ -79,6 +79,7 @@ def trace(
     """Show who sent what to whom, and what became of it; on a terminal as a table, else separated by tabs."""
     from emulator.records.parting import frame_log
     from emulator.records.recorded_run import RecordedRun
+    from emulator.records.tables import PAYLOADS
 
     with one_line_errors():
         if end is not None and not end > start:
@@ -89,8 +90,10 @@ def trace(
             raise VnetError(f"--from {start:g}: must come before the run's end at {ended_s:g} s")
         if node is not None and node not in recorded.number:
             raise VnetError(f"--node {node}: no such vehicle{did_you_mean(node, recorded.node_ids)}")
-        if decode is not None and not recorded.scenario.run.keep_payloads:
-            raise VnetError(f"--decode {decode}: {run} has kept no payloads; set run.keep_payloads = true")
+        if decode is not None:
+            if not recorded.scenario.run.keep_payloads:
+                raise VnetError(f"--decode {decode}: {run} has kept no payloads; set run.keep_payloads = true")
+            recorded.required(PAYLOADS)
         content = _raw if decode is None else _decoded_by(_load(decode))
         end_ns = None if end is None or end > DAY_S else round(end * NS_PER_S)
         rows = (_row(entry, content) for entry in frame_log(recorded, node, round(start * NS_PER_S), end_ns))

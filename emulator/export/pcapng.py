@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from emulator.radio.dot11p import SIFS_NS
 from emulator.radio.unicast import BASIC_RATES_MBPS, ack_airtime_ns, ack_rate_mbps
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.tables import PAYLOADS
 from vnet.errors import VnetError
 from vnet.types import Array, IntArray
 
@@ -204,8 +205,12 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
     With `as_its` payloads that are a CAM or a DENM have the headers of GeoNetworking and BTP. Raises VnetError if
     the run has kept no payloads.
     """
-    if as_its and recorded.payloads is None:
-        raise VnetError("--payloads its: the run has kept no payloads; run it with --set run.keep_payloads=true")
+    if as_its:
+        if not recorded.scenario.run.keep_payloads:
+            raise VnetError(
+                "--payloads its: the run has kept no payloads; run it with --set run.keep_payloads=true"
+            )
+        recorded.required(PAYLOADS)
     routers = Router() if as_its else None
     file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + _option(_APPLICATION, b"vnet")))
     headers, comments = _Headers(recorded), _Comments(recorded)

@@ -851,6 +851,11 @@ class OpenedRun(RecordedRun):
             self._tables[kind] = self._read_table(kind) if there else None
         return self._tables[kind]
 
+    def required(self, kind: Table) -> pa.Table:
+        """Return a table that the run must have. Raises VnetError if it is missing."""
+        table = self.table(kind)
+        return self._read_table(kind) if table is None else table
+
     @cached_property
     def payloads(self) -> KeptPayloads | None:
         """Payloads of frames; None where the run has kept none."""

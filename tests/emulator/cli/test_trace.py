@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import shutil
 import sys
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -149,6 +150,19 @@ def test_without_payloads_there_are_digests(bare: Path, capsys: pytest.CaptureFi
     assert len(lines) == 4 and lines[1][4].startswith("digest ")
     (line,) = trace(capsys, str(bare), "--decode", f"{__name__}:decode", status=2)
     assert line[0].endswith("has kept no payloads; set run.keep_payloads = true")
+
+
+@pytest.mark.parametrize(
+    "words", [["trace", "--decode", f"{__name__}:decode"], ["export", "--to", "pcapng", "--payloads", "its"]]
+)
+def test_a_folder_that_has_lost_its_payloads_is_told_as_such(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    folder = shutil.copytree(kept, tmp_path / "run")
+    (folder / "payloads.parquet").unlink()
+    assert run_app(app, [*words, str(folder)]) == 2
+    captured = capsys.readouterr()
+    assert not captured.out and "there is no payloads.parquet in it" in captured.err.splitlines()[-1]
 
 
 def test_exports_hold_what_was_kept(kept: Path, tmp_path: Path) -> None:
