@@ -14,6 +14,7 @@ Formats: draft-ietf-opsawg-pcapng; radiotap.org. Link type 127 is 802.11 with ra
 A program broadcasts a CAM or a DENM (release 1, in unaligned PER) as it is. On air such a message follows BTP-B
 (EN 302 636-5-1) and GeoNetworking (EN 302 636-4-1 V1.4.1): a CAM as a single-hop broadcast, a DENM as a broadcast
 into a circle around its event. What headers repeat of a message, such as its position, is read from its first bits.
+Timestamps are milliseconds from the start of the run: a CAM has 16 bits of the time since 2004, too few for theirs.
 """
 
 from __future__ import annotations
