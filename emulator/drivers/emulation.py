@@ -804,10 +804,16 @@ class Emulation:
         return time_ns if time_ns < self.duration_ns else None
 
     def finish(self, time_ns: int) -> None:
-        """End of the run at `time_ns`: close the periods and decide what is still in flight. Only once."""
+        """End of the run at `time_ns`: close the periods and decide what is still in flight. Only once.
+
+        Faults, entries and exits before it act, also those to which a run in real time comes too late.
+        """
         if self.ended_ns is None:
-            self.ended_ns = time_ns
             self.drive_to(time_ns)
+            while (change_ns := self.next_change_ns()) is not None and change_ns < time_ns:
+                self.advance(change_ns - 1)
+                self.act(change_ns, starts_at_once=False)
+            self.ended_ns = time_ns
             self.close_periods(time_ns)
             self.folder.reach(time_ns)
             self.engine.drain()

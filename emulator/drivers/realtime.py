@@ -277,6 +277,8 @@ class RealTime:
 
     def _change_by(self, now_ns: int) -> None:
         """Begin and end the faults that are due: messages that have waited must meet those of their time."""
+        if self._emulation.ended_ns is not None:  # the run was interrupted before
+            return
         self._emulation.drive_to(now_ns)
         while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
             self._collect(change_ns - 1)

@@ -188,9 +188,9 @@ class LiveSession:
         except Stalled:
             self._emulation.finish(self._time_ns())
         except asyncio.CancelledError:
-            interrupted = True
-            folder.event(self._time_ns(), EventKind.interrupted)
-            self._emulation.finish(self._time_ns())
+            interrupted, time_ns = True, self._time_ns()
+            folder.event(time_ns, EventKind.interrupted)
+            self._emulation.finish(time_ns)
         finally:
             wall_s = time.monotonic() - started_s
             self._measure_cpu()

@@ -19,6 +19,7 @@ from vnet.radio import SentFrame
 from vnet.runtime.arrivals import Mail
 from vnet.transport import wire
 from vnet.transport.wire import MessageRef, SentMessage, arrived_in_full
+from vnet.units import NS_PER_S
 
 IDS = ["v01", "v02", "v03", "v04"]
 MS = 1_000_000
@@ -395,12 +396,13 @@ def test_who_was_paused_in_a_restart_is_sent_nothing_until_it_has_found_the_emul
 class _Restarting(Processes):
     """Processes whose restart takes time of the clock, as does what is sent within `slow_ms`.
 
-    That of v02 is ready again at `ready_ms`, if ever.
+    That of v02 is ready again at `ready_ms`, if ever. The loop wakes up `late_ms` later than it asks for.
     """
 
-    def __init__(self, slow_ms: range, ready_ms: int | None = None) -> None:
+    def __init__(self, slow_ms: range, ready_ms: int | None = None, late_ms: int = 0) -> None:
         self.now_ns = 0
         self._ready_ms = ready_ms
+        self._late_ms = late_ms
         self.stopped: list[str] = []
         self._slow_ms = slow_ms
         self._receipts = {node: wire.Receipts() for node in IDS}
@@ -432,7 +434,7 @@ class _Restarting(Processes):
     async def receive(self, timeout_s: float = math.inf) -> Heard | None:
         if self._heard:
             return self._heard.pop(0)
-        self.now_ns += math.ceil(timeout_s * 1e9)
+        self.now_ns += math.ceil(timeout_s * 1e9) + self._late_ms * MS
         return None
 
 
@@ -477,3 +479,32 @@ def test_a_restart_takes_no_time_from_a_program_that_starts(
     assert [event.time_ns // MS for event in emulation.folder.events if event.kind == "died"] == died_ms
     assert emulation.up["v02"] is (died_ms == [])
     assert processes.stopped == ["v02"] * (1 + len(died_ms))
+
+
+def fault_events(emulation: Emulation) -> list[tuple[str, str, float]]:
+    events = [event for event in emulation.folder.events if event.kind.startswith("fault_")]
+    return [(event.kind, event.details["fault"], event.time_ns / NS_PER_S) for event in events]
+
+
+@pytest.mark.parametrize("at_s", [2.401, None], ids=["held by a restart", "late"])
+def test_all_that_the_plan_says_until_the_end_is_done_however_late_the_run_comes_to_it(at_s: float | None) -> None:
+    held = [] if at_s is None else [{"kind": "emulator_restart", "at_s": at_s, "down_s": 0.7}]
+    faults = [fault("loss", 2.5, 0.3, probability=0.5), fault("kill", 2.5, 0.499), fault("pause", 2.5, 0.4995)]
+    processes = _Restarting(range(0), late_ms=0 if held else 3)
+    realtime, emulation = run_to_the_end(processes, *faults, *held, settle_s=0.0)
+    realtime.finish()
+    planned = emulation.faults.faults
+    starts = [("fault_started", each.label, each.start_ns / NS_PER_S) for each in planned]
+    ends = [("fault_ended", each.label, each.end_ns / NS_PER_S) for each in planned]
+    assert sorted(fault_events(emulation)) == sorted(
+        event for event in [*starts, *ends] if event[2] < emulation.duration_ns / NS_PER_S
+    )
+
+
+def test_what_the_plan_says_until_an_interruption_is_done_and_nothing_of_later() -> None:
+    realtime, emulation = started(fault("loss", 0.46, 0.03, probability=0.5), fault("pause", 0.52, 0.5))
+    realtime.due(450 * MS)
+    emulation.finish(500 * MS)
+    realtime.receive(550 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic()))
+    realtime.finish()
+    assert fault_events(emulation) == [("fault_started", "loss-0", 0.46), ("fault_ended", "loss-0", 0.49)]
