@@ -39,7 +39,9 @@ from emulator.viewer.sinks import (
 )
 from vnet.errors import VnetError
 from vnet.extras import require
+from vnet.transport.access import OBSERVER
 from vnet.transport.credentials import Credentials
+from vnet.transport.keys import SEGMENTS, is_segment
 
 if TYPE_CHECKING:
     from emulator.viewer.recorder import Recorder
@@ -161,7 +163,11 @@ def record(
         require("vnet record", "rerun")
         from emulator.viewer.watch import record_run  # Rerun is slow to import, and only this command needs it
 
+        if not is_segment(run):
+            raise VnetError(f"{run!r}: {SEGMENTS}")
         login = None if credentials is None else Credentials.load(credentials)
+        if login is not None and login.user != OBSERVER:
+            raise VnetError(f"credentials {credentials}: of the user {login.user}, and not of the {OBSERVER}")
         sinks = choose_sinks(rerun or ["save"], rerun_bind, rerun_port, rerun_vehicle)
         if sinks is None:
             raise VnetError("--rerun off: there is nothing to do")

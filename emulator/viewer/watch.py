@@ -22,7 +22,7 @@ import zenoh
 
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
-from vnet.errors import WireError
+from vnet.errors import TransportError, WireError
 from vnet.transport import keys, wire
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import DEFAULT_SLICE, set_time_slice
@@ -37,6 +37,8 @@ CLOSING_S = 0.2
 """Time to finish after a signal: it is killed half a second after it, and the file must be closed by then."""
 INBOX_BYTES = 64 * 1024 * 1024
 DEFAULT_PATIENCE_S = 5.0
+FIRST_SIGN_S = 60.0
+"""Time within which the emulator must be there: as long as an agent waits for its welcome."""
 
 
 class Inbox:
@@ -95,7 +97,8 @@ class Inbox:
 def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: Sinks) -> None:
     """Record `run` into `sinks` until its end; see the module's text.
 
-    Raises TransportError if no router at `endpoint` accepts, VnetError if the file cannot be written.
+    Raises TransportError if no router at `endpoint` accepts, or no emulator is there under this name, and VnetError
+    if the file cannot be written.
     """
     inbox = Inbox()
 
@@ -121,11 +124,14 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
         liveliness = session.liveliness()
         alive = liveliness.declare_subscriber(keys.emulator_alive(run), on_alive, history=True)
         with alive, session.declare_subscriber(keys.observe(run, "*"), on_sample):
-            _record_all(inbox, recorder)
+            _record_all(inbox, recorder, run)
 
 
-def _record_all(inbox: Inbox, recorder: Recorder) -> None:
-    """Record messages until the end of the run, the inbox is closed, or the emulator has been gone for too long."""
+def _record_all(inbox: Inbox, recorder: Recorder, run: str) -> None:
+    """Record messages until the end of the run, the inbox is closed, or the emulator has been gone for too long.
+
+    Raises TransportError if it never was there.
+    """
     taker = _Taker(inbox, recorder)
     while not taker.ended:
         count = inbox.gather(taker.left_s, GATHER_S)
@@ -133,6 +139,10 @@ def _record_all(inbox: Inbox, recorder: Recorder) -> None:
         if inbox.is_closed:
             return
         if not count:
+            if not taker.heard:
+                raise TransportError(
+                    f"run {run}: no sign of it within {FIRST_SIGN_S:g} s: is it running?"
+                )
             _say(f"the emulator has been gone for {taker.patience_s:g} s; the recording ends")
             return
 
@@ -143,14 +153,14 @@ class _Taker:
     def __init__(self, inbox: Inbox, recorder: Recorder) -> None:
         self._inbox = inbox
         self._recorder = recorder
-        self._deadline: float | None = None
+        self._deadline: float | None = time.monotonic() + FIRST_SIGN_S
         self._said = 0
         self.patience_s = DEFAULT_PATIENCE_S
-        self.ended = False
+        self.heard = self.ended = False
 
     @property
     def left_s(self) -> float | None:
-        """Time left for the emulator to return; None if it is there."""
+        """Time left for the emulator to come, or to return; None if it is there."""
         return None if self._deadline is None else max(0.0, self._deadline - time.monotonic())
 
     def take(self, count: int) -> None:
@@ -162,6 +172,7 @@ class _Taker:
                 if time.monotonic() > closing:
                     break
             stream, data = self._inbox.take()
+            self.heard = True
             if stream == "found":
                 self._deadline = None
             elif stream == "lost" or self._deadline is not None:  # its last words may come after it is lost

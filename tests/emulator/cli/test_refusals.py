@@ -14,6 +14,7 @@ from tests.support import maps
 from tests.support.command_line import app
 from tests.support.paths import ROOT
 from tests.support.recorded import recorded
+from vnet.transport.credentials import Credentials
 
 pytestmark = pytest.mark.slow
 
@@ -28,6 +29,7 @@ FILES = {
     "src/good.py": "async def main(node):\n    pass\n",
     "two.toml": 'program = {entry = "good.py", exceptions = [{entry = "src/good.py", nodes = ["v01"]}]}\n',
     "fault.toml": '[[fault]]\nkind = "kill"\nat_s = 1.0\nduration_s = 1.0\nnodes = ["v99"]\n',
+    "v01.json": Credentials("node-v01", "secret").dumps(),
     "town.geojson": maps.geojson(),
     "trips.csv": "",
     "cross.npz": "",

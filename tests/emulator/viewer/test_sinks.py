@@ -30,7 +30,7 @@ from emulator.viewer.sinks import (
 from emulator.viewer.watch import Inbox, _record_all, _Taker
 from tests.support.paths import ROOT
 from tests.support.recordings import descendants, listening_addresses, read_back, rrd
-from vnet.errors import VnetError
+from vnet.errors import TransportError, VnetError
 from vnet.transport import wire
 
 TIMEOUT_S = 60
@@ -305,7 +305,7 @@ def test_what_waits_is_drawn_by_an_observer_that_a_signal_ends() -> None:
         inbox.put("period", wire.encode_observation({"period": number}))
     before = signal.signal(signal.SIGTERM, lambda *_: inbox.close())
     try:
-        _record_all(inbox, recorder)
+        _record_all(inbox, recorder, "run")
     finally:
         signal.signal(signal.SIGTERM, before)
     assert recorder.drawn == [0, 1, 2, 3, 4]
@@ -321,3 +321,11 @@ def test_what_a_lost_emulator_said_last_does_not_make_it_be_waited_for() -> None
         taker.take(inbox.gather(0))
         assert (taker.left_s is None) == is_there, stream
     assert recorder.drawn == [1, 1]
+
+
+def test_an_emulator_that_never_comes_is_not_awaited_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = Drawn(Inbox())
+    assert _Taker(Inbox(), recorder).left_s is not None
+    monkeypatch.setattr("emulator.viewer.watch.FIRST_SIGN_S", 0.0)
+    with pytest.raises(TransportError, match=r"^run nobody: .* is it running"):
+        _record_all(Inbox(), recorder, "nobody")
