@@ -82,6 +82,7 @@ def _write_recording(played: Iterator[Message], sinks: Sinks) -> None:
             played, "drawing", total, console=console, transient=True, disable=not console.is_terminal
         ):
             recorder.take(stream, message)
+        recorder.finish()
 
 
 def _recorder(sinks: Sinks, name: str) -> Recorder:

@@ -307,6 +307,11 @@ class Recorder:
         self._recording.send_blueprint(blueprint(vehicle, self._content))
         written(self._recording, self._sinks)  # whatever happens now, it can be looked at
 
+    def finish(self) -> None:
+        """Draw what waits, and wait until all is written. Raises VnetError if it cannot be."""
+        self.draw()
+        written(self._recording, self._sinks)
+
     def draw(self) -> None:
         """Draw the periods that wait, which `take` does only once there are some."""
         while self._waiting:

@@ -125,6 +125,7 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
         alive = liveliness.declare_subscriber(keys.emulator_alive(run), on_alive, history=True)
         with alive, session.declare_subscriber(keys.observe(run, "*"), on_sample):
             _record_all(inbox, recorder, run)
+        recorder.finish()
 
 
 def _record_all(inbox: Inbox, recorder: Recorder, run: str) -> None:
@@ -140,9 +141,7 @@ def _record_all(inbox: Inbox, recorder: Recorder, run: str) -> None:
             return
         if not count:
             if not taker.heard:
-                raise TransportError(
-                    f"run {run}: no sign of it within {FIRST_SIGN_S:g} s: is it running?"
-                )
+                raise TransportError(f"run {run}: no sign of it within {FIRST_SIGN_S:g} s: is it running?")
             _say(f"the emulator has been gone for {taker.patience_s:g} s; the recording ends")
             return
 

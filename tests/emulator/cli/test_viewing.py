@@ -1,6 +1,7 @@
 """`vnet render` and `vnet view`, as one types them: what they make, and what they refuse."""
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks, is_closed
 from tests.emulator.test_playback import Watched, watch
 from tests.support.command_line import app
+from tests.support.forked_commands import VNET
+from tests.support.paths import ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -51,6 +54,17 @@ def test_what_was_there_stays_until_the_new_one_is_whole(watched: Watched, tmp_p
     assert "states.parquet" in output
     assert (folder / "recording.rrd").read_bytes() == b"old"
     assert not [path for path in folder.iterdir() if path.name.endswith(".part")]
+
+
+def test_what_was_there_stays_where_the_new_one_has_no_room(watched: Watched, tmp_path: Path) -> None:
+    (out := tmp_path / "mine.rrd").write_bytes(b"old")
+    kib = (watched.folder / "live.rrd").stat().st_size // 1024 // 2
+    words = [*VNET, "render", watched.folder, "--out", out]
+    limited = ["bash", "-c", f'ulimit -f {kib}; exec "$@"', "bash", *map(str, words)]
+    done = subprocess.run(limited, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2, done
+    assert done.stderr.splitlines()[-1].startswith("vnet: ") and "cannot write the recording" in done.stderr
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("mine.rrd", b"old")]
 
 
 def test_nothing_asks_to_render_a_run_that_was_killed(watched: Watched, tmp_path: Path) -> None:

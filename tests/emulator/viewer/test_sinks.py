@@ -205,6 +205,36 @@ def test_a_recording_that_cannot_be_written_any_more_says_so_and_ends(tmp_path: 
     assert f"vnet: {path}: cannot write the recording: " in done.stderr
 
 
+RECORDED_ON_A_FULL_DISK = """
+import resource, sys
+from contextlib import nullcontext
+from pathlib import Path
+from unittest.mock import MagicMock
+import rerun as rr
+from emulator.viewer import sinks, watch
+from vnet.errors import VnetError
+sinks.CLOSE_TIMEOUT_S = 0.5
+watch.open_client = lambda *_: nullcontext(MagicMock())
+def draw(inbox, recorder, run):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+    for number in range(100):
+        recorder._recording.log(f"a{number}", rr.TextLog(1000 * "a"))
+watch._record_all = draw
+try:
+    watch.record_run("tcp/127.0.0.1:1", "run", None, sinks.Sinks(Path(sys.argv[1])))
+except VnetError as error:
+    sys.exit(f"failed: {error}")
+"""
+
+
+@pytest.mark.slow
+def test_who_records_a_run_is_told_that_the_recording_could_not_be_written(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", RECORDED_ON_A_FULL_DISK, str(tmp_path / "full.rrd")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == 1, done.stderr
+    assert f"failed: {tmp_path}/full.rrd: cannot write the recording: " in done.stderr
+
+
 @pytest.mark.slow
 def test_a_recording_whose_writer_was_killed_can_be_read_and_repaired(tmp_path: Path) -> None:
     path = tmp_path / "torn.rrd"
