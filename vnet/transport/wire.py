@@ -29,6 +29,8 @@ from vnet.reports import Report
 
 TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+PacketCount = Annotated[int, msgspec.Meta(ge=0, le=2**40)]
+"""Number of packets: more than any run has, and few enough that the sum over all processes can be written."""
 
 
 class Deviation(msgspec.Struct, frozen=True, array_like=True):
@@ -301,7 +303,7 @@ class Yield(Message, frozen=True):
 class Lateness(msgspec.Struct, frozen=True, array_like=True):
     """Real time: delays of packets to their process, as counts in the bins of `lateness_bin`."""
 
-    counts: Annotated[Sequence[Count], msgspec.Meta(min_length=LATENESS_BINS, max_length=LATENESS_BINS)]
+    counts: Annotated[Sequence[PacketCount], msgspec.Meta(min_length=LATENESS_BINS, max_length=LATENESS_BINS)]
 
 
 class Frames(Message, frozen=True):

@@ -1,5 +1,6 @@
 """The wire: what is encoded comes back, and whatever else comes is a WireError."""
 
+import contextlib
 import sys
 
 import numpy as np
@@ -66,7 +67,8 @@ traffic = st.builds(
     refs,
 )
 steps = st.builds(wire.Step, times, traffic)
-histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
+packet_counts = st.integers(0, 2**40)
+histograms = st.lists(packet_counts, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
 agent_messages = st.one_of(
     st.builds(
         wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names, times
@@ -171,6 +173,20 @@ def test_a_histogram_of_another_length_is_refused(bins: int) -> None:
     frames = wire.Frames(b"n", 0, 0, [], wire.Traffic(), wire.Lateness([0] * bins))
     with pytest.raises(WireError, match="length"):
         wire.decode_tx(wire.encode(frames))
+
+
+def test_the_sum_of_all_histograms_can_be_told() -> None:
+    """Each process says what it likes; ten thousand are the most that a router lets in."""
+
+    def is_taken(count: int) -> bool:
+        frames = wire.Frames(b"n", 0, 0, [], wire.Traffic(), wire.Lateness([count] * wire.LATENESS_BINS))
+        with contextlib.suppress(WireError):
+            return isinstance(wire.decode_tx(wire.encode(frames)), wire.Frames)
+        return False
+
+    most = max(count for count in (2**bits for bits in range(64)) if is_taken(count))
+    total = 10_000 * wire.LATENESS_BINS * most
+    assert wire.decode_observation(wire.encode_observation({"total": total})) == {"total": total}
 
 
 @pytest.mark.parametrize("decode", [wire.decode_tx, wire.decode_sent])
