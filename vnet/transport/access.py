@@ -10,6 +10,7 @@ host has its own.
 from __future__ import annotations
 
 import json
+import re
 import secrets
 import socket
 from collections.abc import Callable, Mapping, Sequence
@@ -37,6 +38,9 @@ Rule = dict[str, Any]
 MOST_SESSIONS = 10_100
 """Most sessions of a router, and most that may log in at once: a run's processes and roles. Zenoh's defaults, 1000
 and 100, refuse agents that start together."""
+
+_ENDPOINT = re.compile(r"(?:tcp|tls|udp)/[^\s/?#]+:([0-9]{1,5})(?:[?#]\S*)?\Z")
+"""Endpoint of a router, with its port; settings of Zenoh's may follow, as `#iface=eth0`."""
 
 EMULATOR = "emulator"
 OBSERVER = "observer"
@@ -201,7 +205,10 @@ class Access:
             check_user(user, password)
 
     def check_endpoint(self, listen: str) -> None:
-        """Raise TransportError unless `listen` is a TLS endpoint exactly if the users have certificates."""
+        """Raise TransportError unless `listen` is an endpoint, of TLS exactly if the users have certificates."""
+        endpoint = _ENDPOINT.match(listen)
+        if endpoint is None or int(endpoint[1]) > 65535:
+            raise TransportError(f"cannot listen on {listen}: an endpoint is tcp/HOST:PORT or tls/HOST:PORT")
         if self.tls is None and is_tls(listen):
             raise TransportError(
                 f"{listen}: the users have no certificates; write them with: vnet access --listen tls/…"
