@@ -219,6 +219,8 @@ class LiveProcesses(Processes):
                 self._reasons.pop(node, None)
             case wire.Frames() if self._expected is wire.Frames:
                 self._take_frames(node, message, self._arrived_ns)
+            case wire.Frames(final=True) if self._realtime and self._expected is None:
+                pass  # the answer to the end of a run that does not begin
             case wire.Hello():
                 self._take_hello(node, message)
             case wire.Final():

@@ -94,6 +94,16 @@ async def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: byt
 
 
 @on_a_loop
+async def test_who_is_told_that_the_run_does_not_begin_may_answer() -> None:
+    stage = Stage(pacing="realtime")
+    for node in ("v01", "v02"):
+        stage.hello(node, b"1")
+    stage.live.tell_to_end()
+    stage.live.take("message", "v01", wire.encode(wire.Frames(b"1", 0, 0, [], wire.Traffic(), final=True)))
+    assert list(stage.emulation.folder.events) == []
+
+
+@on_a_loop
 async def test_a_yield_of_another_window_is_refused_as_it_comes_and_so_is_a_second_one() -> None:
     post = Post()
     for seq in (7, 0, 0):
