@@ -284,10 +284,11 @@ class LiveProcesses(Processes):
 
     def _take_hello(self, node: str, hello: wire.Hello) -> None:
         """Welcome a node, or tell it why it is refused."""
-        refusal = None
+        refusal: str | None
         if hello.version != wire.VERSION:
             refusal = wire.other_version("agent", hello.version, "emulator")
-        refusal = refusal or self.members.hello(node, hello)
+        elif (refusal := self.members.hello(node, hello)) and self.supervisor.has_died(hello.process_id):
+            refusal = f"{node} was here and has gone; the run goes on without it"
         if refusal is not None:
             self._refuse(keys.node_tx(self._options.access.run, node), node, refusal)
             if self.attachment.knows(node):

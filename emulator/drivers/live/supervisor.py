@@ -331,6 +331,10 @@ class Supervisor:
             loop, told_to_end = asyncio.get_running_loop(), self._all_told_to_end
             loop.call_later(DEATH_GRACE_S, self._connection_closed, node, process, told_to_end)
 
+    def has_died(self, node: str) -> bool:
+        """Return whether the process of this name has died: none of its name is started again."""
+        return node in self._processes and self.state(node) is ProcessState.DEAD
+
     def is_there(self, node: str) -> bool:
         """Return whether the process of this name is there: it runs, or is paused."""
         there = (ProcessState.RUNNING, ProcessState.PAUSED)

@@ -94,6 +94,16 @@ async def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: byt
 
 
 @on_a_loop
+async def test_who_comes_back_after_its_death_is_told_that_the_run_goes_on_without_it() -> None:
+    stage = joined(pacing="realtime")
+    stage.launcher.dies(stage.supervisor, "v01")
+    for node, said in (("v01", "was here and has gone"), ("v02", "is already present")):
+        stage.live.take("message", node, wire.encode(hello(node, nonce=b"2")))
+        (_, end) = stage.attachment.sent.pop()
+        assert isinstance(end, wire.End) and end.refused and said in end.reason
+
+
+@on_a_loop
 async def test_who_is_told_that_the_run_does_not_begin_may_answer() -> None:
     stage = Stage(pacing="realtime")
     for node in ("v01", "v02"):
