@@ -63,11 +63,18 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     ]
     if not gone and not recorded.event(EventKind.started):
         return unknown("no event says that the run started")
-    if not gone and (away := _not_up(recorded)):
-        names = [recorded.node_ids[node] for node in away]
-        rows = [{"node": node, "since_ns": since_ns} for node, since_ns in zip(names, away.values(), strict=True)]
-        since = f"{min(away.values()) / NS_PER_S:g} s, when a fault ended or it entered"
+    away = {} if gone else _not_up(recorded)
+    if late := {node: since_ns for node, since_ns in away.items() if since_ns + START_UP_NS < recorded.closed_ns}:
+        names = [recorded.node_ids[node] for node in late]
+        rows = [{"node": node, "since_ns": since_ns} for node, since_ns in zip(names, late.values(), strict=True)]
+        since = f"{min(late.values()) / NS_PER_S:g} s, when a fault ended or it entered"
         return unknown(f"{first_names(names)}: not up since {since}", rows=rows)
+    if away:
+        names = [recorded.node_ids[node] for node in away]
+        there = len(recorded.node_ids) - len(names)
+        return valid(
+            f"{there} of {counted(len(recorded.node_ids), 'node')} to the end; {first_names(names)} not yet up"
+        )
     if not gone:
         who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
         return valid(f"{who} to the end")
@@ -93,13 +100,11 @@ def _not_up(recorded: RecordedRun) -> dict[int, int]:
             entered_ns = (int(np.flatnonzero(~here[:, node])[-1]) + 1) * recorded.scenario.period_ns
             due_ns[node] = max(due_ns.get(node, 0), entered_ns)
         due_ns = {node: time_ns for node, time_ns in due_ns.items() if here[-1, node]}
-    late = [
-        node
-        for node, time_ns in due_ns.items()
-        if time_ns + START_UP_NS < recorded.closed_ns and node not in recorded.deaths_ns
+    due = [
+        node for node, time_ns in due_ns.items() if time_ns < recorded.closed_ns and node not in recorded.deaths_ns
     ]
-    down = recorded.is_down(np.array(late, dtype=np.intp), np.full(len(late), recorded.closed_ns - 1))
-    return {node: due_ns[node] for node, is_down in sorted(zip(late, down.tolist(), strict=True)) if is_down}
+    down = recorded.is_down(np.array(due, dtype=np.intp), np.full(len(due), recorded.closed_ns - 1))
+    return {node: due_ns[node] for node, is_down in sorted(zip(due, down.tolist(), strict=True)) if is_down}
 
 
 def check_no_exceptions(recorded: RecordedRun) -> Finding:

@@ -640,11 +640,14 @@ def test_who_never_comes_back_after_a_fault_in_real_time_was_not_there_to_the_en
     run = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
     back = replace(recorded, scenario=recorded.scenario.model_copy(update={"run": run}))
     gone = replace(back, events=[event for event in back.events if event.kind != "restarted"])
-    assert verdict(gone, "agents_alive") is Verdict.VALID, "it may be on its way"
-    monkeypatch.setattr("emulator.checks.run.START_UP_NS", 0)
-    assert verdict(back, "agents_alive") is Verdict.VALID
     (planned,) = recorded.plan
     killed = [recorded.node_ids[node] for node in np.flatnonzero(planned.nodes)]
+    for each, is_named in ((back, False), (gone, True)):
+        found = result(each, "agents_alive")
+        assert isinstance(found, CheckResult) and found.verdict is Verdict.VALID, "it may be on its way"
+        assert (killed[0] in found.text) is is_named
+    monkeypatch.setattr("emulator.checks.run.START_UP_NS", 0)
+    assert verdict(back, "agents_alive") is Verdict.VALID
     found = result(gone, "agents_alive")
     assert isinstance(found, CheckResult) and found.verdict is Verdict.UNKNOWN
     assert found.figures["rows"] == [{"node": node, "since_ns": planned.end_ns} for node in killed]
