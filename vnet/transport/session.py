@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -106,7 +107,9 @@ def open_client(
         usrpwd = {"user": credentials.user, "password": credentials.password}
         config["transport"]["auth"] = {"usrpwd": usrpwd}
     who = f" as {credentials.user}" if credentials else " without credentials"
-    with _closed_at_end(_open(config, f"cannot connect to {endpoint}{who}", timeout_s)) as session:
+    today = time.strftime("%Y-%m-%d")
+    doubt = "" if identity is None else f", or its certificate does not hold on {today}, this machine's date"
+    with _closed_at_end(_open(config, f"cannot connect to {endpoint}{who}", timeout_s, doubt)) as session:
         yield session
 
 
@@ -176,18 +179,18 @@ def _identification(identity: Identity | None) -> dict[str, Any]:
     }
 
 
-def _open(config: dict[str, Any], failure: str, timeout_s: float = 0.0) -> zenoh.Session:
+def _open(config: dict[str, Any], failure: str, timeout_s: float = 0.0, doubt: str = "") -> zenoh.Session:
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError as error:
-        raise TransportError(f"{failure}: {_reason(str(error), timeout_s)}") from None
+        raise TransportError(f"{failure}: {_reason(str(error), timeout_s, doubt)}") from None
 
 
-def _reason(text: str, timeout_s: float) -> str:
+def _reason(text: str, timeout_s: float, doubt: str) -> str:
     if "Address already in use" in text or "os error 98" in text:
         return "the address is already in use"
     if "Cannot assign requested address" in text:
         return "no such address on this machine"
     if "Timeout" in text:
-        return f"no router answered, or it refused the credentials, within {timeout_s:g} s"
+        return f"no router answered, or it refused the credentials{doubt}, within {timeout_s:g} s"
     return text.split(" at /")[0]

@@ -16,7 +16,7 @@ import zenoh
 from tests.support.paths import ROOT
 from vnet.errors import TransportError
 from vnet.transport import keys, session, wire
-from vnet.transport.access import Access, node_user
+from vnet.transport.access import Access, certifier, node_user
 from vnet.transport.session import open_client, open_local_router, open_router, router_endpoint
 
 LEASE_MS = 10_000
@@ -152,6 +152,15 @@ def test_a_client_says_how_long_it_has_waited_for_a_router() -> None:
     with (
         pytest.raises(TransportError, match=r"tcp/127.0.0.1:1 without .*: no router answered.* within 0.05 s"),
         open_client("tcp/127.0.0.1:1", None, LEASE_MS, timeout_s=0.05),
+    ):
+        pass
+
+
+def test_a_client_that_may_itself_have_refused_the_router_says_by_which_date() -> None:
+    credentials = Access.create("r", [["v01"]], certifier("tls/127.0.0.1:1")).credentials(node_user("v01"))
+    with (
+        pytest.raises(TransportError, match=r"certificate does not hold on \d{4}-\d\d-\d\d, this machine's date"),
+        open_client("tls/127.0.0.1:1", credentials, LEASE_MS, timeout_s=0.05),
     ):
         pass
 
