@@ -809,6 +809,7 @@ class Emulation:
         Faults, entries and exits before it act, also those to which a run in real time comes too late.
         """
         if self.ended_ns is None:
+            time_ns = min(time_ns, self.duration_ns)
             self.drive_to(time_ns)
             while (change_ns := self.next_change_ns()) is not None and change_ns < time_ns:
                 self.advance(change_ns - 1)

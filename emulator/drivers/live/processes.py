@@ -12,7 +12,7 @@ import dataclasses
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Coroutine, Sequence
 from typing import Any
 
 import zenoh
@@ -589,9 +589,13 @@ class LiveProcesses(Processes):
         await asyncio.sleep(AWAIT_WARNING_S)
         self.supervisor.reconnecting = True
         if isinstance(fault, EmulatorRestart):
-            await asyncio.to_thread(self.attachment.close)
-            await asyncio.sleep(fault.down_s)
-            await asyncio.to_thread(self.attachment.open)
+            cancelled = await to_its_end(asyncio.to_thread(self.attachment.close))
+            try:
+                await asyncio.sleep(0.0 if cancelled else fault.down_s)
+            finally:  # also as the run is interrupted: all are told of its end
+                cancelled |= await to_its_end(asyncio.to_thread(self.attachment.open))
+            if cancelled:
+                raise asyncio.CancelledError
         else:
             self._launcher.kill(ROUTER)
             await asyncio.sleep(fault.down_s)
@@ -695,6 +699,18 @@ class LiveProcesses(Processes):
         """Return the details of the deaths since all were told to end, by node; `ends` have just been seen."""
         deaths = self.supervisor.take_last_deaths(ends)
         return {node: details for id_, details in deaths.items() for node in self.members.nodes_with(id_)}
+
+
+async def to_its_end(work: Coroutine[Any, Any, None]) -> bool:
+    """Await something to its end, whatever cancels the present task meanwhile; return whether anything has."""
+    task, cancelled = asyncio.ensure_future(work), False
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError:
+            cancelled = True
+    task.result()
+    return cancelled
 
 
 def _lease_ms(emulation: Emulation) -> int:

@@ -23,7 +23,7 @@ from emulator.drivers.control import answer, control_endpoint
 from emulator.drivers.debugging import debug_point
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.launch import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Launcher, Zygote
-from emulator.drivers.live.processes import RECORDER, LiveProcesses
+from emulator.drivers.live.processes import RECORDER, LiveProcesses, to_its_end
 from emulator.drivers.live.supervisor import SHUT_DOWN_S
 from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
 from emulator.drivers.observers import Messages
@@ -106,18 +106,6 @@ def _agent_environment(scenario: Scenario) -> Mapping[str, str]:
     return LOCKSTEP_ENVIRONMENT if scenario.run.pacing == "lockstep" else AGENT_ENVIRONMENT
 
 
-async def _to_its_end(work: Coroutine[Any, Any, None]) -> bool:
-    """Await something to its end, whatever cancels the present task meanwhile; return whether anything has."""
-    task, cancelled = asyncio.ensure_future(work), False
-    while not task.done():
-        try:
-            await asyncio.shield(task)
-        except asyncio.CancelledError:
-            cancelled = True
-    task.result()
-    return cancelled
-
-
 class LiveSession:
     """One live run's course: join, drive, shut down."""
 
@@ -188,13 +176,13 @@ class LiveSession:
         except Stalled:
             self._emulation.finish(self._time_ns())
         except asyncio.CancelledError:
-            interrupted, time_ns = True, self._time_ns()
+            interrupted, time_ns = True, min(self._time_ns(), self._emulation.duration_ns)
             folder.event(time_ns, EventKind.interrupted)
             self._emulation.finish(time_ns)
         finally:
             wall_s = time.monotonic() - started_s
             self._measure_cpu()
-            interrupted |= await _to_its_end(self._shut_down(completed))
+            interrupted |= await to_its_end(self._shut_down(completed))
             in_all_ns = self._cpu.cpu_ns if self._fleet is None else self._cpu.cpu_ns + self._fleet.cpu_ns
             self._emulation.costs.cpu_ns = in_all_ns
             self._memory.write(folder, self._time_ns())

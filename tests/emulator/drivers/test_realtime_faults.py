@@ -501,6 +501,13 @@ def test_all_that_the_plan_says_until_the_end_is_done_however_late_the_run_comes
     )
 
 
+def test_an_interruption_that_comes_later_than_the_end_is_one_at_the_end() -> None:
+    """A restart has held the run for longer."""
+    _, emulation = started()
+    emulation.finish(emulation.duration_ns + 500 * MS)
+    assert emulation.ended_ns == emulation.duration_ns == emulation.emulated_ns
+
+
 def test_what_the_plan_says_until_an_interruption_is_done_and_nothing_of_later() -> None:
     realtime, emulation = started(fault("loss", 0.46, 0.03, probability=0.5), fault("pause", 0.52, 0.5))
     realtime.due(450 * MS)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from emulator.drivers.live.session import _to_its_end
+from emulator.drivers.live.processes import to_its_end
 from emulator.drivers.signals import ENDING, cancelled_by_signals, gets_signals, signals_handled, signals_ignored
 
 
@@ -101,7 +101,7 @@ def test_a_run_that_is_over_ends_its_programs_whatever_interrupts_it() -> None:
             await go_on.wait()
             ended.append(True)
 
-        task = asyncio.create_task(_to_its_end(shut_down()))
+        task = asyncio.create_task(to_its_end(shut_down()))
         for _ in range(signals):
             await asyncio.sleep(0)
             task.cancel()
@@ -119,4 +119,4 @@ def test_what_fails_as_programs_end_is_told() -> None:
         raise ValueError("no")
 
     with pytest.raises(ValueError, match="no"):
-        asyncio.run(_to_its_end(shut_down()))
+        asyncio.run(to_its_end(shut_down()))

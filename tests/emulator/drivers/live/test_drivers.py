@@ -236,6 +236,15 @@ async def test_in_lockstep_only_those_have_stalled_whose_yields_their_host_does_
 
 
 @in_virtual_time
+async def test_a_run_that_is_interrupted_in_a_restart_of_the_emulator_can_tell_its_end() -> None:
+    play = Play("lockstep", yields, faults=[fault("emulator_restart", 0.2, 0.1, down_s=60.0)])
+    running = asyncio.ensure_future(play.run())
+    asyncio.get_running_loop().call_later(30.0, running.cancel)
+    await asyncio.wait([running])
+    assert running.cancelled() and play.stage.attachment.done == ["close", "open"]
+
+
+@in_virtual_time
 async def test_a_restart_of_the_emulator_is_announced_and_ends_when_all_have_answered() -> None:
     asked: list[str] = []
 
