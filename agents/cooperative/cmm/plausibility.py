@@ -43,9 +43,9 @@ SPREAD_FLOOR_M = 0.05
 MAJORITY = 4
 """Least number of priors or increments of which a majority can be told."""
 MEMORY_S = 10.0
-"""Time (s) in which an origin's leans decay."""
+"""Time (s) in which an origin's leans, and its sums about lanes, decay."""
 SUM_MEMORY_S = 30.0
-"""Time (s) in which its sums decay: c returns slowly from where one pulls, so even a small pull must be noticed."""
+"""Time (s) in which its sums about c decay: c returns slowly from where one pulls, so small pulls must be noticed."""
 COMMON_EVERY_S = 1.0
 """Time (s) after which what most sums deviate by is found again."""
 COMMON_ROUNDS = 3
@@ -233,6 +233,7 @@ class Origins:
         off_x, off_y = common_m or (0.0, 0.0)
         off_x /= c_xx
         off_y = (off_y - c_yx * off_x) / c_yy
+        memory_s = MEMORY_S if is_about_lanes else SUM_MEMORY_S
         then_s, keep, keep_2 = now_s, 1.0, 1.0
         nothing: Sums = (now_s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         shares = []
@@ -242,7 +243,7 @@ class Origins:
             x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
             since_s, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count = sums.get(code, nothing)
             if since_s != then_s:  # for most the same
-                then_s, keep = since_s, math.exp((since_s - now_s) / SUM_MEMORY_S)
+                then_s, keep = since_s, math.exp((since_s - now_s) / memory_s)
                 keep_2 = keep * keep  # covariances of sums whose parts have decayed
             n_xx, n_xy, n_yx, n_yy = m_xx + keep * n_xx, m_xy + keep * n_xy, m_yx + keep * n_yx, m_yy + keep * n_yy
             n_x, n_y, count = x + keep * n_x, y + keep * n_y, 1.0 + keep * count

@@ -180,7 +180,7 @@ def shares_after(offsets_m: list[float], is_about_lanes: bool = False) -> list[f
 
 
 def test_outliers_are_weighed_by_how_far_they_are_beyond_the_gates() -> None:
-    """Of few an honest vehicle may contradict for long: it counts less and less, and a liar's pull vanishes."""
+    """An honest vehicle among few may contradict for long: it counts less and less, and a liar's pull vanishes."""
     shares = shares_after([0.2, 0.4, 50.0])
     assert shares[0] == 1
     assert 0.2 < shares[1] < 1
