@@ -45,7 +45,7 @@ MAJORITY = 4
 MEMORY_S = 10.0
 """Time (s) in which an origin's leans, and its sums about lanes, decay."""
 SUM_MEMORY_S = 30.0
-"""Time (s) in which its sums about c decay: c returns slowly from where one pulls, so small pulls must be noticed."""
+"""Time (s) in which its sums about c decay: c returns slowly from where one pulls, so small pulls must be found."""
 COMMON_EVERY_S = 1.0
 """Time (s) after which what most sums deviate by is found again."""
 COMMON_ROUNDS = 3
