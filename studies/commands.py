@@ -40,7 +40,9 @@ LiveOption = Annotated[
 ]
 OnlyOption = Annotated[
     list[str] | None,
-    typer.Option("--only", metavar="LABEL=VALUE", help="Only such cells, for example --only network=n2."),
+    typer.Option(
+        "--only", metavar="LABEL=VALUE", help="Only such cells, as network=n2; several of one label: any."
+    ),
 ]
 SeedsOption = Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 … N.")]
 DurationOption = Annotated[
@@ -357,16 +359,19 @@ def _run(
 
 
 def _select(cells: Sequence[Cell], only: Sequence[str]) -> list[Cell]:
-    wanted = list(cells)
+    """Return the cells that fit; conditions of one label are alternatives."""
+    labels = sorted({label for cell in cells for label in cell.labels})
+    asked: dict[str, set[str]] = {}
     for condition in only:
         key, equals, value = condition.partition("=")
-        labels = sorted({label for cell in cells for label in cell.labels})
         if not equals or key not in labels:
             raise VnetError(f"--only {condition}: write it as label=value with one of {', '.join(labels)}")
-        wanted = [cell for cell in wanted if str(cell.labels[key]) == value]
-        if not wanted:
-            values = sorted({str(cell.labels[key]) for cell in cells})
+        if value not in (values := sorted({str(cell.labels[key]) for cell in cells})):
             raise VnetError(f"--only {condition}: no such cell; {key} is one of {', '.join(values)}")
+        asked.setdefault(key, set()).add(value)
+    wanted = [cell for cell in cells if all(str(cell.labels[key]) in values for key, values in asked.items())]
+    if not wanted:
+        raise VnetError(f"--only {' --only '.join(only)}: no cell is all of that")
     return wanted
 
 

@@ -6,6 +6,8 @@ import pytest
 
 from emulator.cells.cells import compute
 from studies.attackers import ATTACKS, HONEST, attack_cells, report
+from studies.commands import _select
+from vnet.errors import VnetError
 
 TINY = {"n1": {"kind": "generated", "vehicles": 6}}
 
@@ -21,6 +23,14 @@ def test_each_attack_has_a_cell_for_each_seed_in_which_the_same_vehicles_count()
     for cell in cells:
         lying = [e for e in cell.scenario.program.exceptions if "lie" in e.options]
         assert len(lying) == ATTACKS[str(cell.labels["attack"])].attackers
+
+
+def test_conditions_of_one_label_are_alternatives() -> None:
+    cells = attack_cells(TINY, [1, 2])
+    found = _select(cells, ["attack=none", "seed=2", "attack=gates, two"])
+    assert [(cell.labels["attack"], cell.labels["seed"]) for cell in found] == [("none", 2), ("gates, two", 2)]
+    with pytest.raises(VnetError, match="seed=3"):
+        _select(cells, ["attack=none", "seed=3"])
 
 
 @pytest.mark.slow
