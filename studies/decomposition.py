@@ -19,7 +19,7 @@ from agents.cooperative.cmm.kalman_bound import KalmanBound, LaneModel, lane_axe
 from agents.cooperative.cmm.own_vehicle import INCREMENT_SHARE
 from agents.cooperative.cmm.plausibility import INCREMENT_FACTOR, PRIOR_FACTOR, SELF_SHARE
 from agents.cooperative.hears_all import lane_model
-from agents.cooperative.information_estimator import LEARNED_S, PASSED_SHARE
+from agents.cooperative.information_estimator import LEARNED_S
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from studies.paper import PAPER_RANGE_M, counted_from
@@ -47,9 +47,8 @@ class Rules:
     loss: share of the frames that is lost. hops: hops that an increment goes, each takes a period; `FLOODED` for
     all, and then no priors are pooled: each increment counts once, wherever it is heard. hears_all: a vehicle hears
     all others of its component. increment_share: share of what a fix says that is told. learned_s: time in which c
-    moves by the error that increments have in common. passed_share: share of an increment that is passed on which
-    is added. self_share: weight that a vehicle keeps for its own prior. is_cut: increments and priors are cut at
-    some times the own.
+    moves by the error that increments have in common. self_share: weight that a vehicle keeps for its own prior.
+    is_cut: increments and priors are cut at some times the own.
     """
 
     loss: float = LOSS
@@ -57,7 +56,6 @@ class Rules:
     hears_all: bool = False
     increment_share: float = INCREMENT_SHARE
     learned_s: float = LEARNED_S
-    passed_share: float = PASSED_SHARE
     self_share: float = SELF_SHARE
     is_cut: bool = True
 
@@ -65,7 +63,7 @@ class Rules:
 ORACLES: Mapping[str, Rules] = {
     "the program's rules": Rules(),
     "no frame lost": Rules(loss=0.0),
-    "no share, no cut": Rules(increment_share=1.0, learned_s=0.0, passed_share=1.0, self_share=0.0, is_cut=False),
+    "no share, no cut": Rules(increment_share=1.0, learned_s=0.0, self_share=0.0, is_cut=False),
     "a third hop": Rules(hops=3),
     "all hops, each increment once": Rules(hops=FLOODED),
     "all hops, once, no frame lost": Rules(hops=FLOODED, loss=0.0),
@@ -267,7 +265,7 @@ class Exchange:
             if age >= self._rules.hops:
                 break
             new = ((heard @ used) > 0) & (used == 0)
-            shares = np.where(new, self._rules.passed_share * (1 - weights @ used), 0.0)
+            shares = np.where(new, 1 - weights @ used, 0.0)
             if self._rules.is_cut:
                 traces = _trace(increments)[:, None]
                 shares = shares * np.minimum(1.0, limit[:, :, None] / np.maximum(shares * traces, 1e-12))
