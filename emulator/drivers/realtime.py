@@ -366,7 +366,8 @@ class RealTime:
 
     def finish(self) -> None:
         """End of the run: what nobody acknowledged is lost in transport; say how late deliveries were."""
-        self._emulation.give_up_starts(self._emulation.duration_ns, self._held_ns)
+        if self._emulation.ended_ns is None:
+            self._emulation.give_up_starts(self._emulation.duration_ns, self._held_ns)
         self._emulation.finish(self._emulation.duration_ns)
         for waiting in self._unacknowledged.values():
             for sent in waiting.values():

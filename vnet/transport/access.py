@@ -208,7 +208,7 @@ class Access:
         """Raise TransportError unless `listen` is an endpoint, of TLS exactly if the users have certificates."""
         endpoint = _ENDPOINT.match(listen)
         if endpoint is None or int(endpoint[1]) > 65535:
-            raise TransportError(f"cannot listen on {listen}: an endpoint is tcp/HOST:PORT or tls/HOST:PORT")
+            raise TransportError(f"cannot listen on {listen}: an endpoint is HOST:PORT after tcp/, tls/ or udp/")
         if self.tls is None and is_tls(listen):
             raise TransportError(
                 f"{listen}: the users have no certificates; write them with: vnet access --listen tls/…"

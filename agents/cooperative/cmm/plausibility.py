@@ -167,19 +167,19 @@ def _sum_gate(count: float, gate_of_many: float) -> float:
 def _in_common(sums: Sequence[Sums], off: tuple[float, float]) -> tuple[float, float] | None:
     """Return by what (x, y) most `sums` deviate, in deviations of the belief, found from `off` on.
 
-    Beyond its own deviation a sum weighs less in proportion (Huber 1964), so that a few do not draw it. None if the
-    sums do not tell.
+    Beyond its own deviation a sum weighs less in proportion (Huber 1964), and so does one that claims much more
+    than most, so that a few do not draw it. None if the sums do not tell.
     """
     off_x, off_y = off
+    most = INCREMENT_FACTOR * max(0.0, _median([n_a + n_d for *_, n_a, _, n_d, _ in sums]))
     for _ in range(COMMON_ROUNDS):
         s_xx = s_xy = s_yx = s_yy = s_x = s_y = 0.0
         for _, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, _ in sums:
-            more = 1e-4 * (n_a + n_d) + 1e-9
-            n_a += more
-            n_d += more
+            trace = n_a + n_d
+            n_a, n_d = n_a + 1e-4 * trace + 1e-9, n_d + 1e-4 * trace + 1e-9
             r_x, r_y = n_x - n_xx * off_x - n_xy * off_y, n_y - n_yx * off_x - n_yy * off_y
             squared = (n_d * r_x * r_x - 2 * n_b * r_x * r_y + n_a * r_y * r_y) / (n_a * n_d - n_b * n_b)
-            weight = 1 / math.sqrt(squared) if squared > 1 else 1.0
+            weight = (1 / math.sqrt(squared) if squared > 1 else 1.0) * (most / trace if trace > most else 1.0)
             s_xx += weight * n_xx
             s_xy += weight * n_xy
             s_yx += weight * n_yx
@@ -199,7 +199,7 @@ class Origins:
         self._sums: dict[int, Sums] = {}
         self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
         self._common_m: tuple[float, float] | None = None  # by most sums the belief is off by this
-        self._common_again_s = -math.inf
+        self._common_s = -math.inf  # when that was found
 
     def __len__(self) -> int:
         """Number of origins whose increments are summed up."""
@@ -220,7 +220,7 @@ class Origins:
         are heard, it is the root, and far beyond the gate less: three vehicles on nearly parallel lanes, or on a
         map, contradict each other for long and are right. What is beyond is summed up all the same: who has lied is
         believed again when it has decayed. Each is compared with the belief (x, P) when it came: c itself moves by
-        half a metre in the sum's memory. What most sums deviate by is the belief's error and does not count; sums
+        a metre in the sum's memory. What most sums deviate by is the belief's error and does not count; sums
         about lanes (`is_about_lanes`) have nothing in common, because their beliefs differ.
         """
         sums = self._sums
@@ -278,9 +278,9 @@ class Origins:
                 of_sum = min(1.0, gate / max(abs(in_sum), _TINY))
                 of_sum = min(math.sqrt(of_sum), FAR * of_sum) if common_m is None else of_sum * of_sum
                 shares.append(min(of_sum, INCREMENT_GATE / max(abs(alone), _TINY)))
-        if not is_about_lanes and now_s >= self._common_again_s:
-            self._common_again_s = now_s + COMMON_EVERY_S
-            recent = [known for known in sums.values() if now_s - known[0] < COMMON_EVERY_S]
+        if not is_about_lanes and now_s >= self._common_s + COMMON_EVERY_S:
+            recent = [known for known in sums.values() if known[0] >= self._common_s]
+            self._common_s = now_s
             common = _in_common(recent, (off_x, off_y)) if len(recent) >= MAJORITY else None
             self._common_m = common and (c_xx * common[0], c_yx * common[0] + c_yy * common[1])
         return shares
@@ -330,7 +330,7 @@ T = TypeVar("T", bound=tuple[Any, ...])
 
 def _newest(of_origins: dict[int, T], now_s: float) -> dict[int, T]:
     """Return what is known of the latest origins; it begins with its time."""
-    kept = [code for code, known in of_origins.items() if now_s - known[0] < MEMORY_S]
+    kept = [code for code, known in of_origins.items() if now_s - known[0] < SUM_MEMORY_S]
     return {code: of_origins[code] for code in kept[-(MAX_ORIGINS // 2) :]}
 
 

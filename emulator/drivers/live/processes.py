@@ -592,9 +592,11 @@ class LiveProcesses(Processes):
             cancelled = await to_its_end(asyncio.to_thread(self.attachment.close))
             try:
                 await asyncio.sleep(0.0 if cancelled else fault.down_s)
-            finally:  # also as the run is interrupted: all are told of its end
-                cancelled |= await to_its_end(asyncio.to_thread(self.attachment.open))
+            except asyncio.CancelledError:  # as the run is interrupted, all are told of its end
+                cancelled = True
+            cancelled |= await to_its_end(asyncio.to_thread(self.attachment.open))
             if cancelled:
+                self._tell_restarted(fault)  # until now all were silent by plan
                 raise asyncio.CancelledError
         else:
             self._launcher.kill(ROUTER)
@@ -603,6 +605,9 @@ class LiveProcesses(Processes):
             await asyncio.to_thread(self._options.router.start, self._launcher)
         await self._all_answer(process_ids, patience_s)
         self.supervisor.reconnecting = False
+        self._tell_restarted(fault)
+
+    def _tell_restarted(self, fault: Infrastructure) -> None:
         self._emulation.folder.event(self._now(), KINDS[f"{fault.kind}ed"], None, down_s=fault.down_s)
 
     def _connected_nodes(self) -> list[str]:

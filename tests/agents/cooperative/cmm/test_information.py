@@ -197,6 +197,26 @@ def test_among_many_a_lie_pulls_the_less_the_larger_it_is() -> None:
     assert pulls_m[0] < lies_m[0] and pulls_m[-1] < 1e-3
 
 
+@pytest.mark.parametrize("claim", [1.0, 100.0, 1e5])
+def test_a_liar_that_claims_much_is_not_what_most_deviate_by(claim: float) -> None:
+    origins, belief = Origins(), ((0.0, 0.0), (0.01, 0.0, 0.01))
+    said = [_information((0.0, 0.0), 2.0)] * 9 + [_information((5.0, 5.0), 2.0 / claim)]
+    for k in range(300):
+        *honest, liar = origins.shares(range(10), said, belief, 0.1 * k)
+    assert honest == [1.0] * 9
+    assert liar < 0.01
+
+
+@pytest.mark.parametrize("period_s", [0.1, 0.5, 1.0, 2.0])
+def test_what_is_passed_on_counts_among_what_most_deviate_by(period_s: float) -> None:
+    origins, belief = Origins(), ((0.0, 0.0), (0.01, 0.0, 0.01))
+    said = _information((0.6, 0.0), 0.5)
+    for k in range(300):
+        shares = origins.shares(range(3), [said] * 3, belief, period_s * k)
+        shares += origins.shares(range(3, 20), [said] * 17, belief, period_s * k)
+    assert shares == [1.0] * 20
+
+
 def test_increments_passed_on_by_others_do_not_hide_what_most_are_off_by() -> None:
     """A period's relayed increments are few, and are compared with the same belief."""
     origins, belief = Origins(), ((0.0, 0.0), (0.01, 0.0, 0.01))

@@ -242,6 +242,7 @@ async def test_a_run_that_is_interrupted_in_a_restart_of_the_emulator_can_tell_i
     asyncio.get_running_loop().call_later(30.0, running.cancel)
     await asyncio.wait([running])
     assert running.cancelled() and play.stage.attachment.done == ["close", "open"]
+    assert play.stage.events("emulator_restarted") == [("emulator_restarted", None)], "the silence was planned"
 
 
 @in_virtual_time
