@@ -71,8 +71,7 @@ PASSED_SHARE = 0.8
 their lists. On straight lanes the error in common covers it."""
 LEARNED_S = 1.3
 """Time (s) in which c moves by the error that the increments of a period have in common: offsets in lanes were
-learned with what c was (Bar-Shalom 1981). With 0 s 30 vehicles in range have an ANEES of 1.6 in place of 1.1; with
-3 s N1 has 0.76 in place of 0.91."""
+learned with what c was (Bar-Shalom 1981). With 0 s 30 vehicles in range have an ANEES of 1.6 in place of 1.1."""
 REMEMBERED_PERIODS = 8
 """Periods for which a vehicle on a map remembers increments, so that it uses none twice. If c moves in so many by
 less than its deviation, it also passes on what others have passed on: else that comes too late."""
