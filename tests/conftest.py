@@ -15,9 +15,6 @@ import typer.main
 from hypothesis import Phase, settings
 
 from tests.support import forked_commands
-from vnet.runtime.environment import use_same_arithmetic
-
-use_same_arithmetic()  # as in the commands, whose results some tests compare with those of this process
 
 # The same examples in each run, so that it fails for what was changed, and however slow the machine.
 # Others: --hypothesis-profile=others. Where time matters less, twice as many.

@@ -2,10 +2,6 @@
 
 import sys
 
-from vnet.runtime.environment import use_same_arithmetic
-
-use_same_arithmetic()  # before numpy is imported
-
-from tests.golden.runs import main  # noqa: E402
+from tests.golden.runs import main
 
 main(sys.argv[1:])
