@@ -14,6 +14,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from itertools import filterfalse
+from operator import itemgetter
 from types import MappingProxyType
 
 import numpy as np
@@ -153,7 +154,7 @@ class InformationEstimator:
         self.rng = rng
         self._rule = FusionRule(options, rng)
         self._origins = Origins()
-        self._frames: dict[str, InformationFrame] = {}
+        self._frames: list[tuple[str, InformationFrame]] = []
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._now_ns = -period_ns
         self._contradicted = 0
@@ -198,7 +199,7 @@ class InformationEstimator:
 
     def read(self, packets: Iterable[Packet], now_ns: int) -> None:
         """Take in packets from the radio; those that cannot be used are counted by reason."""
-        self._frames |= self._admission.admit(packets, now_ns)
+        self._frames += self._admission.admit(packets, now_ns)
 
     def position(self, own: Fix) -> tuple[Array, Array]:
         """Position (2,) of the vehicle and its covariance (2, 2); NaN as long as no fix tells it."""
@@ -233,18 +234,19 @@ class InformationEstimator:
         self.observe(own)
 
     def agree(self) -> None:
-        """Do a round of consensus, and fuse, with the frames of this period."""
+        """Do a round of consensus, and fuse, with the frames of this period, and late ones of the one before."""
         own = plain_moments(*self._prior)
-        frames = self._current_frames()
-        heard = HeardFrames.of(frames.values())
+        frames, late_frames = self._current_frames()
+        heard, late = HeardFrames.of(frames.values()), HeardFrames.of(late_frames.values())
         if self._lanes:
             self._lanes.join(heard.increments)
         self._compare(heard, own)
         if self._begins_again(heard.priors):
-            own, frames, heard = plain_moments(*self._prior), {}, HeardFrames()  # the new belief is what they know
+            own, frames, late_frames = plain_moments(*self._prior), {}, {}  # the new belief is what they know
+            heard = late = HeardFrames()
         # Of all that follows what this vehicle says itself is the first.
         priors, means_m, leaning = self._moderated(heard, own)
-        shares = dict(zip(frames, heard.shares, strict=True))
+        shares = dict(zip([*late_frames, *frames], [*late.shares, *heard.shares], strict=True))
         self._share = self.consensus.round(np.array(means_m[0]), shares)
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
@@ -254,7 +256,9 @@ class InformationEstimator:
         limited, increments = self._limited(heard, priors)
         self._weighed = list(frames)
         weights = self._weights = self._weigh(heard, means_m, own[2] + own[4], leaning)
-        passed, onward = self._passed_on(heard, weights[1:])
+        # A late increment counts as one that a frame without a prior passes on; the first of an origin is used.
+        listed = [*[(record,) for record in late.records], *heard.passed]
+        passed, onward = self._passed_on(listed, [0.0] * len(late.records) + weights[1:])
         self.imported = len(frames) + len(passed)
         self._pass_on(heard, onward, own[2] + own[4])
         self._absorb(weights, limited, increments, passed)
@@ -298,19 +302,20 @@ class InformationEstimator:
                 used[row] = share
         return used
 
-    def _current_frames(self) -> dict[str, InformationFrame]:
-        """Take the frames of this period, by sender: what one says is of one instant, fused then or never."""
+    def _current_frames(self) -> tuple[dict[str, InformationFrame], dict[str, InformationFrame]]:
+        """Take the frames of this period, and those that have missed the period before, by sender."""
         ids, neighbours, now_ns = self._admission.ids, self._neighbours, self._now_ns
-        frames = {}
-        for sender in sorted(self._frames):
+        frames, late = {}, {}
+        for sender, frame in sorted(self._frames, key=itemgetter(0)):
             if sender in ids and (neighbours is None or sender in neighbours):
-                frame = self._frames[sender]
                 if frame.fix_time_ns == now_ns:
                     frames[sender] = frame
+                elif frame.fix_time_ns == now_ns - self._period_ns:
+                    late[sender] = frame
                 else:
                     self.rejected["late"] += 1
-        self._frames = {}
-        return frames
+        self._frames = []
+        return frames, late
 
     def _compare(self, heard: HeardFrames, own: Five) -> None:
         """Find the shares (n,) of their priors and of their increments that are used.
@@ -445,12 +450,13 @@ class InformationEstimator:
             [record for record, (_, (a, _, d, _, _)) in zip(onward, further, strict=False) if a + d >= least],
         )
 
-    def _passed_on(self, heard: HeardFrames, weights: Sequence[float]) -> tuple[list[Five], list[bytes]]:
+    def _passed_on(self, listed: Sequence[Records], weights: Sequence[float]) -> tuple[list[Five], list[bytes]]:
         """Return the increments of earlier periods from out of range, less what the pooled priors hold.
 
-        The second value are the records of those that are used: what can go further.
+        `listed` are the records of frames whose priors have these `weights`. The second value are the records of
+        those that are used: what can go further.
         """
-        shares, forged = self._passing.shares(heard.passed, weights, self._options.defence)
+        shares, forged = self._passing.shares(listed, weights, self._options.defence)
         self._reject("forged", forged)
         records, origins, increments = [], [], []
         has_joined = self._lanes is not None and self._lanes.has_joined

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import fields, replace
 from typing import Any, get_args
 
@@ -35,9 +35,13 @@ def _honest(_: str, frame: InformationFrame) -> InformationFrame:
 
 
 class Network:
-    """Vehicles on lanes through the origin in all directions, that hear their neighbours on a ring, or all."""
+    """Vehicles on lanes through the origin in all directions, that hear their neighbours on a ring, or all.
+
+    late: the vehicles whose frames reach the others a period later.
+    """
 
     period_ns = PERIOD_NS
+    late: Collection[str] = ()
 
     def __init__(self, count: int = 6, reach: int | None = None, **options: object) -> None:
         headings = np.arange(count) * np.pi / count
@@ -47,6 +51,7 @@ class Network:
         self.estimators = [self.new(k) for k in range(count)]
         self.reach = count if reach is None else reach
         self.period = 0
+        self._delayed: list[tuple[int, bytes]] = []
         self._rng = np.random.default_rng(1)
 
     def new(self, k: int) -> InformationEstimator:
@@ -66,11 +71,14 @@ class Network:
                     sent.append(None if frame is None else encode(frame))
                 else:
                     sent.append(payload)
+            payloads = [(j, payload) for j, payload in enumerate(sent) if payload is not None]
+            arriving = self._delayed + [each for each in payloads if self.ids[each[0]] not in self.late]
+            self._delayed = [each for each in payloads if self.ids[each[0]] in self.late]
             for k, estimator in enumerate(self.estimators):
                 packets = [
                     Packet(self.ids[j], now_ns, now_ns + 5_000_000, payload)
-                    for j, payload in enumerate(sent)
-                    if payload is not None and 0 < min((j - k) % len(sent), (k - j) % len(sent)) <= self.reach
+                    for j, payload in arriving
+                    if 0 < min((j - k) % len(sent), (k - j) % len(sent)) <= self.reach
                 ]
                 estimator.read(packets, now_ns + 50_000_000)
                 estimator.filter(fixes[k])
@@ -372,17 +380,47 @@ def test_a_restarted_vehicle_learns_from_the_others() -> None:
     assert network.errors_m()[0] < 0.9
 
 
-def test_frames_of_another_period_are_not_fused() -> None:
+def test_a_frame_that_is_late_by_more_than_a_period_is_not_used() -> None:
     network = Network(3)
     network.run(5)
     late = network.estimators[1].frame(network.fix(1), 1400)
-    network.period += 1
+    network.period += 2
     estimator, fix = network.estimators[0], network.fix(0)
     estimator.read([Packet("v1", 0, 0, late)], fix.time_ns + 1)
     estimator.filter(fix)
     estimator.agree()
     assert estimator.imported == 0
     assert estimator.rejected["late"] == 1
+
+
+@pytest.mark.parametrize("late", [["v0"], ["v0", "v2", "v4"], [f"v{k}" for k in range(6)]])
+@pytest.mark.parametrize("sigma_m", [1.0, 0.1])
+def test_an_increment_that_misses_its_period_is_used_in_the_next(late: list[str], sigma_m: float) -> None:
+    punctual, network = MovingNetwork([sigma_m] * 6, 0), MovingNetwork([sigma_m] * 6, 0)
+    network.late = late
+    expected, found = punctual.advance(60), network.advance(60)
+    assert np.mean(found) < 1.3 * np.mean(expected), "and none twice"
+    stated_m2, expected_m2 = [
+        [np.trace(each.common_error[1]) for each in some.estimators] for some in (network, punctual)
+    ]
+    assert np.max(stated_m2) < 1.1 * np.mean(expected_m2)
+    assert all(each.mean_m is not None for each in network.estimators), "the consensus goes on"
+    assert sum(each.rejected.total() for each in network.estimators) == 0
+
+
+@pytest.mark.parametrize("late", [[], ["v0", "v2", "v4"], [f"v{k}" for k in range(6)]])
+def test_on_a_map_none_that_misses_its_period_is_used_twice(late: list[str]) -> None:
+    network, told = RoadNetwork(6, reach=1), []
+    network.late = late
+
+    def listen(_: str, frame: InformationFrame) -> InformationFrame:
+        told.append(frame.increment)
+        return frame
+
+    network.run(20, listen)
+    known = np.array([Information.of(*e.common_error).numbers for e in network.estimators])
+    share = known[:, [0, 2]].sum(axis=1) / (np.array(told)[:, [0, 2]].sum() + 2 / 9)
+    assert 0.3 < share.min() <= share.max() < 1
 
 
 def test_who_passes_on_what_a_liar_claims_is_still_heard() -> None:
