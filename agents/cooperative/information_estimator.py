@@ -29,9 +29,11 @@ from agents.cooperative.cmm.plausibility import (
     INCREMENT_FACTOR,
     PRIOR_FACTOR,
     SELF_SHARE,
+    SENDER_FACTOR,
     SPREAD_GATE,
     Belief,
     Origins,
+    all_of,
     cut_to,
     median_belief,
     moved,
@@ -81,6 +83,8 @@ RARE_PERIOD_S = 0.25
 vehicle have the same errors of the map (Ann Arbor, 5 Hz: ANEES 1.28 without and 1.68 with it)."""
 LEAST_SHARE = 3e-4
 """Share of what a vehicle on a map knows of c below which it does not pass an increment on."""
+LEAST_LISTERS = 3
+"""Number of frames that list an increment from which on its origin counts as one: a pair of liars invents none."""
 COUNTED_SHARE = 0.5
 """An increment of which less than this share is used is counted among what is rejected."""
 
@@ -256,9 +260,7 @@ class InformationEstimator:
         limited, increments = self._limited(heard, priors)
         self._weighed = list(frames)
         weights = self._weights = self._weigh(heard, means_m, own[2] + own[4], leaning)
-        # A late increment counts as one that a frame without a prior passes on; the first of an origin is used.
-        listed = [*[(record,) for record in late.records], *heard.passed]
-        passed, onward = self._passed_on(listed, [0.0] * len(late.records) + weights[1:])
+        passed, onward = self._passed_on(heard, late.records, weights[1:])
         self.imported = len(frames) + len(passed)
         self._pass_on(heard, onward, own[2] + own[4])
         self._absorb(weights, limited, increments, passed)
@@ -282,12 +284,17 @@ class InformationEstimator:
         self._lanes.absorb(pooled, now, before, len(weights) - 1, others)
 
     def _shares_used(
-        self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, is_before: bool
+        self,
+        codes: Sequence[int],
+        increments: Sequence[Five],
+        belief: Belief,
+        is_before: bool,
+        unvouched: Set[int] = frozenset(),
     ) -> list[float]:
         """Return the share (n,) of each increment (n,) of `codes` that is used; `belief` is the one about c."""
         now_s, said = self._now_ns / NS_PER_S, all_information_of(increments)
         if not (self._lanes and self._lanes.has_joined):
-            return self._origins.shares(codes, said, belief, now_s)
+            return self._origins.shares(codes, said, belief, now_s, unvouched=unvouched)
         used = [0.0 if any(each) else 1.0 for each in said]
         by_kind: dict[int, list[int]] = {}
         for row, increment in enumerate(increments):
@@ -450,18 +457,29 @@ class InformationEstimator:
             [record for record, (_, (a, _, d, _, _)) in zip(onward, further, strict=False) if a + d >= least],
         )
 
-    def _passed_on(self, listed: Sequence[Records], weights: Sequence[float]) -> tuple[list[Five], list[bytes]]:
-        """Return the increments of earlier periods from out of range, less what the pooled priors hold.
+    def _passed_on(
+        self, heard: HeardFrames, late: Records, weights: Sequence[float]
+    ) -> tuple[list[Five], list[bytes]]:
+        """Return the increments of the period before that are new, less what the pooled priors hold.
 
-        `listed` are the records of frames whose priors have these `weights`. The second value are the records of
-        those that are used: what can go further.
+        They are those that frames of these `weights` list, and those of `late` frames. The second value are the
+        records of those that are used: what can go further.
         """
-        shares, forged = self._passing.shares(listed, weights, self._options.defence)
+        # A late increment counts as one that a frame without a prior lists; the first of an origin is used.
+        first_hand = len(late)
+        listed, weights = [*[(record,) for record in late], *heard.passed], [*[0.0] * first_hand, *weights]
+        listers, forged = self._passing.new(listed, self._options.defence)
         self._reject("forged", forged)
-        records, origins, increments = [], [], []
+        records: list[bytes] = []
+        origins: list[int] = []
+        increments: list[Five] = []
+        by_few: dict[int, list[int]] = {}
         has_joined = self._lanes is not None and self._lanes.has_joined
-        for record, share in shares.items():
+        for record, rows in listers.items():
             code, increment = passed_increment.cached(record)
+            share = 0.0
+            for row in rows:
+                share += weights[row]
             if share >= 1:
                 continue
             a, b, d, x, y = increment
@@ -472,19 +490,49 @@ class InformationEstimator:
             else:
                 left = (PASSED_SHARE if self._lanes is None else 1.0) * (1 - share)
                 increment = left * a, left * b, left * d, left * x, left * y
+                if len(rows) < LEAST_LISTERS and rows[0] >= first_hand:
+                    by_few[len(records)] = rows
             records.append(record)
             origins.append(code)
             increments.append(increment)
         if not origins or not self._options.defence:
             return increments, records
+        codes = self._judged_as(origins, increments, by_few, [0] * first_hand + [*heard.codes])
         x, y, p, q, r = self.own.plain_moments
-        used = self._shares_used(origins, increments, ((x, y), (p, q, r)), True)
+        used = self._shares_used(codes, increments, ((x, y), (p, q, r)), True, {origins[n] for n in by_few})
         increments = scaled_down(increments, self._largest_increment)
         if min(used) < 1:
             self._reject("passed", sum(share < COUNTED_SHARE for share in used))
             increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]
             records = [record for record, share in zip(records, used, strict=True) if share >= COUNTED_SHARE]
         return increments, records
+
+    def _judged_as(
+        self,
+        origins: Sequence[int],
+        increments: list[Five],
+        by_few: Mapping[int, Sequence[int]],
+        senders: Sequence[int],
+    ) -> list[int]:
+        """Return the codes (n,) of `Origins` by which increments (n,) of the period before are judged.
+
+        Origins can be invented in any number. So what few list (`by_few`: the rows of their `senders`, by number of
+        the increment) is cut to `SENDER_FACTOR` times the largest increment a sender, and all of it whose origin is
+        unknown is judged as one; of two senders by the one that lists less.
+        """
+        traces: dict[int, float] = {}
+        for n, rows in by_few.items():
+            a, _, d, _, _ = increments[n]
+            for row in rows:
+                traces[row] = traces.get(row, 0.0) + a + d
+        limit, known, codes = SENDER_FACTOR * self._largest_increment, self._origins.known, [*origins]
+        for n, rows in by_few.items():
+            row = min(rows, key=traces.__getitem__) if len(rows) > 1 else rows[0]
+            if traces[row] > limit:
+                increments[n] = scaled_by(increments[n], limit / traces[row])
+            if origins[n] not in known:
+                codes[n] = all_of(senders[row])
+        return codes
 
     # What goes out.
 
@@ -557,29 +605,26 @@ class Passing:
             sent += _in_turns(group, limit - len(sent), period * limit)
         return np.frombuffer(b"".join(sent), dtype=PASSED)
 
-    def shares(
-        self, listed: Sequence[Records], weights: Sequence[float], defence: bool
-    ) -> tuple[dict[bytes, float], int]:
-        """Return the records of `listed` that are not used yet, each with the share that priors hold.
+    def new(self, listed: Sequence[Records], defence: bool) -> tuple[dict[bytes, list[int]], int]:
+        """Return the records of `listed` that are not used yet, each with the rows of the frames that list it.
 
-        That is the sum of the `weights` of the senders that list it. With `defence` what forged frames list is not
-        counted; the second value is their number.
+        With `defence` what forged frames list is not counted; the second value is their number.
         """
         latest, *earlier = self._known
         unknown: list[Records] = [list(filterfalse(latest.__contains__, records)) for records in listed]
-        shares = _shares(unknown, weights)
+        listers = _listers(unknown)
         if self._periods > 1:
-            for old in [record for record in shares if any(record in known for known in earlier)]:
-                del shares[old]
-            self._listed = list(shares)
-        heard, new = {record[:NAME_BYTES] for record in self._heard}, {record[:NAME_BYTES] for record in shares}
+            for old in [record for record in listers if any(record in known for known in earlier)]:
+                del listers[old]
+            self._listed = list(listers)
+        heard, new = {record[:NAME_BYTES] for record in self._heard}, {record[:NAME_BYTES] for record in listers}
         # Of who is not heard a vehicle that remembers gets increments of several periods.
-        if heard.isdisjoint(new) and (self._periods > 1 or len(new) == len(shares)):
-            return shares, 0
-        unknown = [[record for record in records if record in shares] for records in unknown]
+        if heard.isdisjoint(new) and (self._periods > 1 or len(new) == len(listers)):
+            return listers, 0
+        unknown = [[record for record in records if record in listers] for records in unknown]
         forged = _forged(heard, listed, unknown) if defence else set()
         kept, unknown = _one_an_origin(self._heard, unknown, forged)
-        return {record: share for record, share in _shares(unknown, weights).items() if record in kept}, len(forged)
+        return {record: rows for record, rows in _listers(unknown).items() if record in kept}, len(forged)
 
 
 def _in_turns(records: Sequence[bytes], count: int, first: int) -> Sequence[bytes]:
@@ -589,13 +634,16 @@ def _in_turns(records: Sequence[bytes], count: int, first: int) -> Sequence[byte
     return [records[(first + turn) % len(records)] for turn in range(count)]
 
 
-def _shares(listed: Sequence[Records], weights: Sequence[float]) -> dict[bytes, float]:
-    """Return the sum of the weights of the frames that list a record."""
-    shares: dict[bytes, float] = {}
-    for weight, records in zip(weights, listed, strict=True):
+def _listers(listed: Sequence[Records]) -> dict[bytes, list[int]]:
+    """Return the rows of the frames that list each record."""
+    listers: dict[bytes, list[int]] = {}
+    for row, records in enumerate(listed):
         for record in records:
-            shares[record] = shares.get(record, 0.0) + weight
-    return shares
+            if record in listers:
+                listers[record].append(row)
+            else:
+                listers[record] = [row]
+    return listers
 
 
 def _forged(heard: Set[bytes], listed: Sequence[Records], unknown: Sequence[Records]) -> set[int]:

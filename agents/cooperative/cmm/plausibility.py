@@ -7,13 +7,15 @@ period's lie may be small; so the deviations of each origin are summed up as wel
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from typing import Any, TypeVar
 
 from agents.cooperative.cmm.information import Five, Information, Three, plain_moments
 
 INCREMENT_FACTOR = 1.5
 """Largest trace of an increment, relative to one's own: what it says more is scaled down."""
+SENDER_FACTOR = 3.0
+"""Largest trace of all that one sender lists and few others do, relative to the largest of one increment."""
 PRIOR_FACTOR = 2.0
 """Largest trace of a prior's matrix, relative to one's own."""
 INCREMENT_GATE = 16.0
@@ -164,14 +166,13 @@ def _sum_gate(count: float, gate_of_many: float) -> float:
     return INCREMENT_GATE + (gate_of_many - INCREMENT_GATE) * min(1.0, count / MANY)
 
 
-def _in_common(sums: Sequence[Sums], off: tuple[float, float]) -> tuple[float, float] | None:
+def _in_common(sums: Sequence[Sums], off: tuple[float, float], most: float) -> tuple[float, float] | None:
     """Return by what (x, y) most `sums` deviate, in deviations of the belief, found from `off` on.
 
-    Beyond its own deviation a sum weighs less in proportion (Huber 1964), and so does one that claims much more
-    than most, so that a few do not draw it. None if the sums do not tell.
+    Beyond its own deviation a sum weighs less in proportion (Huber 1964), and so does one with a trace of more than
+    `most`, so that a few do not draw it. None if the sums do not tell.
     """
     off_x, off_y = off
-    most = INCREMENT_FACTOR * max(0.0, _median([n_a + n_d for *_, n_a, _, n_d, _ in sums]))
     for _ in range(COMMON_ROUNDS):
         s_xx = s_xy = s_yx = s_yy = s_x = s_y = 0.0
         for _, n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, _ in sums:
@@ -192,6 +193,11 @@ def _in_common(sums: Sequence[Sums], off: tuple[float, float]) -> tuple[float, f
     return off_x, off_y
 
 
+def all_of(sender: int) -> int:
+    """Return the code of all that a sender passes on, in place of an origin."""
+    return ~sender
+
+
 class Origins:
     """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
 
@@ -200,10 +206,17 @@ class Origins:
         self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
         self._common_m: tuple[float, float] | None = None  # by most sums the belief is off by this
         self._common_s = -math.inf  # when that was found
+        self._voters: set[int] = set()  # origins by whose sums it is found next
+        self._most = math.inf  # the trace beyond which a sum claimed much more than most
 
     def __len__(self) -> int:
         """Number of origins whose increments are summed up."""
         return len(self._sums)
+
+    @property
+    def known(self) -> Set[int]:
+        """The origins whose increments are summed up."""
+        return self._sums.keys()
 
     def shares(
         self,
@@ -212,6 +225,7 @@ class Origins:
         belief: Belief,
         now_s: float,
         is_about_lanes: bool = False,
+        unvouched: Set[int] = frozenset(),
     ) -> list[float]:
         """Return the share (n,) of each increment (n,) of the origins `codes` that is used.
 
@@ -221,7 +235,8 @@ class Origins:
         map, contradict each other for long and are right. What is beyond is summed up all the same: who has lied is
         believed again when it has decayed. Each is compared with the belief (x, P) when it came: c itself moves by
         a metre in the sum's memory. What most sums deviate by is the belief's error and does not count; sums
-        about lanes (`is_about_lanes`) have nothing in common, because their beliefs differ.
+        about lanes (`is_about_lanes`) have nothing in common, because their beliefs differ. Those of `unvouched`
+        origins do not say what it is, and all that one sender passes on of such (`all_of`) claims as much as most.
         """
         sums = self._sums
         if len(sums) + len(codes) > MAX_ORIGINS:
@@ -269,6 +284,8 @@ class Origins:
             d += more
             alone = (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
             # What has a negative eigenvalue may deviate by less than nothing, which is no less a deviation.
+            if code < 0 and common_m is not None and n_a + n_d > self._most:
+                in_sum *= self._most / (n_a + n_d)
             gate = gate_of_many
             if not -gate < in_sum < gate:
                 gate = _sum_gate(count, gate)
@@ -278,11 +295,15 @@ class Origins:
                 of_sum = min(1.0, gate / max(abs(in_sum), _TINY))
                 of_sum = min(math.sqrt(of_sum), FAR * of_sum) if common_m is None else of_sum * of_sum
                 shares.append(min(of_sum, INCREMENT_GATE / max(abs(alone), _TINY)))
-        if not is_about_lanes and now_s >= self._common_s + COMMON_EVERY_S:
-            recent = [known for known in sums.values() if known[0] >= self._common_s]
-            self._common_s = now_s
-            common = _in_common(recent, (off_x, off_y)) if len(recent) >= MAJORITY else None
-            self._common_m = common and (c_xx * common[0], c_yx * common[0] + c_yy * common[1])
+        if not is_about_lanes:
+            self._voters.update(codes if not unvouched else set(codes) - unvouched)
+            if now_s >= self._common_s + COMMON_EVERY_S:
+                voters = [known for code, known in sums.items() if code in self._voters]
+                self._voters, self._common_s = set(), now_s
+                traces = [n_a + n_d for *_, n_a, _, n_d, _ in voters]
+                self._most = INCREMENT_FACTOR * max(0.0, _median(traces or [0.0]))
+                common = _in_common(voters, (off_x, off_y), self._most) if len(voters) >= MAJORITY else None
+                self._common_m = common and (c_xx * common[0], c_yx * common[0] + c_yy * common[1])
         return shares
 
     def without_lean(

@@ -1,4 +1,4 @@
-"""Increments that are passed on: which are new, and which share of them the pooled priors hold."""
+"""Increments that are passed on: which are new, and who lists them."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def _passing() -> Passing:
     return passing
 
 
-def test_what_is_not_used_yet_is_new_and_priors_hold_the_weight_of_who_lists_it() -> None:
+def test_what_is_not_used_yet_is_new() -> None:
     listed = [(FIRST, OWN, FAR), (SECOND, FAR, FURTHER)]
-    shares, forged = _passing().shares(listed, [0.25, 0.5], True)
-    assert shares == {FAR: 0.75, FURTHER: 0.5}
-    assert list(shares) == [FAR, FURTHER], "the order is that of the frames, and not that of hashes of bytes"
+    listers, forged = _passing().new(listed, True)
+    assert listers == {FAR: [0, 1], FURTHER: [1]}
+    assert list(listers) == [FAR, FURTHER], "the order is that of the frames, and not that of hashes of bytes"
     assert not forged
-    assert [passed_increment(record) for record in shares] == [
+    assert [passed_increment(record) for record in listers] == [
         (code, (1.0, 0.0, 1.0, 0.0, 0.0)) for code in (300, 70_000)
     ]
-    assert _passing().shares([(OWN,)], [1.0], True) == ({}, 0)
+    assert _passing().new([(OWN,)], True) == ({}, 0)
 
 
 @pytest.mark.parametrize("defence", [True, False])
@@ -38,14 +38,14 @@ def test_who_changes_most_that_is_known_first_hand_is_not_counted(defence: bool)
     """A record that it lists first is not used either; without the defence the first record counts for all."""
     false = (_record(2, 9.0), _record(3, 9.0), OWN, _record(300, 9.0))
     honest = (FIRST, FAR, FURTHER)
-    shares, forged = _passing().shares([false, honest], [0.25, 0.5], defence)
+    listers, forged = _passing().new([false, honest], defence)
     assert forged == int(defence)
-    assert shares == ({FURTHER: 0.5} if defence else {_record(300, 9.0): 0.75, FURTHER: 0.5})
+    assert listers == ({FURTHER: [1]} if defence else {_record(300, 9.0): [0, 1], FURTHER: [1]})
 
 
 def test_a_frame_that_differs_in_one_of_two_is_not_forged() -> None:
     listed = [(FIRST, _record(3, 9.0), FAR), (SECOND, FAR)]
-    assert _passing().shares(listed, [0.25, 0.5], True) == ({FAR: 0.75}, 0)
+    assert _passing().new(listed, True) == ({FAR: [0, 1]}, 0)
 
 
 def test_others_are_sent_in_turns() -> None:
@@ -62,16 +62,16 @@ def _codes(passing: Passing, limit: int, period: int = 0) -> list[int]:
 def test_what_others_passed_on_is_used_once_as_long_as_a_vehicle_remembers_it() -> None:
     passing, listed = Passing(OWN, 3), [(FIRST, FAR)]
     passing.use([OWN, FIRST], [OWN, FIRST])
-    assert passing.shares(listed, [0.5], True) == ({FAR: 0.5}, 0)
+    assert passing.new(listed, True) == ({FAR: [0]}, 0)
     passing.use([OWN, SECOND], [OWN, SECOND], [FAR])
     assert _codes(passing, 9) == [1, 3, 300]
     for _ in range(3):
-        assert passing.shares(listed, [0.5], True) == ({}, 0)
+        assert passing.new(listed, True) == ({}, 0)
         passing.use([OWN], [OWN])
         assert _codes(passing, 9) == [1]
     for _ in range(3):
         passing.use([OWN], [OWN])
-    assert FAR in passing.shares(listed, [0.5], True)[0], "it has forgotten"
+    assert FAR in passing.new(listed, True)[0], "it has forgotten"
 
 
 def test_what_was_heard_is_sent_before_what_others_have_passed_on() -> None:
@@ -81,20 +81,20 @@ def test_what_was_heard_is_sent_before_what_others_have_passed_on() -> None:
     assert _codes(passing, 9) == [1, 2, 3, 300, 70_000]
     assert _codes(passing, 4) == [1, 2, 3, 300]
     assert [_codes(passing, 2, period) for period in range(2)] == [[1, 2], [1, 2]]
-    assert passing.shares([(_record(4), OWN)], [0.5], True) == ({}, 0)
+    assert passing.new([(_record(4), OWN)], True) == ({}, 0)
 
 
 def test_an_older_increment_of_who_is_heard_is_no_forgery_if_it_is_known() -> None:
     passing, false = Passing(OWN, 3), _record(2, 9.0)
     passing.use([OWN, FIRST], [OWN, FIRST])
     passing.use([OWN, _record(2, 2.0)], [OWN, _record(2, 2.0)])
-    assert passing.shares([(FIRST, false, FAR)], [0.5], True) == ({FAR: 0.5}, 0)
-    assert passing.shares([(false, FAR)], [0.5], True) == ({}, 1)
+    assert passing.new([(FIRST, false, FAR)], True) == ({FAR: [0]}, 0)
+    assert passing.new([(false, FAR)], True) == ({}, 1)
 
 
 def test_a_known_increment_does_not_hide_a_new_one_of_the_same_origin() -> None:
     passing, newer = Passing(OWN, 3), _record(300, 2.0)
     passing.use([OWN, FIRST], [OWN, FIRST], [FAR])
-    assert passing.shares([(FAR,)], [0.5], True) == ({FAR: 0.5}, 0)
+    assert passing.new([(FAR,)], True) == ({FAR: [0]}, 0)
     passing.use([OWN, FIRST], [OWN, FIRST], [FAR])
-    assert passing.shares([(FAR,), (newer, _record(2, 3.0))], [0.25, 0.5], False) == ({newer: 0.5}, 0)
+    assert passing.new([(FAR,), (newer, _record(2, 3.0))], False) == ({newer: [1]}, 0)

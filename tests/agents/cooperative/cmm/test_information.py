@@ -26,6 +26,7 @@ from agents.cooperative.cmm.plausibility import (
     SUM_GATE,
     Belief,
     Origins,
+    all_of,
     cut_to,
     median_belief,
     moved,
@@ -225,6 +226,17 @@ def test_increments_passed_on_by_others_do_not_hide_what_most_are_off_by() -> No
         shares = origins.shares(range(10), [said] * 10, belief, 0.1 * k)
         origins.shares([99], [said], belief, 0.1 * k)
     assert shares == [1.0] * 10
+
+
+def test_what_is_not_vouched_for_does_not_say_what_most_are_off_by() -> None:
+    """Thirty that are off by a metre, of whom one sender has told, are judged by ten that are heard."""
+    origins, belief = Origins(), ((0.0, 0.0), (0.01, 0.0, 0.01))
+    honest, off = [_information((0.0, 0.0), 2.0)] * 10, [_information((1.0, 0.0), 2.0)] * 30
+    for k in range(100):
+        assert origins.shares(range(10), honest, belief, 0.1 * k) == [1.0] * 10
+        codes, said = [*range(10, 40), all_of(3)], [*off, _information((1.0, 0.0), 2.0 / 30)]
+        shares = origins.shares(codes, said, belief, 0.1 * k, unvouched=set(range(10, 40)))
+    assert max(shares) < 0.1
 
 
 @pytest.mark.parametrize("liar_m", [-0.4, 1.0, 50.0])
