@@ -72,9 +72,10 @@ KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
 `format` in `verdict.json` is the version of the whole folder.
 
+- 5: `packet_delivery_ratio` counts receivers that are up. Of an earlier folder in which one was down it is not
+  shown; `vnet radio` computes it.
 - 4: `states.parquet` and `metrics.parquet` have the columns that the run's program declares, and no other's.
-- 3: the folder has a `manifest.json`. Without one, checks that compare files with each other are *unknown*
-  instead of *invalid*.
+- 3: the folder has a `manifest.json`. Without one, checks that compare files are *unknown* instead of *invalid*.
 - 2: the folder has a `world.npz`, and `scenario.toml` a section `[code]`.
 - 1 (vnet 0.1.0): it has neither. `render` and, with `radio.links` in a file, checks and radio figures need
   the run's input files. Names of checks that began with `bit:` are read as `effect:`.
@@ -99,7 +100,7 @@ WORLD = {
     "receiver_m": "with a recorded common error of several receivers only: what each has beyond the common error",
 }
 VERDICT = {
-    "format": "version of the folder, [3](#formats)",
+    "format": "version of the folder, [5](#formats)",
     "verdict": "`valid`, `invalid` or `unknown`",
     "checks": "list of {`name`, `verdict`, `text`, `figures`}; `figures.rows` are the first offending rows",
     "not_exercised": "list of {`name`, `reason`}",

@@ -38,6 +38,7 @@ from emulator.records.reported import reported_figures
 from emulator.records.run_folder import MANIFEST_FILE, SCENARIO_FILE, VERDICT_FILE, WORLD_FILE
 from emulator.records.tables import BACKBONE, BUSY, DRIVEN, PAYLOADS, STATES, backbone_figures, driving_figures
 from emulator.records.verdicts import (
+    FIRST_WITH_RATIO,
     MOST_ROWS,
     CheckResult,
     Finding,
@@ -482,6 +483,8 @@ def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
     computed = verdict_figures(recorded, rows_of(recorded.metrics)) | dict(_of_the_course(recorded))
     if record.format < 4:  # which left out some
         computed["figures"] = {name: value for name, value in computed["figures"].items() if name in record.figures}
+    if record.format < FIRST_WITH_RATIO:
+        del computed["packet_delivery_ratio"]
     wrong = [
         {"figure": path, "kept": ours, "computed": theirs}
         for each, value in computed.items()

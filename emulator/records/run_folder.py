@@ -53,7 +53,7 @@ VERDICT_ROOM_BYTES = 1 << 16
 """Size of most verdicts, with their manifests."""
 PLAIN = ("size_bytes", "payload_digest", "copy")
 """Columns of tables, beside times, that are written without a dictionary."""
-FORMAT = 4
+FORMAT = 5
 """Version of the folder's files; `verdict.json` holds it. docs/reference/files.md says what changed with each."""
 
 MOST_FILES = 1000

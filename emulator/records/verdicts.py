@@ -137,6 +137,8 @@ def result(
 
 
 LARGEST_BYTES = 64 * 2**20
+FIRST_WITH_RATIO = 5
+"""The first format whose packet delivery ratio is at receivers that are up."""
 RENAMED_CHECKS = {"bit:": "effect:"}
 """Prefixes of the names of checks: that of format 1, and today's."""
 
@@ -208,8 +210,10 @@ def read_record(path: Path) -> Record:
             KeyFigure(name, title_of(name)) for name in record.figures if name[-2:] == "_m" and name not in own
         ]
         record = replace(record, key_figures=[*others, *POSITION_FIGURES])
-    if "packet_delivery_ratio" not in data:  # of an earlier vnet, which counted all receptions
-        record = replace(record, packet_delivery_ratio=record.share_of("delivered"))
+    if record.format < FIRST_WITH_RATIO:  # which also counted receivers that were down, or left the ratio out
+        ratio = data.get("packet_delivery_ratio", record.share_of("delivered"))
+        down = record.frames_by_outcome.get("receiver_down")
+        record = replace(record, packet_delivery_ratio=None if down else ratio)
     return replace(
         record,
         checks=[replace(check, name=_new_name(check.name)) for check in record.checks],

@@ -152,7 +152,7 @@ def without_manifest(folder: Path) -> None:
 def of_format(number: int) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         path = folder / "verdict.json"
-        path.write_text(path.read_text().replace('"format": 4', f'"format": {number}', 1))
+        path.write_text(path.read_text().replace('"format": 5', f'"format": {number}', 1))
 
     return apply
 
@@ -173,6 +173,17 @@ def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_
     of_format(2)(copy)
     judgement = check_run(copy)
     assert (broken(judgement), judgement.verdict) == (set(), Verdict.UNKNOWN)
+
+
+def test_a_delivery_ratio_of_an_earlier_definition_is_neither_shown_nor_wrong(copy: Path) -> None:
+    says("packet_delivery_ratio", 0.5)(copy)
+    of_format(4)(copy)
+    forge(copy)
+    assert broken(check_run(copy)) == set()
+    record = RecordedRun.open(copy).record
+    assert record.frames_by_outcome["receiver_down"] and record.packet_delivery_ratio is None
+    says("seed", 99)(copy)
+    assert "verdict_file" in broken(check_run(copy)), "whatever else it has meant the same"
 
 
 def test_a_log_is_of_the_manifest_whatever_its_vehicle_is_called(copy: Path) -> None:

@@ -186,10 +186,10 @@ def test_a_world_that_cannot_be_read_is_told_in_one_line(
 def test_a_folder_of_a_later_format_is_refused(inputs: Path, tmp_path: Path) -> None:
     run_scenario(tmp_path / "run", with_files(inputs))
     path = tmp_path / "run" / "verdict.json"
-    path.write_text(path.read_text().replace('"format": 4', '"format": 5', 1))
+    path.write_text(path.read_text().replace('"format": 5', '"format": 6', 1))
     run = RecordedRun.open(tmp_path / "run")
     for read in (lambda: check_run(run.folder), lambda: list(messages(run.folder)), lambda: run.states):
-        with pytest.raises(VnetError, match=r"format 5, of vnet [\w.]+; this vnet reads 1 to 4"):
+        with pytest.raises(VnetError, match=r"format 6, of vnet [\w.]+; this vnet reads 1 to 5"):
             read()
 
 
