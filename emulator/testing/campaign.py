@@ -312,33 +312,46 @@ def _checks(row: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return list(checks.items()) if isinstance(checks, dict) else []
 
 
+def _judging(results: Sequence[Mapping[str, Any]], check: str) -> list[Mapping[str, Any]]:
+    """Return the runs of `campaign.json` in which a check was judged: all for those that only a failure has."""
+    if check in (HUNG, EMULATOR):
+        return list(results)
+    judged = (Verdict.VALID, Verdict.INVALID)
+    return [row for row in results if any(column_of(n)[0] == check and v in judged for n, v in _checks(row))]
+
+
 def after_a_fix(results: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield a line for each check that failed: the runs that make its fix credible."""
     for check, failed in failures_by_check(results).most_common():
-        needed = green_runs_needed(failed, len(results))
+        runs = len(_judging(results, check))
         yield (
-            f"{check} failed in {failed} of {len(results)} runs: once it is fixed, {needed} runs without a failure "
-            f"make that credible ({1 - ALPHA:.0%})"
+            f"{check} failed in {failed} of {runs} runs: once it is fixed, {green_runs_needed(failed, runs)} runs "
+            f"without a failure make that credible ({1 - ALPHA:.0%})"
         )
 
 
 def compared_with_before(before: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield a line for each check that failed before: whether it is credibly fixed now."""
+    """Yield a line for each check that failed before: whether it is credibly fixed now, by runs of other seeds."""
     failing = failures_by_check(now)
-    judged = {HUNG, EMULATOR} | {column_of(name)[0] for row in now for name, _ in _checks(row)}
+    seeds = [row.get("seed") for row in before]
+    known = {seed for seed in seeds if isinstance(seed, int)}
     for check, failed in failures_by_check(before).most_common():
-        was = f"{check} failed in {failed} of {len(before)} runs before"
+        runs, judging = len(_judging(before, check)), _judging(now, check)
+        was = f"{check} failed in {failed} of {runs} runs before"
+        new = [row for row in judging if row.get("seed") not in known]
         if failing[check]:
-            yield f"{was}, and in {failing[check]} of {len(now)} now"
-            continue
-        if check not in judged:
+            yield f"{was}, and in {failing[check]} of {len(judging)} now"
+        elif not judging:
             yield f"{was}, and was judged in no run now"
-            continue
-        needed = green_runs_needed(failed, len(before))
-        if len(now) >= needed:
-            yield f"{was}, and in none of {len(now)} now: a fix is credible, for which {needed} runs are enough"
+        elif not new:
+            yield f"{was}, and in none of {len(judging)} now, the same runs: compare others (--seed with --before)"
         else:
-            yield f"{was}, and in none of {len(now)} now: a fix is credible from {needed} runs on ({1 - ALPHA:.0%})"
+            needed = green_runs_needed(failed, runs)
+            told = f"{was}, and in none of {len(new)} now{' with other seeds' if len(new) < len(judging) else ''}"
+            if len(new) >= needed:
+                yield f"{told}: a fix is credible, for which {needed} runs are enough"
+            else:
+                yield f"{told}: a fix is credible from {needed} runs on ({1 - ALPHA:.0%})"
 
 
 def regression_test(number: str, checks: Sequence[str], limit_s: float) -> str:

@@ -56,8 +56,36 @@ def test_a_campaign_is_compared_with_the_one_before_the_fix() -> None:
     assert "enough" in hung, "a run that hangs comes to no check, and one that does not has no such check"
 
 
+def test_only_runs_that_judge_a_check_say_anything_of_its_fix() -> None:
+    unjudged: list[dict[str, object]] = [{"checks": {"own:safe": "unknown"}}, {"checks": {}}]
+    needed = green_runs_needed(10, 20)
+    (line,) = after_a_fix([*rows(20, 10), *unjudged * 90])
+    assert "10 of 20 runs" in line and f" {needed} runs" in line
+    (too_few,) = compared_with_before([*rows(20, 10), *unjudged], [*rows(needed - 1, 0), *unjudged * 90])
+    assert f"none of {needed - 1} now" in too_few and f"from {needed} runs on" in too_few
+    (none,) = compared_with_before(rows(20, 10), unjudged * 90)
+    assert "judged in no run now" in none
+
+
+def with_seeds(runs: list[dict[str, object]], first: int) -> list[dict[str, object]]:
+    return [row | {"seed": first + number} for number, row in enumerate(runs)]
+
+
+def test_the_same_runs_again_say_nothing_of_a_fix() -> None:
+    needed = green_runs_needed(10, 200)
+    before = with_seeds(rows(200, 10), 1)
+    (same,) = compared_with_before(before, with_seeds(rows(200, 0), 1))
+    assert "credible" not in same and "--seed" in same
+    (some,) = compared_with_before(before, with_seeds(rows(200 + needed - 1, 0), 1))
+    assert f"none of {needed - 1} " in some and f"from {needed} runs on" in some
+    (enough,) = compared_with_before(before, with_seeds(rows(200 + needed, 0), 1))
+    assert "enough" in enough
+    (failing,) = compared_with_before(before, with_seeds(rows(200, 3), 1))
+    assert "in 3 of 200 now" in failing
+
+
 def test_a_fault_s_own_checks_count_together_and_a_foreign_row_counts_nothing() -> None:
     kills = dict.fromkeys(["effect:kill-0", "effect:kill-1"], "invalid")
     found: list[dict[str, object]] = [{"checks": kills}, {"checks": 3}, {}]
     (line,) = after_a_fix(found)
-    assert "in 1 of 3 runs" in line
+    assert "in 1 of 1 runs" in line
