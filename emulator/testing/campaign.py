@@ -454,7 +454,7 @@ class CampaignRun:
         trial = self.again if self.again is not None and self.again.failed else self.trial
         texts = {name: trial.texts[name] for name in trial.failed}
         if self.again is not None and self.again.verdicts and not self.again.failed:
-            texts["replay"] = "the shrunk run failed, and did not when it was run again"
+            texts["replay"] = "it failed, and did not when it was run again"
         return texts
 
     def as_json(self) -> dict[str, Any]:

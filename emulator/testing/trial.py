@@ -26,7 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from emulator.cells.cells import BROKEN, WorkerPool, worker_died
+from emulator.cells.cells import BROKEN, MOST_TRIES, WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
 from emulator.checks.replay import compare_tables, events_table, first_call
@@ -182,19 +182,20 @@ class TrialPool:
     def run(self, scenario: Scenario, folder: Path, apart: bool = False) -> Trial:
         """Return a trial on this machine, whose files stay in `folder`.
 
-        One that hangs has failed; one that ends its process is made again with a process a vehicle, so that the
-        vehicle has died; so is any if `apart`. Nothing is known of one that was begun once closed.
+        One that hangs has failed; one that ends its process is made again, as the machine may have ended it, and at
+        last with a process a vehicle, so that the vehicle has died; so is any if `apart`. Nothing is known of one
+        that was begun once closed.
         """
-        return self._judged(lambda apart: self._here(scenario, folder, apart), apart)
+        return self._judged(lambda tries: self._here(scenario, folder, tries), MOST_TRIES if apart else 1)
 
     def run_anywhere(self, scenario: Scenario, apart: bool = False) -> Trial:
         """Return a trial that leaves no files, on the executor if there is one; VnetError if that is broken."""
-        return self._judged(lambda apart: self._away(scenario, apart), apart)
+        return self._judged(lambda tries: self._away(scenario, tries), MOST_TRIES if apart else 1)
 
-    def _judged(self, run: Callable[[bool], Trial], apart: bool = False) -> Trial:
+    def _judged(self, run: Callable[[int], Trial], tries: int) -> Trial:
         try:
             if not self.closed:
-                return run(apart)
+                return run(tries)
         except WorkerTimeoutError as error:
             return Trial.failure(HUNG, f"{error}; logs/stacks.txt says where it stood")
         except BROKEN:
@@ -203,28 +204,30 @@ class TrialPool:
         except Exception as error:
             if not worker_died(error):
                 raise
+            if not self.closed and tries == MOST_TRIES:
+                return Trial.failure(EMULATOR, str(error))
             if not self.closed:
-                return Trial.failure(EMULATOR, str(error)) if apart else self._apart(run, error)
+                return self._apart(run, error) if tries + 1 == MOST_TRIES else self._judged(run, tries + 1)
         return UNKNOWN
 
-    def _apart(self, run: Callable[[bool], Trial], error: Exception) -> Trial:
+    def _apart(self, run: Callable[[int], Trial], error: Exception) -> Trial:
         """Return the trial again with a process a vehicle, so that the vehicle has died that ended all before."""
-        trial = self._judged(run, apart=True)
+        trial = self._judged(run, MOST_TRIES)
         if trial.verdicts and not trial.failed:
             return Trial.failure(EMULATOR, f"{error}; not where each vehicle had a process of its own")
         return replace(trial, apart=True)
 
-    def _here(self, scenario: Scenario, folder: Path | None, apart: bool) -> Trial:
+    def _here(self, scenario: Scenario, folder: Path | None, tries: int) -> Trial:
         self._pool.call(self._place, _get_ready)
         function = _run_unkept if folder is None else _run_in_worker
         place = self._scratch / str(threading.get_ident()) if folder is None else folder
-        how = self.limit_s, self._twice, apart
+        how = self.limit_s, self._twice, tries
         return self._pool.call(self._place, function, scenario, place, *how, limit_s=self.limit_s)
 
-    def _away(self, scenario: Scenario, apart: bool) -> Trial:
+    def _away(self, scenario: Scenario, tries: int) -> Trial:
         if self._executor is None:
-            return self._here(scenario, None, apart)
-        how = self.limit_s, self._twice, apart
+            return self._here(scenario, None, tries)
+        how = self.limit_s, self._twice, tries
         future: Future[Trial] = self._executor.submit(
             call_fitly, self._place, _run_elsewhere, scenario, *how, limit_s=self.limit_s
         )
@@ -245,27 +248,27 @@ def _get_ready() -> None:
     """Have a worker import all of this module before the time of a trial is measured."""
 
 
-def _run_elsewhere(scenario: Scenario, limit_s: float, twice: bool, apart: bool) -> Trial:
+def _run_elsewhere(scenario: Scenario, limit_s: float, twice: bool, tries: int) -> Trial:
     """Run a trial in a worker on any machine, and keep nothing but its result."""
     with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-        return _run_unkept(scenario, Path(name) / "run", limit_s, twice, apart)
+        return _run_unkept(scenario, Path(name) / "run", limit_s, twice, tries)
 
 
-def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float, twice: bool, apart: bool) -> Trial:
+def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float, twice: bool, tries: int) -> Trial:
     """Run a trial in a worker, and keep nothing but its result: files take as long as a small run's checks."""
     folder = RunFolder.scratch(scratch)
     # Checks of the user's own may read what programs have printed.
     log = folder.logs / PROGRAMS_LOG if scenario.program.checks else Path(os.devnull)
-    return _run(scenario, folder, log, Path(os.devnull), limit_s, twice, apart)
+    return _run(scenario, folder, log, Path(os.devnull), limit_s, twice, tries)
 
 
-def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float, twice: bool, apart: bool) -> Trial:
+def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float, twice: bool, tries: int) -> Trial:
     """Run a trial in a worker. What its programs print, and where it stood if it hangs, is in the run's logs."""
-    if apart:
+    if tries > 1:
         shutil.rmtree(folder, ignore_errors=True)  # of the attempt before
     run_folder = RunFolder.create(folder, scenario)
     log, stacks = run_folder.logs / PROGRAMS_LOG, run_folder.logs / "stacks.txt"
-    return _run(scenario, run_folder, log, stacks, limit_s, twice, apart)
+    return _run(scenario, run_folder, log, stacks, limit_s, twice, tries)
 
 
 def _run(
@@ -275,14 +278,14 @@ def _run(
     stacks_path: Path,
     limit_s: float,
     twice: bool,
-    apart: bool,
+    tries: int,
 ) -> Trial:
     with log_path.open("ab") as log, stacks_path.open("w") as stacks:
         before = os.dup(STDOUT)
         os.dup2(log.fileno(), STDOUT)
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:
-            return run_trial(scenario, run_folder, twice, apart)
+            return run_trial(scenario, run_folder, twice, tries == MOST_TRIES)
         except DiskError:
             raise
         except BaseException as error:

@@ -168,6 +168,12 @@ def test_what_hangs_or_dies_on_an_executor_has_failed(error: VnetError, failed: 
     assert TrialPool(2.0, planted("proud"), Failing(error)).run_anywhere(planted("proud")).failed == failed
 
 
+def test_a_worker_that_is_killed_once_is_the_machine_s_and_no_failure() -> None:
+    trial = Trial({"safe": Verdict.VALID}, {})
+    once = Failing(WorkerDiedError("its process ended with SIGKILL"), then=trial)
+    assert TrialPool(2.0, planted("proud"), once).run_anywhere(planted("proud")) == trial
+
+
 @pytest.mark.parametrize("error", [BrokenExecutor(), CancelledError()], ids=["broken", "without its scheduler"])
 def test_an_executor_that_is_broken_ends_campaign_and_sweep(error: Exception) -> None:
     with pytest.raises(VnetError, match="the executor is broken"):
@@ -178,15 +184,21 @@ def test_an_executor_that_is_broken_ends_campaign_and_sweep(error: Exception) ->
 
 
 class Failing(Executor):
-    """Fails whatever it is to do."""
+    """Fails whatever it is to do, or only at first, and then has a result."""
 
-    def __init__(self, error: Exception) -> None:
+    def __init__(self, error: Exception, then: Trial | None = None) -> None:
         self._error = error
+        self._then = then
+        self._failed = False
 
     def submit(self, *_: Any, **__: Any) -> Future[Any]:
-        failed: Future[Any] = Future()
-        failed.set_exception(self._error)
-        return failed
+        future: Future[Any] = Future()
+        if self._failed and self._then is not None:
+            future.set_result(self._then)
+        else:
+            future.set_exception(self._error)
+        self._failed = True
+        return future
 
 
 def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(tmp_path: Path) -> None:
@@ -328,7 +340,7 @@ def test_what_the_disk_refuses_is_no_failure_of_the_run(tmp_path: Path, monkeypa
 
     monkeypatch.setattr(trial, "run_trial", refuse)
     with pytest.raises(DiskError):
-        trial._run_unkept(planted("proud"), tmp_path / "run", 60.0, False, False)
+        trial._run_unkept(planted("proud"), tmp_path / "run", 60.0, False, 1)
 
 
 def test_what_cannot_be_a_campaign_is_refused(tmp_path: Path) -> None:
