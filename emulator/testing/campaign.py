@@ -53,6 +53,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign_plan import Plan, with_seed
 from emulator.testing.trial import (
     EMULATOR,
+    GROWTH,
     HUNG,
     MOST_ORDER_STEPS,
     MOST_STEPS,
@@ -678,8 +679,7 @@ class Campaign:
             "checks": outcome.texts(),
             "schedule": outcome.schedule(),
             "order": outcome.order(),
-            "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}"
-            + (" --check-determinism" if REPLAY in outcome.trial.failed else ""),
+            "command": _reproduction(outcome.folder.absolute(), outcome.trial.failed),
             "folder": f"failures/{outcome.folder.name}",
             "parting": shown_parting(outcome.explanation) if outcome.explanation else None,
         }
@@ -703,6 +703,14 @@ class Campaign:
         for outcome in self.failures:
             if outcome.label in first and outcome.explanation is not None:
                 yield Text(f"{outcome.label} {outcome.explanation.line()}")
+
+
+def _reproduction(folder: Path, failed: Sequence[str]) -> str:
+    """Return the command that shows a failure again: the test if it is of growth, for which nothing else looks."""
+    if GROWTH in failed:
+        return f"pytest {shlex.quote(str(folder / TEST_FILE))}"
+    command = f"vnet simulate {shlex.quote(str(folder / SCENARIO_FILE))}"
+    return f"{command} --check-determinism" if REPLAY in failed else command
 
 
 def _distance(outcome: CampaignRun, other: CampaignRun) -> tuple[bool, int]:

@@ -263,7 +263,9 @@ def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path, pytester:
     row = failure_of(Plan.of(planted("growing"), "loss", 1, seed=1, shrink_steps=2), tmp_path / "growing")
     assert list(row["failed"]) == ["growth"]
     assert row["shrunk"] == "", "it grows without any fault"
-    assert "growth" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)
+    assert "growth" in said_by_pytest(test := Path(row["folder"]) / TEST_FILE, pytester)
+    page = (tmp_path / "growing" / "campaign.html").read_text()
+    assert f"<pre>pytest {test}</pre>" in page, "no other command looks for growth"
 
 
 def test_coordinates_of_the_network_are_no_growth(tmp_path: Path) -> None:
