@@ -451,9 +451,13 @@ class CampaignRun:
         return "" if run.tape is None or isinstance(run.tape, Path) else order_text(run.tape)
 
     def texts(self) -> dict[str, str]:
-        """Return the texts of the failed checks, of the shrunk run if there is one."""
+        """Return the texts of the failed checks, of the shrunk run if they failed there."""
         trial = self.again if self.again is not None and self.again.failed else self.trial
         texts = {name: trial.texts[name] for name in trial.failed}
+        told = {column_of(name) for name in texts}
+        for name in self.trial.failed:
+            if column_of(name) not in told:
+                texts[name] = f"{self.trial.texts[name]}; not in the shrunk run"
         if self.again is not None and self.again.verdicts and not self.again.failed:
             texts["replay"] = "it failed, and did not when it was run again"
         return texts

@@ -216,6 +216,9 @@ def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(t
     assert row["failed"] == {"own:unpaused": "1 pauses"}
     assert row["shrunk"].count("[[fault]]") == 1
     assert "unknown in 1 run: own:own_campaign_checks.broken: raises ValueError: v01" in said
+    both = make_scenario(planted("growing"), {"checks": checks[:1]})
+    row = failure_of(Plan.of(both, "pause", 1, 1), tmp_path / "both")
+    assert row["shrunk"] == "" and set(row["failed"]) == {"growth", "own:unpaused"}, "also what was shrunk away"
     status, said = run(Plan.of(make_scenario(scenario, {"checks": checks}), "none", 1, seed=1), tmp_path / "none")
     assert (status, "1 run, 0 failed" in said) == (3, True)
 
