@@ -99,11 +99,13 @@ def sweep_page(run: Run, programs: Sequence[Program], rows: Rows, varied: Sequen
     charts, missing = draw_charts(drawers if varied else {})
     counts = Counter(row["verdict"] for row in rows)
     seeds = len({row["seed"] for row in rows})
+    lengths_s = [row["emulated_s"] for row in rows]
+    ends = [f"{end_s:g}" for end_s in (min(lengths_s), max(lengths_s))]
     return render(
         "sweep.html.j2",
         title=f"Sweep {run.name}",
         facts=[
-            f"{counted(len(rows), 'run')} of {run.duration_s:g} s of emulated time",
+            f"{counted(len(rows), 'run')} of {' to '.join(dict.fromkeys(ends))} s of emulated time",
             f"{counted(seeds, 'seed')} for each combination of values",
             ", ".join(program.entry for program in programs),
         ],

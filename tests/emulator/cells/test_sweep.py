@@ -84,6 +84,12 @@ def test_shards_are_the_whole_without_an_overlap() -> None:
 
 
 @pytest.mark.slow
+def test_a_page_says_how_long_its_runs_are_where_that_varies(tmp_path: Path, in_this_process: list[Cell]) -> None:
+    emulator.sweep(TINY, {"run.duration_s": [0.4, 0.6]}, seeds=[1], out=tmp_path)
+    assert "2 runs of 0.4 to 0.6 s of emulated time" in (tmp_path / "sweep.html").read_text()
+
+
+@pytest.mark.slow
 def test_a_sweep_leaves_a_table_and_a_page_and_goes_on(tmp_path: Path, in_this_process: list[Cell]) -> None:
     table = emulator.sweep(TINY, VARY, seeds=[1, 2], out=tmp_path)
     assert len(in_this_process) == len(table) == 8
