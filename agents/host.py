@@ -597,10 +597,11 @@ class _RealTimeAgent:
 
     def _take(self, batch: wire.Batch, arrived_ns: int) -> None:
         if batch.origin_ns is not None and not self._started:
-            same_machine = self._boot_id != "" and self._boot_id == wire.boot_id()
             head_start_ns = 0 if batch.start_ns else wire.HEAD_START_NS
-            here_ns = monotonic_ns() + head_start_ns - batch.start_ns
-            self._origin_ns = self._loop.origin_ns = batch.origin_ns if same_machine else here_ns
+            here_ns = arrived_ns + head_start_ns - batch.start_ns
+            # By a clock that is shared the batch has not come before it was sent.
+            is_shared = self._boot_id != "" and self._boot_id == wire.boot_id() and batch.origin_ns <= here_ns
+            self._origin_ns = self._loop.origin_ns = batch.origin_ns if is_shared else here_ns
             self._started = True
             head_start_s = max(0.0, (self._origin_ns + batch.start_ns - monotonic_ns()) / 1e9)
             self._loop.call_later(head_start_s, self._host.start, self._loop, self._programs)

@@ -134,6 +134,29 @@ def test_a_message_of_the_backbone_that_has_come_while_the_program_computed_is_n
     assert said[0].unseen == [MessageRef("v01", 1)]
 
 
+@pytest.mark.parametrize(
+    ("origin_s", "namespace", "is_shared"),
+    [(-0.05, "", True), (500.0, "", False), (-100.0, "time:[5]", False)],
+    ids=["the same clock", "one that is ahead", "one of another time namespace"],
+)
+def test_a_vehicle_begins_with_batch_0_where_the_emulator_s_clock_is_not_its_own(
+    origin_s: float, namespace: str, is_shared: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    welcome = emulation_of(scenario_of((), "agents.beacon:main")).welcome("v01", b"n")
+    if namespace:
+        monkeypatch.setattr("os.readlink", lambda path: namespace)
+    attached: Any = SimpleNamespace(nonce=b"n", units=None)
+    agent = _RealTimeAgent(attached, [welcome], {}, None)
+    starts_s: list[float] = []
+    loop = SimpleNamespace(origin_ns=0, call_later=lambda delay_s, *_: starts_s.append(delay_s))
+    agent._loop = loop  # type: ignore[assignment]
+    arrived_ns = time.monotonic_ns()
+    batch = wire.Batch([], 0, [], origin_ns=arrived_ns + round(origin_s * 1e9))
+    agent._take(batch, arrived_ns)
+    assert loop.origin_ns == (batch.origin_ns if is_shared else arrived_ns + wire.HEAD_START_NS)
+    assert starts_s[0] <= wire.HEAD_START_NS / 1e9
+
+
 def test_a_program_may_put_emulated_time_in_place_of_the_machines(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("monotonic", "monotonic_ns"):
         monkeypatch.setattr(time, name, lambda: 0)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -579,12 +580,23 @@ def check_size(data: bytes) -> None:
         raise WireError(f"message of {len(data)} bytes: at most {LARGEST_MESSAGE_BYTES} allowed")
 
 
+FIRST_TIME_NAMESPACE = "time:[4026531834]"
+"""Constant of Linux (PROC_TIME_INIT_INO): the time namespace whose clocks are the machine's own."""
+
+
 def boot_id() -> str:
-    """Return the id of this machine's boot: processes with the same id share a monotonic clock."""
+    """Return the id of this machine's boot, and of the time namespace unless that is the first.
+
+    Processes with the same id share a monotonic clock.
+    """
     try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
         return ""
+    with suppress(OSError):  # before Linux 5.6
+        if (namespace := str(Path("/proc/self/ns/time").readlink())) != FIRST_TIME_NAMESPACE:
+            return f"{boot} {namespace}"
+    return boot
 
 
 # Messages of the backbone on keys of the units' own.
