@@ -153,7 +153,7 @@ class Agent:
                 expected = batch + 1
                 now_ns = max(arrived_ns - origin_ns, 0)
                 for packet in [] if held else packets:  # a bin of lateness for each quarter of a power of two
-                    late = max(now_ns - packet[3], 1) / LIMIT_NS
+                    late = max(abs(now_ns - packet[3]), 1) / LIMIT_NS
                     lateness[min(max(LIMIT_BIN + math.floor(4 * math.log2(late)), 0), LATENESS_BINS - 1)] += 1
                 traffic = vehicle.step(now_ns, packets, fixes, clocks)
             if traffic[0] or time.monotonic() - said_s >= SIGN_OF_LIFE_S:

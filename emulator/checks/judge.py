@@ -417,9 +417,10 @@ CHECKS: list[Check] = [
     Check(
         check_kept_up,
         MACHINE,
-        "In real time, at most 0.1 % of deliveries are over 20 ms late: the lower end of the 95 % confidence "
-        "interval of their share (Clopper and Pearson) is not above it. Of what a restart of emulator or "
-        "router holds back only the time after that counts.",
+        "In real time, at most 0.1 % of deliveries are over 20 ms late, or early, by the clock of their process "
+        "(early where the clock of a host drifts or was stopped): the lower end of the 95 % confidence interval of "
+        "their share (Clopper and Pearson) is not above it. Of what a restart of emulator or router holds back "
+        "only the time after that counts.",
         unknown="more are, or none was timed",
         not_applicable="lockstep: nothing can be late",
         without_positions=WithoutPositions.JUDGE,

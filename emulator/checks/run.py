@@ -234,7 +234,7 @@ def check_kept_up(recorded: RecordedRun) -> Finding:
     count, total = figures["count"], figures["total"]
     at_least = lowest_share(count, total)
     deliveries = counted(total, "delivery", "deliveries")
-    text = f"{count / total:.3%} of {deliveries} over 20 ms late (p99 {figures['p99_ms']:.1f} ms)"
+    text = f"{count / total:.3%} of {deliveries} over 20 ms late or early (p99 {figures['p99_ms']:.1f} ms)"
     verdict = Verdict.VALID if at_least <= LATE_SHARE_LIMIT else Verdict.UNKNOWN
     return CheckResult("", verdict, text, {**figures, "share_at_least": at_least})
 

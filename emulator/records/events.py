@@ -181,8 +181,8 @@ class EventKind(StrEnum):
     transport_gap = "transport_gap", "", "count", "real time: how often something went missing on the way", WARNING
     late_deliveries = (
         "late_deliveries", "", "total count p50_ms p99_ms max_ms worst worst_s", "real time: all deliveries, those "
-        "over 20 ms late beyond what restarts held back, how late they were, the processes with most of them, and "
-        "the seconds in which most were told of", _if_any, MEASURED)
+        "over 20 ms late, or early, beyond what restarts held back, how late they were, the processes with most of "
+        "them, and the seconds in which most were told of", _if_any, MEASURED)
     # fmt: on
 
 

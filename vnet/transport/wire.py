@@ -302,7 +302,7 @@ class Yield(Message, frozen=True):
 
 
 class Lateness(msgspec.Struct, frozen=True, array_like=True):
-    """Real time: delays of packets to their process, as counts in the bins of `lateness_bin`."""
+    """Real time: packets to their process by how late, or early, they came, in the bins of `lateness_bin`."""
 
     counts: Annotated[Sequence[PacketCount], msgspec.Meta(min_length=LATENESS_BINS, max_length=LATENESS_BINS)]
 
@@ -473,7 +473,7 @@ class Receipts:
         self._expected = batch.seq + 1
         late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
         for each_ns in late_ns:
-            self._lateness[lateness_bin(each_ns)] += 1
+            self._lateness[lateness_bin(abs(each_ns))] += 1  # early where a host's clock is slow, or was stopped
         if max(late_ns, default=0) >= LATENESS_LIMIT_NS:
             self._late.append((batch.seq, now_ns))
 

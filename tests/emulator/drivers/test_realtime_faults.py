@@ -318,6 +318,19 @@ def test_only_lateness_beyond_that_of_a_restart_counts(
     assert late_count(realtime, emulation) == (count, 1)
 
 
+@pytest.mark.parametrize("slow_ms", [15, 2000])
+def test_a_host_whose_clock_was_stopped_has_not_kept_up(slow_ms: int) -> None:
+    """By its clock deliveries come before they have arrived: its vehicles live in the past."""
+    realtime, emulation = started()
+    batch, receipts = late_batch(realtime, 10, 60)
+    (packet,) = batch.packets
+    receipts.take(batch, packet.received_ns - slow_ms * MS)
+    realtime.receive(1000 * MS, "v02", receipts.frames(b"n", wire.Traffic()))
+    (row,) = [row for row in emulation.engine.trace.to_table().to_pylist() if row["receiver"] == "v02"]
+    assert row["arrival_ns"] == packet.received_ns, "nothing was late by the emulator's clock"
+    assert late_count(realtime, emulation) == (slow_ms > 20, 1)
+
+
 def test_messages_lost_in_a_restart_are_no_gaps_of_the_machine() -> None:
     realtime, _ = started()
     frames = [wire.Frames(b"n", seq, 1, [], wire.Traffic()) for seq in range(9)]
