@@ -165,7 +165,7 @@ def _mean(rows: Rows, name: str) -> Mean | None:
 def _means(rows: Rows, varied: Sequence[str], titles: Mapping[str, str]) -> list[dict[str, Any]]:
     return [
         {**dict(zip(varied, values, strict=True)), "runs": len(group)}
-        | {title: "–" if (mean := _mean(group, name)) is None else str(mean) for name, title in titles.items()}
+        | {title: _shown(_mean(group, name), len(group)) or "–" for name, title in titles.items()}
         for values, group in _groups(rows, varied)
     ]
 
@@ -191,7 +191,14 @@ def _difference(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], na
         (one[name], two[name]) for one, two in pairs if _is_number(one.get(name)) and _is_number(two.get(name))
     ]
     size = max((abs(number) for pair in numbers for number in pair), default=0.0)
-    return str(mean_of([one - two for one, two in numbers], size)) if numbers else ""
+    return _shown(mean_of([one - two for one, two in numbers], size) if numbers else None, len(pairs))
+
+
+def _shown(mean: Mean | None, count: int) -> str:
+    """Return a mean as text, with its number in brackets where it is of fewer than `count`; "" for None."""
+    if mean is None:
+        return ""
+    return f"{mean} ({mean.count})" if mean.count < count else str(mean)
 
 
 def _failed(rows: Rows, varied: Sequence[str]) -> list[dict[str, Any]]:

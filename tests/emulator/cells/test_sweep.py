@@ -16,7 +16,7 @@ from emulator.cells import sweep as subject
 from emulator.cells.cells import WALL_CLOCK, Cell, compute, judged_figures, read_result
 from emulator.cells.sweep import SweepPlan, parse_shard
 from emulator.cli.studies import sweep as command
-from emulator.report.sweep_page import Mean, differences, mean_of
+from emulator.report.sweep_page import Mean, _means, differences, mean_of
 from emulator.scenario.loading import scenario_of
 from tests.support.cells import compute_here
 from tests.support.cli import command_app
@@ -235,12 +235,14 @@ def test_differences_are_of_pairs_in_each_combination(first: float, second: floa
     del rows[-1]  # a pair of which one is missing
     names = ["loss", "program.entry"]
     assert differences(rows, names, {"pdr": "PDR"}) == [
-        {"loss": first, "programs": "b − a", "pairs": 3, "PDR": "0.5 ± 0"},
+        {"loss": first, "programs": "b − a", "pairs": 3, "PDR": "0.5 ± 0 (2)"},
         {"loss": first, "programs": "c − a", "pairs": 3, "PDR": "0 ± 0"},
-        {"loss": second, "programs": "b − a", "pairs": 3, "PDR": "1.0 ± 6.4"},
+        {"loss": second, "programs": "b − a", "pairs": 3, "PDR": "1.0 ± 6.4 (2)"},
         {"loss": second, "programs": "c − a", "pairs": 2, "PDR": "0 ± 0"},
     ]
     assert differences(rows, ["loss"], {"pdr": "PDR"}) == []
+    of_b = [row for row in rows if row["program.entry"] == "b"]
+    assert [row["PDR"] for row in _means(of_b, ["loss"], {"pdr": "PDR"})] == ["2.0 ± 6.4 (2)", "2 ± 13 (2)"]
 
 
 def test_columns_of_several_kinds_are_texts() -> None:
