@@ -104,6 +104,8 @@ class Attachment:
         self._set_aside: deque[Item] = deque()
         self.on_message: Callable[[bytes], None] = no_wake
         self.time_ns: Callable[[], int | None] = no_time
+        self.hello_ns = 0
+        """Instant (monotonic ns) of its last hello: at the latest then it was ready."""
         self.frames_seq: int | None = None
         """Real time: number of `Frames` that have been said."""
         self.orphan_timeout_s = 5.0
@@ -189,6 +191,7 @@ class Attachment:
 
     def say_hello(self, ready: bool = False, failure: str | None = None) -> None:
         """Say hello for each node on its own `tx`."""
+        self.hello_ns = monotonic_ns()
         for node, publisher in self._publishers.items():
             hello = wire.Hello(
                 node,
@@ -598,10 +601,12 @@ class _RealTimeAgent:
     def _take(self, batch: wire.Batch, arrived_ns: int) -> None:
         if batch.origin_ns is not None and not self._started:
             head_start_ns = 0 if batch.start_ns else wire.HEAD_START_NS
-            here_ns = arrived_ns + head_start_ns - batch.start_ns
-            # By a clock that is shared the batch has not come before it was sent.
-            is_shared = self._boot_id != "" and self._boot_id == wire.boot_id() and batch.origin_ns <= here_ns
-            self._origin_ns = self._loop.origin_ns = batch.origin_ns if is_shared else here_ns
+            sent_ns = batch.origin_ns + batch.start_ns - head_start_ns
+            # By a clock that is shared the batch was sent once this process was ready, and before it came.
+            is_possible = self._attachment.hello_ns <= sent_ns <= arrived_ns
+            is_shared = is_possible and self._boot_id != "" and self._boot_id == wire.boot_id()
+            here_ns = batch.origin_ns if is_shared else batch.origin_ns + arrived_ns - sent_ns
+            self._origin_ns = self._loop.origin_ns = here_ns
             self._started = True
             head_start_s = max(0.0, (self._origin_ns + batch.start_ns - monotonic_ns()) / 1e9)
             self._loop.call_later(head_start_s, self._host.start, self._loop, self._programs)

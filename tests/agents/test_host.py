@@ -136,8 +136,8 @@ def test_a_message_of_the_backbone_that_has_come_while_the_program_computed_is_n
 
 @pytest.mark.parametrize(
     ("origin_s", "namespace", "is_shared"),
-    [(-0.05, "", True), (500.0, "", False), (-100.0, "time:[5]", False)],
-    ids=["the same clock", "one that is ahead", "one of another time namespace"],
+    [(-0.05, "", True), (500.0, "", False), (-100.0, "", False), (-0.05, "time:[5]", False)],
+    ids=["the same clock", "one that is ahead", "one that is behind", "one of another time namespace"],
 )
 def test_a_vehicle_begins_with_batch_0_where_the_emulator_s_clock_is_not_its_own(
     origin_s: float, namespace: str, is_shared: bool, monkeypatch: pytest.MonkeyPatch
@@ -145,7 +145,7 @@ def test_a_vehicle_begins_with_batch_0_where_the_emulator_s_clock_is_not_its_own
     welcome = emulation_of(scenario_of((), "agents.beacon:main")).welcome("v01", b"n")
     if namespace:
         monkeypatch.setattr("os.readlink", lambda path: namespace)
-    attached: Any = SimpleNamespace(nonce=b"n", units=None)
+    attached: Any = SimpleNamespace(nonce=b"n", units=None, hello_ns=time.monotonic_ns() - 10**9)
     agent = _RealTimeAgent(attached, [welcome], {}, None)
     starts_s: list[float] = []
     loop = SimpleNamespace(origin_ns=0, call_later=lambda delay_s, *_: starts_s.append(delay_s))

@@ -82,6 +82,25 @@ def test_in_real_time_they_take_part_as_well(tmp_path: Path) -> None:
     assert {"v01", "v02", "v04"} >= receivers_of(done, "v03") >= {"v01"}
 
 
+UNSHARE = ["unshare", "--time", "--kill-child", "--monotonic"]
+
+
+def test_in_real_time_agents_in_another_time_namespace_begin_with_the_run(tmp_path: Path) -> None:
+    """Their monotonic clocks are behind or ahead of the emulator's, and the boot id is the same."""
+    if subprocess.run([*UNSHARE, "1", "true"], capture_output=True, check=False).returncode != 0:
+        pytest.skip("time namespaces are not permitted here")
+    folder = tmp_path / "run"
+    agents = [AGENT, [*UNSHARE, "-500", *AGENT], [*UNSHARE, "5", *AGENT], [*UNSHARE, "5", *FOREIGN]]
+    with ExitStack() as stack:
+        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--pacing", "realtime")
+        for node, agent in zip(NODES, agents, strict=True):
+            start(stack, agent, node, endpoint, folder)
+        done = finish(emulator, folder)
+    assert {row["sender"] for row in done.trace()} == set(NODES)
+    (late,) = done.events_of("late_deliveries")
+    assert late["max_ms"] < 4000
+
+
 def receivers_of(done: Finished, sender: str) -> set[str]:
     return {row["receiver"] for row in done.trace() if row["sender"] == sender and row["outcome"] == "delivered"}
 
