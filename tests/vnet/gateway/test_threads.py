@@ -258,6 +258,17 @@ def test_moments_are_of_the_classes_that_compiled_code_looks_for(drive: Drive) -
     assert datetime.datetime.now().year > 2025, "of the tests' own"
 
 
+@pytest.mark.usefixtures("elsewhere")
+def test_local_time_is_utc_by_name_too(drive: Drive) -> None:
+    run = drive("""
+        import datetime, time
+        now, zone = time.localtime(), datetime.datetime.now().astimezone().tzname()
+        print(time.strftime("%Z"), time.strftime("%Z %z", now), now.tm_zone, *time.tzname, zone)
+        print(now == time.gmtime() == time.localtime(time.time()), time.ctime())
+        """)
+    assert printed(run) == ["UTC UTC +0000 UTC UTC UTC UTC", "True Wed Jan  1 00:00:00 2025"]
+
+
 def test_modules_beside_the_script_are_each_vehicles_own(drive: Drive, tmp_path: Path) -> None:
     package = tmp_path / "cars"
     package.mkdir()

@@ -569,8 +569,8 @@ class ProgramModules:
         def seconds(clock: int) -> float:
             return ns(clock) / NS_PER_S
 
-        def utc(at: float | None = None) -> time.struct_time:
-            return time.gmtime(seconds(time.CLOCK_REALTIME) if at is None else at)
+        def moment(at: float | None = None) -> float:
+            return seconds(time.CLOCK_REALTIME) if at is None else at
 
         own: dict[str, Any] = {
             "time": partial(seconds, time.CLOCK_REALTIME),
@@ -582,10 +582,11 @@ class ProgramModules:
             "clock_gettime": seconds,
             "clock_gettime_ns": ns,
             "sleep": sleep,
-            **dict.fromkeys(["gmtime", "localtime"], utc),
-            "ctime": lambda at=None: time.asctime(utc(at)),
-            "asctime": lambda at=None: time.asctime(at or utc()),
-            "strftime": lambda form, at=None: time.strftime(form, at or utc()),
+            "gmtime": lambda at=None: time.gmtime(moment(at)),
+            "localtime": lambda at=None: time.localtime(moment(at)),
+            "ctime": lambda at=None: time.ctime(moment(at)),
+            "asctime": lambda at=None: time.asctime(at or time.localtime(moment())),
+            "strftime": lambda form, at=None: time.strftime(form, at or time.localtime(moment())),
         }
         # As those of `time`, they make no methods of classes that have them.
         return facade(time, **{name: staticmethod(each) if callable(each) else each for name, each in own.items()})
