@@ -320,6 +320,20 @@ def test_signals_to_itself_and_hard_exits_end_a_program_alone(drive: Drive) -> N
     assert "-9" in crashes["v03"] and "program0.py" in crashes["v03"]
 
 
+def test_an_interrupt_that_ends_a_program_is_told_with_its_line(drive: Drive) -> None:
+    text = """
+        import os, signal, sys, threading, time
+        interrupt = lambda: os.kill(os.getpid(), signal.SIGINT)
+        if sys.argv[1] == "v01":
+            interrupt()
+        threading.Timer(0.5, interrupt).start()
+        time.sleep(100)
+        """
+    told = {event["node"]: event for event in events(drive(text, vehicles=2), "crashed")}
+    assert {node: each["place"] for node, each in told.items()} == {"v01": "program0.py:3", "v02": "program0.py:7"}
+    assert all(each["error"].endswith("ended with 130") for each in told.values())
+
+
 def test_alarms_ring_by_emulated_time_and_end_a_wait(drive: Drive) -> None:
     run = drive("""
         import signal, time

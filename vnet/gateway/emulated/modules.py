@@ -335,7 +335,7 @@ class ProgramModules:
         except KeyboardInterrupt as interrupt:
             if interrupt is not self.process.interrupt:  # of the whole process
                 raise
-            leave = SystemExit(INTERRUPTED)
+            leave = SystemExit(INTERRUPTED).with_traceback(interrupt.__traceback__)
         except Exception as error:
             hook: Any = vars(self.load("sys"))["excepthook"]
             if hook is not sys.excepthook:
