@@ -78,6 +78,8 @@ class _Vehicle:
     fragments: Fragments | None = None
     acknowledges: bool = False
     is_ready: bool = False
+    has_begun: bool = False
+    """True from batch 0 on, by which the run no longer waits for its programs."""
     on_air: bool = False
     """True from time 0, or from its return, on."""
     early: dict[object, tuple[str, Any]] = field(default_factory=dict)
@@ -265,7 +267,7 @@ class Gateways:
         if vehicle is None:
             return False
         node, words = vehicle.gateway.node_id, vehicle.commands.pop(name)
-        crash = self._crash(vehicle, name, words) if vehicle.on_air else None
+        crash = self._crash(vehicle, name, words) if vehicle.has_begun else None
         if crash is not None:
             others, vehicle.commands = vehicle.commands, {}
             self._spawn(self._wait_or_kill(self._told_to_end(others)))
@@ -395,7 +397,8 @@ class Gateways:
     def _take_batch(self, vehicle: _Vehicle, batch: wire.Batch) -> None:
         now_ns = self._now_ns()
         vehicle.receipts.take(batch, now_ns)
-        if batch.origin_ns is not None and not vehicle.on_air:
+        if batch.origin_ns is not None and not vehicle.has_begun:
+            vehicle.has_begun = True
             delay_s = max(batch.origin_ns + batch.start_ns - time.monotonic_ns(), 0) / NS_PER_S
             turn = self._emulation.number[vehicle.gateway.node_id] / len(self._emulation.number)
             turn_s = 0.0 if batch.start_ns else TURNS_S * turn  # who comes back is alone

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from emulator.drivers.launch import Exit
 from emulator.drivers.live.gateway import Gateway
 from emulator.drivers.live.gateways import Gateways
 from emulator.drivers.live.supervisor import ChangeSignal
@@ -15,6 +16,7 @@ from tests.emulator.drivers.live.fakes import FakeLauncher, on_a_loop
 from tests.support.multi_loop_driver import emulation_of
 from vnet.gateway.frames import CrossingSample, CrossingTokens, Message, Reassembly
 from vnet.gateway.radio_side import RadioSide
+from vnet.runtime.error_text import write_report
 from vnet.transport import wire
 from vnet.transport.access import Access
 from vnet.units import NS_PER_S
@@ -134,6 +136,24 @@ async def test_a_vehicle_that_ends_before_its_turn_sends_what_it_has_put(monkeyp
     _, node, (frames, _) = await rig.told.get()
     assert (node, list(frames.traffic.frames)) == ("v03", [])
     assert [each.text for each in frames.traffic.notes] == ["1 frame not sent: the vehicle has ended"]
+    await rig.gateways.close()
+
+
+@on_a_loop
+async def test_a_command_that_fails_between_batch_0_and_the_start_has_crashed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig(monkeypatch, 1, {})
+    await rig.welcome("v01")
+    vehicle = rig.gateways._vehicles["v01"]
+    vehicle.commands["v01"] = "python drive.py"
+    write_report(str(rig.gateways._failure_path(vehicle, "v01")), KeyError("calibration"), None, "drive.py:9")
+    rig.gateways.send("v01", wire.Batch([], 0, origin_ns=0))
+    assert rig.gateways.takes_end("v01", Exit(1, "")) and not vehicle.on_air
+    what, node, item = await rig.told.get()
+    assert (what, node) == ("frames", "v01")
+    (ending,) = item[0].traffic.endings
+    assert (ending.kind, ending.error, ending.place) == ("crashed", "KeyError: 'calibration'", "drive.py:9")
     await rig.gateways.close()
 
 
