@@ -423,27 +423,26 @@ def test_on_a_map_none_that_misses_its_period_is_used_twice(late: list[str]) -> 
     assert 0.3 < share.min() <= share.max() < 1
 
 
-@pytest.mark.parametrize("liars", [["v0"], ["v0", "v4"]])
-@pytest.mark.parametrize("always_new", [False, True])
-@pytest.mark.parametrize(("off_m", "claim"), [(1.0, 0.5), (5.0, 0.05)])
+@pytest.mark.parametrize(("liars", "always_new"), [(["v0"], True), (["v0", "v4"], False)])
+@pytest.mark.parametrize(("off_m", "claim"), [(1.0, 0.5), (5.0, 0.1)])
 def test_increments_of_origins_that_are_invented_hardly_draw(
     liars: list[str], always_new: bool, off_m: float, claim: float
 ) -> None:
-    """Thirty a period, which one of ten lists, or two list alike."""
-    network = Network(10)
-    network.run(60)
-    false = np.zeros(30, dtype=PASSED)
+    """Twenty a period, which one of eight lists, or two list alike."""
+    network = Network(8)
+    network.run(30)
+    false = np.zeros(20, dtype=PASSED)
     false["information"] = claim, 0.0, claim, claim * (COMMON_M[0] + off_m), claim * COMMON_M[1]
 
     def lie(name: str, frame: InformationFrame) -> InformationFrame:
         if name not in liars:
             return frame
-        false["name"] = np.arange(30) + (30 * network.period if always_new else 0)
+        false["name"] = np.arange(20) + (20 * network.period if always_new else 0)
         return replace(frame, passed=np.concatenate([frame.passed, false]))
 
-    network.run(100, lie)
+    network.run(50, lie)
     honest_m = [m for name, m in zip(network.ids, network.errors_m(), strict=True) if name not in liars]
-    assert np.sqrt(np.mean(np.square(honest_m))) < 0.5
+    assert np.sqrt(np.mean(np.square(honest_m))) < 0.5 * off_m
 
 
 def test_who_passes_on_what_a_liar_claims_is_still_heard() -> None:
