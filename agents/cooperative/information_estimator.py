@@ -483,10 +483,10 @@ class InformationEstimator:
             if share >= 1:
                 continue
             a, b, d, x, y = increment
-            if d < 0:
+            if is_of_lane(increment) != has_joined:
+                continue  # those about c are too old for precise receivers, those of lanes nothing to others
+            if has_joined:
                 increment = scaled_by(increment, 1 - share)
-            elif has_joined:
-                continue  # c has moved since, which precise receivers see
             else:
                 left = (PASSED_SHARE if self._lanes is None else 1.0) * (1 - share)
                 increment = left * a, left * b, left * d, left * x, left * y

@@ -428,16 +428,17 @@ def test_on_a_map_none_that_misses_its_period_is_used_twice(late: list[str]) -> 
 def test_increments_of_origins_that_are_invented_hardly_draw(
     liars: list[str], always_new: bool, off_m: float, claim: float
 ) -> None:
-    """Twenty a period, which one of eight lists, or two list alike."""
+    """Twenty a period, which one of eight lists, or two list alike; as many are about lanes, and say the same."""
     network = Network(8)
     network.run(30)
-    false = np.zeros(20, dtype=PASSED)
-    false["information"] = claim, 0.0, claim, claim * (COMMON_M[0] + off_m), claim * COMMON_M[1]
+    false = np.zeros(40, dtype=PASSED)
+    false["information"][:20] = claim, 0.0, claim, claim * (COMMON_M[0] + off_m), claim * COMMON_M[1]
+    false["information"][20:] = np.sqrt(claim), 0.0, -1.0, np.sqrt(claim) * (COMMON_M[0] + off_m), 1.0
 
     def lie(name: str, frame: InformationFrame) -> InformationFrame:
         if name not in liars:
             return frame
-        false["name"] = np.arange(20) + (20 * network.period if always_new else 0)
+        false["name"] = np.arange(40) + (40 * network.period if always_new else 0)
         return replace(frame, passed=np.concatenate([frame.passed, false]))
 
     network.run(50, lie)
