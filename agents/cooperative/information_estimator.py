@@ -490,8 +490,8 @@ class InformationEstimator:
             else:
                 left = (PASSED_SHARE if self._lanes is None else 1.0) * (1 - share)
                 increment = left * a, left * b, left * d, left * x, left * y
-                if len(rows) < LEAST_LISTERS and rows[0] >= first_hand:
-                    by_few[len(records)] = rows
+            if len(rows) < LEAST_LISTERS and rows[0] >= first_hand:
+                by_few[len(records)] = rows
             records.append(record)
             origins.append(code)
             increments.append(increment)
@@ -521,10 +521,9 @@ class InformationEstimator:
         unknown is judged as one; of two senders by the one that lists less.
         """
         traces: dict[int, float] = {}
-        for n, rows in by_few.items():
-            a, _, d, _, _ = increments[n]
+        for trace, rows in zip(traces_of([increments[n] for n in by_few]), by_few.values(), strict=True):
             for row in rows:
-                traces[row] = traces.get(row, 0.0) + a + d
+                traces[row] = traces.get(row, 0.0) + trace
         limit, known, codes = SENDER_FACTOR * self._largest_increment, self._origins.known, [*origins]
         for n, rows in by_few.items():
             row = min(rows, key=traces.__getitem__) if len(rows) > 1 else rows[0]
