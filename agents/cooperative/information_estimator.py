@@ -218,12 +218,15 @@ class InformationEstimator:
         """Advance to the time of the vehicle's own fix, and take it; once a period."""
         if own.time_ns <= self._now_ns:
             return
-        dt_s, self._now_ns = (own.time_ns - self._now_ns) / NS_PER_S, own.time_ns
+        since_ns, self._now_ns = own.time_ns - self._now_ns, own.time_ns
+        if since_ns > self._period_ns:
+            self._passing.use(*[[passed_record(self._code, _NOTHING)]] * 2)  # of the period before nothing is known
         multipath = own.multipath_sigma_m, own.multipath_tau_s
         seen = Observation(
             own.position_m, own.covariance_m2, own.heading_rad, multipath=multipath, speed_m_s=own.speed_m_s
         )
         fix = seen if usable(own) else None
+        dt_s = since_ns / NS_PER_S
         said = self._lanes.step(dt_s, fix) if self._lanes else self.own.step(dt_s, fix).numbers
         increment = as_sent(said)
         largest = max(map(abs, increment))
@@ -243,9 +246,10 @@ class InformationEstimator:
         frames, late_frames = self._current_frames()
         heard, late = HeardFrames.of(frames.values()), HeardFrames.of(late_frames.values())
         if self._lanes:
-            self._lanes.join(heard.increments)
+            self._lanes.join(heard.increments, late.increments)
         self._compare(heard, own)
-        if self._begins_again(heard.priors):
+        missing = [late.priors[n] for n, name in enumerate(late_frames) if name not in frames]
+        if self._begins_again(own, heard, missing):
             own, frames, late_frames = plain_moments(*self._prior), {}, {}  # the new belief is what they know
             heard = late = HeardFrames()
         # Of all that follows what this vehicle says itself is the first.
@@ -259,7 +263,8 @@ class InformationEstimator:
             self.mean_m = tracked_mean(middle_m, self.mean_m, self.limit_m / SPREAD_GATE)
         limited, increments = self._limited(heard, priors)
         self._weighed = list(frames)
-        weights = self._weights = self._weigh(heard, means_m, own[2] + own[4], leaning)
+        punctual_share = len(frames) / max(len(frames) + len(late_frames), 1)
+        weights = self._weights = self._weigh(heard, means_m, own[2] + own[4], leaning, punctual_share)
         passed, onward = self._passed_on(heard, late.records, weights[1:])
         self.imported = len(frames) + len(passed)
         self._pass_on(heard, onward, own[2] + own[4])
@@ -327,7 +332,8 @@ class InformationEstimator:
     def _compare(self, heard: HeardFrames, own: Five) -> None:
         """Find the shares (n,) of their priors and of their increments that are used.
 
-        `own` is the mean and the covariance of the vehicle's own prior.
+        `own` is the mean and the covariance of the vehicle's own prior. Who has been heard lately and is not now
+        contradicts nobody: in some periods a few are most of those that are heard.
         """
         self._prior_shares = self._used_shares = [1.0] * len(heard.codes)
         if not self._options.defence or not heard.codes:
@@ -336,7 +342,7 @@ class InformationEstimator:
         self._prior_shares = prior_shares(heard.moments, own)
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
         used = self._shares_used(heard.codes, heard.increments, belief, False)
-        self._used_shares = relative_to_most(used)
+        self._used_shares = relative_to_most(used, self._silent(heard))
         if min(self._prior_shares) < 1 or min(self._used_shares) < 1:
             self._reject("prior", sum(share < COUNTED_SHARE for share in self._prior_shares))
             self._reject("increment", sum(share < COUNTED_SHARE for share in self._used_shares))
@@ -346,15 +352,22 @@ class InformationEstimator:
         if count:
             self.rejected[reason] += count
 
-    def _begins_again(self, priors: Sequence[Five]) -> bool:
+    def _silent(self, heard: HeardFrames) -> int:
+        """Return the number of vehicles that have been heard lately, and are not in this period."""
+        return max(0, len(self._share.heard) - len(heard.codes))
+
+    def _begins_again(self, own: Five, heard: HeardFrames, late: Sequence[Five]) -> bool:
         """Begin again at the median of what the others know, if most have contradicted this vehicle for long.
 
-        Returns whether it did. A period in which nothing is heard says neither.
+        Returns whether it did. The others are those that are `heard`, with the priors of `late` frames of others; a
+        period in which nothing is heard says neither.
         """
+        priors = [*heard.priors, *late]
         if not priors:
             return False
-        far = len(self._prior_shares) - self._prior_shares.count(1.0)
-        contradicted = len(priors) >= LOST_NEIGHBOURS and 2 * far > len(priors)
+        shares = self._prior_shares + (prior_shares([plain_moments(*prior) for prior in late], own) if late else [])
+        far = len(shares) - shares.count(1.0)
+        contradicted = len(shares) >= LOST_NEIGHBOURS and 2 * far > max(len(shares), len(self._share.heard))
         self._contradicted = self._contradicted + 1 if contradicted else 0
         if self._contradicted < LOST_PERIODS:
             return False
@@ -404,7 +417,7 @@ class InformationEstimator:
         if not self._options.defence:
             return priors, increments
         own, largest = traces_of([self._increment, self._prior])
-        traces = sorted(traces_of(increments))
+        traces = sorted([*traces_of(increments), *[own] * self._silent(heard)])
         usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
         self._largest_increment = max(usual, self.own.largest_increment)
         if traces[-1] > self._largest_increment:
@@ -421,11 +434,13 @@ class InformationEstimator:
         means_m: Sequence[tuple[float, float]],
         own_variance_m2: float,
         leaning: list[bool] | None,
+        punctual_share: float,
     ) -> list[float]:
         """Return the weights (1 + n,) of the priors.
 
         They have means (1 + n,), and the own a covariance with this trace. The weight of who is always to one side,
-        `leaning` (n,), goes to the vehicle itself, and of who is far off in part.
+        `leaning` (n,), goes to the vehicle itself, and of who is far off in part, and that of late frames, which
+        `punctual_share` leaves: few that are heard in time are not to speak for all.
         """
         self._rule.notice(heard.largest_degrees, len(self._share.heard))
         variances_m2 = [own_variance_m2, *heard.variances_m2]
@@ -433,29 +448,28 @@ class InformationEstimator:
         if self._options.defence:
             leaning = leaning or [False] * len(heard.codes)
             each = zip(weights[1:], self._prior_shares, leaning, strict=True)
-            others = [0.0 if leans else (1 - SELF_SHARE) * share * weight for weight, share, leans in each]
+            most = (1 - SELF_SHARE) * punctual_share
+            others = [0.0 if leans else most * share * weight for weight, share, leans in each]
             weights = [1 - math.fsum(others), *others]
         return weights
 
     # What is passed on.
 
     def _pass_on(self, heard: HeardFrames, onward: list[bytes], variance_m2: float) -> None:
-        """Take what the next frame passes on: the increments heard, and `onward`, which others have passed on.
+        """Take what the next frame passes on: the increments heard and used, and `onward`, which others passed on.
 
         `variance_m2` is the trace of the vehicle's own covariance of c.
         """
-        used = [passed_record(self._code, self._increment), *heard.records]
-        if not self._is_rare:
-            self._passing.use(used, used)
-            return
-        least = LEAST_SHARE * (self._prior[0] + self._prior[2])
-        told = zip(heard.records, heard.increments, strict=True)
-        further = map(passed_increment.cached, onward if variance_m2 > 2 * self._moves_m2 else [])
-        self._passing.use(
-            used,
-            [used[0], *[record for record, (a, _, d, _, _) in told if a + d >= least]],
-            [record for record, (_, (a, _, d, _, _)) in zip(onward, further, strict=False) if a + d >= least],
-        )
+        own = passed_record(self._code, self._increment)
+        least, further = 0.0, list[bytes]()
+        if self._is_rare:
+            least = LEAST_SHARE * (self._prior[0] + self._prior[2])
+            if variance_m2 > 2 * self._moves_m2:
+                traces = traces_of([passed_increment.cached(record)[1] for record in onward])
+                further = [record for record, trace in zip(onward, traces, strict=True) if trace >= least]
+        each = zip(heard.records, traces_of(heard.increments), self._used_shares, strict=True)
+        told = [record for record, trace, share in each if share >= COUNTED_SHARE and trace >= least]
+        self._passing.use([own, *heard.records], [own, *told], further)
 
     def _passed_on(
         self, heard: HeardFrames, late: Records, weights: Sequence[float]

@@ -542,13 +542,15 @@ class LaneExchange:
         self.follow_own()
         self._lane = self._lane_of = None
 
-    def join(self, increments: Sequence[Five]) -> None:
-        """Begin again with the age of the oldest memories that are heard.
+    def join(self, increments: Sequence[Five], late: Sequence[Five] = ()) -> None:
+        """Begin again with the age of the oldest memories that are heard; `late` ones are of the period before.
 
         A vehicle that has joined does so at most once in `MEMORY_S`: whoever claims an older memory in each period
         would stop the exchange.
         """
         ages = [round(increment[4]) for increment in increments if is_of_lane(increment)]
+        then = [round(increment[4]) for increment in late if is_of_lane(increment)]
+        ages += [age + 1 if age >= 0 else age for age in then]
         oldest = max(ages, default=-1)
         if self.has_joined:
             if oldest > self._memory.age and self._since_older_s >= MEMORY_S:

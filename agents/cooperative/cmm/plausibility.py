@@ -155,9 +155,13 @@ def cut_to(off_m: list[tuple[float, float]], limit_m: float) -> list[tuple[float
     return [(x * part, y * part) for (x, y), part in zip(off_m, share, strict=True)]
 
 
-def relative_to_most(shares: list[float]) -> list[float]:
-    """Return shares relative to their median: where most are below 1, what is believed is wrong, and not they."""
-    middle = sorted(shares)[len(shares) // 2] if len(shares) >= MAJORITY - 1 else 1.0
+def relative_to_most(shares: list[float], silent: int = 0) -> list[float]:
+    """Return shares relative to their median: where most are below 1, what is believed is wrong, and not they.
+
+    So many as are `silent` contradict nobody.
+    """
+    count = len(shares) + silent
+    middle = sorted(shares)[count // 2] if MAJORITY - 1 <= count < 2 * len(shares) else 1.0
     return shares if middle >= 1 else [min(1.0, share / max(middle, _TINY)) for share in shares]
 
 
