@@ -455,12 +455,19 @@ class CampaignRun:
         trial = self.again if self.again is not None and self.again.failed else self.trial
         texts = {name: trial.texts[name] for name in trial.failed}
         told = {column_of(name) for name in texts}
-        for name in self.trial.failed:
-            if column_of(name) not in told:
-                texts[name] = f"{self.trial.texts[name]}; not in the shrunk run"
+        texts |= {name: self.trial.texts[name] for name in self.trial.failed if column_of(name) not in told}
         if self.again is not None and self.again.verdicts and not self.again.failed:
             texts["replay"] = "it failed, and did not when it was run again"
         return texts
+
+    def told(self) -> dict[str, str]:
+        """Return `texts` for those who look into the folder, with a note on the checks that did not fail there."""
+        kept = {column_of(name) for name in (self.again.failed if self.again is not None else ())}
+        note = "not when it was run again" if self.shrunk == self.scenario else "not in the shrunk run"
+        return {
+            name: f"{text}; {note}" if kept and column_of(name) not in kept else text
+            for name, text in self.texts().items()
+        }
 
     def as_json(self) -> dict[str, Any]:
         """The run's part of campaign.json."""
@@ -473,7 +480,7 @@ class CampaignRun:
         }
         if self.folder is not None:
             row |= {
-                "failed": self.texts(),
+                "failed": self.told(),
                 "shrunk": self.schedule(),
                 "order": self.order(),
                 "steps": self.steps,
@@ -633,7 +640,7 @@ class Campaign:
             explanation = explain(shrunk, folder, other, self._workshop)
             outcome = replace(outcome, explanation=explanation)
             write_atomically(folder / PARTING_FILE, explanation.text())
-            write_failure_page(folder, title, outcome.texts(), explanation)
+            write_failure_page(folder, title, outcome.told(), explanation)
         return outcome
 
     def _smallest(self, outcome: CampaignRun, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
@@ -680,7 +687,7 @@ class Campaign:
         return {
             "number": outcome.label,
             "seed": outcome.seed,
-            "checks": outcome.texts(),
+            "checks": outcome.told(),
             "schedule": outcome.schedule(),
             "order": outcome.order(),
             "command": _reproduction(outcome.folder.absolute(), outcome.trial.failed),

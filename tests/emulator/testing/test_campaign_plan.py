@@ -9,8 +9,9 @@ from emulator.report.index import write_index
 from emulator.scenario.faults import KINDS, Delay, Drawn, GnssJump
 from emulator.scenario.loading import load_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.testing.campaign import FailureKind, count_verdicts, failure_kinds, page
+from emulator.testing.campaign import CampaignRun, FailureKind, count_verdicts, failure_kinds, page
 from emulator.testing.campaign_plan import Plan, parse_ranges, simulated_kinds
+from emulator.testing.trial import Trial, with_faults
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 
@@ -88,6 +89,24 @@ def test_failures_that_differ_in_numbers_and_names_are_of_one_kind() -> None:
     ]
     text = page("Campaign", [], {}, [], failure_kinds(failures))
     assert '<td class="number">2</td><td>agents_alive</td><td><a href="#failure-004">004</a>: 1 of 10 nodes' in text
+
+
+def test_a_failure_that_only_some_kept_runs_show_again_is_of_one_kind_and_noted() -> None:
+    one = Trial.failure("growth", "x holds 1e9")
+    both = Trial(one.verdicts | {"own:unpaused": Verdict.INVALID}, one.texts | {"own:unpaused": "1 pauses"})
+    drawn = scenario(2.0, 0.5)
+    same, less = with_faults(drawn, drawn.fault), with_faults(drawn, ())
+    runs = [
+        CampaignRun(n + 1, drawn, both, each, again)
+        for n, (each, again) in enumerate([(same, both), (same, one), (less, one)])
+    ]
+    assert {kind.check: kind.runs for kind in failure_kinds((r.label, r.texts()) for r in runs)} == {
+        "growth": 3,
+        "own:unpaused": 3,
+    }
+    kept, again, shrunk = (run.told()["own:unpaused"] for run in runs)
+    assert kept == "1 pauses" and again != kept and "shrunk" not in again and "not in the shrunk run" in shrunk
+    assert all(run.told()["growth"] == "x holds 1e9" for run in runs)
 
 
 def test_the_list_of_runs_has_the_campaigns(tmp_path: Path) -> None:
