@@ -483,7 +483,7 @@ def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
     computed = verdict_figures(recorded, rows_of(recorded.metrics)) | dict(_of_the_course(recorded))
     if record.format < 4:  # which left out some
         computed["figures"] = {name: value for name, value in computed["figures"].items() if name in record.figures}
-    if record.format < FIRST_WITH_RATIO:
+    if record.format < 3 or (record.format < FIRST_WITH_RATIO and recorded.down):  # whose definition differs
         del computed["packet_delivery_ratio"]
     wrong = [
         {"figure": path, "kept": ours, "computed": theirs}

@@ -186,6 +186,17 @@ def test_a_delivery_ratio_of_an_earlier_definition_is_neither_shown_nor_wrong(co
     assert "verdict_file" in broken(check_run(copy)), "whatever else it has meant the same"
 
 
+def test_a_delivery_ratio_of_an_earlier_definition_is_judged_where_it_is_the_same(tmp_path: Path) -> None:
+    folder = simulated(tmp_path / "run", fault=[], program={"entry": "agents.beacon:main"})
+    of_format(4)(folder)
+    forge(folder)
+    assert broken(check_run(folder)) == set()
+    says("packet_delivery_ratio", 0.5)(folder)
+    forge(folder)
+    assert RecordedRun.open(folder).record.packet_delivery_ratio == 0.5
+    assert broken(check_run(folder)) == {"verdict_file"}
+
+
 def test_a_log_is_of_the_manifest_whatever_its_vehicle_is_called(copy: Path) -> None:
     (copy / "logs" / PROGRAMS_LOG).write_text("what programs printed\n")
     (copy / "logs" / "programs.log").write_text("of a vehicle\n")
