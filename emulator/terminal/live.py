@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -28,12 +29,19 @@ _ERASE_AND_UP = ((ControlType.ERASE_IN_LINE, 2), (ControlType.CURSOR_UP, 1))
 class SafeConsole(Console):
     """A console whose own colours are the only escape sequences that reach the terminal.
 
-    Control characters are shown as escapes, and markup in texts has no effect.
+    Control characters are shown as escapes, and markup in texts has no effect. A size of 0 in the environment is
+    one that is not known.
     """
 
     def __init__(self, file: IO[str] | None = None, stderr: bool = False, colours: bool = True) -> None:
+        unknown = [name for name in ("COLUMNS", "LINES") if not os.environ.get(name, "").strip("0")]
         super().__init__(
-            file=file, stderr=stderr, markup=False, emoji=False, color_system="auto" if colours else None
+            file=file,
+            stderr=stderr,
+            markup=False,
+            emoji=False,
+            color_system="auto" if colours else None,
+            _environ={name: value for name, value in os.environ.items() if name not in unknown},
         )
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:

@@ -50,6 +50,18 @@ def test_control_characters_are_shown_in_whatever_holds_them() -> None:
     assert "[/red] :smile:" in printed(HOSTILE)
 
 
+@pytest.mark.parametrize("value", ["", "0", "00"])
+def test_a_size_of_zero_in_the_environment_is_not_known(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    for name in ("COLUMNS", "LINES"):
+        monkeypatch.delenv(name, raising=False)
+    size = SafeConsole(io.StringIO()).size
+    for name in ("COLUMNS", "LINES"):
+        monkeypatch.setenv(name, value)
+    assert SafeConsole(io.StringIO()).size == size and "all that there is" in printed("all that there is")
+    monkeypatch.setenv("COLUMNS", "33")
+    assert SafeConsole(io.StringIO()).width == 33
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     network, program = {"vehicles": 3}, {"entry": "agents.beacon:main"}
