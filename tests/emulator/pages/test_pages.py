@@ -149,3 +149,5 @@ def test_every_file_of_the_packages_is_shipped() -> None:
     files = (path for name in ("vnet", "agents", "emulator") for path in (ROOT / name).rglob("*"))
     others = {path for path in files if path.is_file() and path.suffix not in (".py", ".pyc")}
     assert others and others <= shipped
+    marked = {folder for folder, pattern in patterns if pattern == "py.typed" and (folder / pattern).is_file()}
+    assert marked == {ROOT / name for name in ("vnet", "agents", "emulator")}, "all of them have types"
