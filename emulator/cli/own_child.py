@@ -44,6 +44,8 @@ class OwnChild:
         The folder of its run is then removed. Where no vehicle has, the parent ends as the child did. A vehicle
         whose code runs for `stall_limit_s` without a pause ends it, too: after Ctrl-C as a second one would.
         """
+        from emulator.records.run_folder import MANIFEST_FILE  # slow to import, and --help does without
+
         sys.stdout.flush()
         sys.stderr.flush()
         in_foreground = interrupts.is_in_foreground()
@@ -89,8 +91,11 @@ class OwnChild:
         forwarded |= signal.sigpending() & set(heeded)
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
         ended = os.waitstatus_to_exitcode(waited[1])
-        # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short.
-        if (vehicle or folder) and (self.ending == "stalled" or ended != -signal.SIGKILL) and not forwarded:
+        # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short. Once
+        # all files are written, a fatal signal while no vehicle's code runs takes nothing from the run.
+        is_over = not vehicle and ended < 0 and (Path(folder) / MANIFEST_FILE).exists()
+        by_vehicle = self.ending == "stalled" or (ended != -signal.SIGKILL and not is_over)
+        if (vehicle or folder) and by_vehicle and not forwarded:
             running_node.running.show("")
             shutil.rmtree(folder, ignore_errors=True)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -111,7 +111,7 @@ def test_what_a_program_has_started_ends_with_the_simulation(tmp_path: Path, pro
 LATER = """
 import atexit, ctypes, os, pathlib, threading
 def end():
-    while not pathlib.Path("run/world.npz").exists():  # the first of the files that are written after a run
+    while not pathlib.Path("run/AFTER").exists():
         pass
     END
 async def main(node):
@@ -122,15 +122,23 @@ async def main(node):
 """
 
 
-def later(folder: Path, begin: str, end: str) -> subprocess.CompletedProcess[str]:
+def later(folder: Path, begin: str, end: str, after: str = "world.npz") -> subprocess.CompletedProcess[str]:
+    """Run a program that ends so once a file is there, by default the first of those written after a run."""
     words = command(folder, "")
-    (folder / "deadly.py").write_text(LATER.replace("BEGIN", begin).replace("END", end))
+    (folder / "deadly.py").write_text(LATER.replace("BEGIN", begin).replace("END", end).replace("AFTER", after))
     return run(words, cwd=folder, capture_output=True, timeout=TIMEOUT_S)
 
 
 def test_a_thread_that_ends_the_process_before_the_command_has_ended_is_no_pass(tmp_path: Path) -> None:
     begin, end = "threading.Thread(target=end, daemon=True).start()", "ctypes.CDLL(None)._exit(0)"
     assert later(tmp_path, begin, end).returncode in (1, 2)
+
+
+def test_a_fatal_signal_once_all_is_written_leaves_the_run_as_it_is(tmp_path: Path) -> None:
+    begin = "threading.Thread(target=end, daemon=True).start()"
+    assert later(tmp_path, begin, "os.abort()", after="manifest.json").returncode == -signal.SIGABRT
+    assert (tmp_path / "run" / "trace.parquet").exists() and died(tmp_path / "run") == set()
+    assert json.loads((tmp_path / "run" / "verdict.json").read_text())["verdict"] == "valid"
 
 
 @pytest.mark.parametrize("end", ["while True: pass", "os._exit(1)"])
