@@ -220,7 +220,8 @@ class InformationEstimator:
             return
         since_ns, self._now_ns = own.time_ns - self._now_ns, own.time_ns
         if since_ns > self._period_ns:
-            self._passing.use(*[[passed_record(self._code, _NOTHING)]] * 2)  # of the period before nothing is known
+            nothing = [passed_record(self._code, _NOTHING)]
+            self._passing.use(nothing, nothing)  # in the period before
         multipath = own.multipath_sigma_m, own.multipath_tau_s
         seen = Observation(
             own.position_m, own.covariance_m2, own.heading_rad, multipath=multipath, speed_m_s=own.speed_m_s

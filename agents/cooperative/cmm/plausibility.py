@@ -240,7 +240,8 @@ class Origins:
         believed again when it has decayed. Each is compared with the belief (x, P) when it came: c itself moves by
         a metre in the sum's memory. What most sums deviate by is the belief's error and does not count; sums
         about lanes (`is_about_lanes`) have nothing in common, because their beliefs differ. Those of `unvouched`
-        origins do not say what it is, and all that one sender passes on of such (`all_of`) claims as much as most.
+        origins do not say what it is; all that one sender passes on of such (`all_of`) says it once, and claims no
+        more than most.
         """
         sums = self._sums
         if len(sums) + len(codes) > MAX_ORIGINS:
