@@ -85,6 +85,8 @@ LEAST_SHARE = 3e-4
 """Share of what a vehicle on a map knows of c below which it does not pass an increment on."""
 LEAST_LISTERS = 3
 """Number of frames that list an increment from which on its origin counts as one: a pair of liars invents none."""
+TOLD_SHARE = 0.1
+"""An increment of which less than this share is used is not told: honest ones have less than 0.5 at times."""
 COUNTED_SHARE = 0.5
 """An increment of which less than this share is used is counted among what is rejected."""
 
@@ -469,7 +471,7 @@ class InformationEstimator:
                 traces = traces_of([passed_increment.cached(record)[1] for record in onward])
                 further = [record for record, trace in zip(onward, traces, strict=True) if trace >= least]
         each = zip(heard.records, traces_of(heard.increments), self._used_shares, strict=True)
-        told = [record for record, trace, share in each if share >= COUNTED_SHARE and trace >= least]
+        told = [record for record, trace, share in each if share >= TOLD_SHARE and trace >= least]
         self._passing.use([own, *heard.records], [own, *told], further)
 
     def _passed_on(

@@ -489,7 +489,7 @@ def test_late_frames_tell_a_vehicle_that_it_is_wrong() -> None:
 def test_what_is_not_used_is_not_passed_on() -> None:
     network = Network(10)
     network.run(30)
-    network.run(30, _off(["v0"], 5.0))
+    network.run(30, _off(["v0"], 20.0))
     frames = [estimator.compose(network.fix(k), 1400) for k, estimator in enumerate(network.estimators)]
     assert all(int(short_name("v0"), 16) not in frame.passed["name"] for frame in frames[1:])
 
