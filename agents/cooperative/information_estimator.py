@@ -366,7 +366,7 @@ class InformationEstimator:
         period in which nothing is heard says neither.
         """
         priors = [*heard.priors, *late]
-        if not priors:
+        if not priors or not self._options.defence:
             return False
         shares = self._prior_shares + (prior_shares([plain_moments(*prior) for prior in late], own) if late else [])
         far = len(shares) - shares.count(1.0)

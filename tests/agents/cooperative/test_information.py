@@ -486,6 +486,15 @@ def test_late_frames_tell_a_vehicle_that_it_is_wrong() -> None:
     assert network.errors_m()[0] < 1.0
 
 
+def test_without_the_defence_late_frames_do_not_have_a_vehicle_begin_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = Network(6, defence=False)
+    network.late = network.ids
+    network.run(20)
+    network.estimators[0].restart(Information.of(COMMON_M + np.array([50.0, 0.0]), 0.0001 * np.eye(2)))
+    monkeypatch.setattr(InformationEstimator, "restart", lambda *_: pytest.fail("it has begun again"))
+    network.run(20)
+
+
 def test_what_is_not_used_is_not_passed_on() -> None:
     network = Network(10)
     network.run(30)
