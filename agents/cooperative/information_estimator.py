@@ -46,7 +46,15 @@ from agents.cooperative.cmm.plausibility import (
 )
 from agents.cooperative.cmm.rbpf import Observation
 from agents.cooperative.estimator import FusionRule, mean_consensus, usable
-from agents.cooperative.frame import MAX_DEGREE, MAX_HEARD, NAME_BYTES, Admission, VehicleCache, short_name
+from agents.cooperative.frame import (
+    MAX_DEGREE,
+    MAX_HEARD,
+    NAME_BYTES,
+    Admission,
+    VehicleCache,
+    name_of_code,
+    short_name,
+)
 from agents.cooperative.information_frame import (
     INCREMENT_LIMIT,
     PASSED,
@@ -151,7 +159,7 @@ class InformationEstimator:
         self.fused_m = self.own.estimate_m
         self.mean_m: Array | None = None
         self._weights: list[float] = []
-        self._weighed: list[str] = []
+        self._weighed: Sequence[int] = ()
         self.imported = 0
         self.limit_m = math.inf
         self._node_id = node_id
@@ -175,7 +183,8 @@ class InformationEstimator:
         self._passing = Passing(passed_record(self._code, self._increment), periods)
         config = options.filter_config()
         moves_as = config.common_sigma_m, config.common_tau_s, config.common_walk_m
-        self._moves_m2 = REMEMBERED_PERIODS * common_step(*moves_as, self.period_s)[1]
+        self._period_step = common_step(*moves_as, self.period_s)
+        self._moves_m2 = REMEMBERED_PERIODS * self._period_step[1]
         self._common_m2 = common_step(*moves_as, LEARNED_S)[1] if self._lanes else 0.0
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
@@ -194,10 +203,8 @@ class InformationEstimator:
         """The latest fusion weights by node id, the vehicle's own included."""
         if not self._weights:
             return {}
-        ids = self._admission.ids
-        return dict(
-            zip([self._node_id, *[ids.get(name, name) for name in self._weighed]], self._weights, strict=True)
-        )
+        names, ids = map(name_of_code, self._weighed), self._admission.ids
+        return dict(zip([self._node_id, *[ids.get(name, name) for name in names]], self._weights, strict=True))
 
     def sample(self, count: int) -> Array:
         """Draw `count` hypotheses (count, 2) of the common error."""
@@ -250,13 +257,14 @@ class InformationEstimator:
         heard, late = HeardFrames.of(frames.values()), HeardFrames.of(late_frames.values())
         if self._lanes:
             self._lanes.join(heard.increments, late.increments)
-        self._compare(heard, own)
-        missing = [late.priors[n] for n, name in enumerate(late_frames) if name not in frames]
-        if self._begins_again(own, heard, missing):
+        missing = [late_frames[name] for name in late_frames if name not in frames]
+        pool = heard.and_earlier(missing, *self._period_step)
+        self._compare(heard, pool, own)
+        if self._begins_again(pool):
             own, frames, late_frames = plain_moments(*self._prior), {}, {}  # the new belief is what they know
-            heard = late = HeardFrames()
+            heard = late = pool = HeardFrames()
         # Of all that follows what this vehicle says itself is the first.
-        priors, means_m, leaning = self._moderated(heard, own)
+        priors, means_m, leaning = self._moderated(pool, own)
         shares = dict(zip([*late_frames, *frames], [*late.shares, *heard.shares], strict=True))
         self._share = self.consensus.round(np.array(means_m[0]), shares)
         self.mean_m = self.consensus.mean_m
@@ -265,11 +273,10 @@ class InformationEstimator:
             middle_m = math.fsum([x for x, _ in means_m]) / count, math.fsum([y for _, y in means_m]) / count
             self.mean_m = tracked_mean(middle_m, self.mean_m, self.limit_m / SPREAD_GATE)
         limited, increments = self._limited(heard, priors)
-        self._weighed = list(frames)
-        punctual_share = len(frames) / max(len(frames) + len(late_frames), 1)
-        weights = self._weights = self._weigh(heard, means_m, own[2] + own[4], leaning, punctual_share)
-        passed, onward = self._passed_on(heard, late.records, weights[1:])
-        self.imported = len(frames) + len(passed)
+        self._weighed = pool.codes
+        weights = self._weights = self._weigh(pool, means_m, own[2] + own[4], leaning, len(frames))
+        passed, onward = self._passed_on(heard, late.records, weights[1 : 1 + len(frames)])
+        self.imported = len(pool.codes) + len(passed)
         self._pass_on(heard, onward, own[2] + own[4])
         self._absorb(weights, limited, increments, passed)
         self.fused_m = self.own.estimate_m
@@ -332,21 +339,21 @@ class InformationEstimator:
         self._frames = []
         return frames, late
 
-    def _compare(self, heard: HeardFrames, own: Five) -> None:
-        """Find the shares (n,) of their priors and of their increments that are used.
+    def _compare(self, heard: HeardFrames, pool: HeardFrames, own: Five) -> None:
+        """Find the shares (n,) of the priors of `pool` and of the increments `heard` that are used.
 
         `own` is the mean and the covariance of the vehicle's own prior. Who has been heard lately and is not now
         contradicts nobody: in some periods a few are most of those that are heard.
         """
-        self._prior_shares = self._used_shares = [1.0] * len(heard.codes)
-        if not self._options.defence or not heard.codes:
+        self._prior_shares, self._used_shares = [1.0] * len(pool.codes), [1.0] * len(heard.codes)
+        if not self._options.defence or not pool.codes:
             return
         x, y, *covariance_m2 = own
-        self._prior_shares = prior_shares(heard.moments, own)
+        self._prior_shares = prior_shares(pool.moments, own)
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
         used = self._shares_used(heard.codes, heard.increments, belief, False)
         self._used_shares = relative_to_most(used, self._silent(heard))
-        if min(self._prior_shares) < 1 or min(self._used_shares) < 1:
+        if min([*self._prior_shares, *self._used_shares]) < 1:
             self._reject("prior", sum(share < COUNTED_SHARE for share in self._prior_shares))
             self._reject("increment", sum(share < COUNTED_SHARE for share in self._used_shares))
 
@@ -359,16 +366,14 @@ class InformationEstimator:
         """Return the number of vehicles that have been heard lately, and are not in this period."""
         return max(0, len(self._share.heard) - len(heard.codes))
 
-    def _begins_again(self, own: Five, heard: HeardFrames, late: Sequence[Five]) -> bool:
+    def _begins_again(self, pool: HeardFrames) -> bool:
         """Begin again at the median of what the others know, if most have contradicted this vehicle for long.
 
-        Returns whether it did. The others are those that are `heard`, with the priors of `late` frames of others; a
-        period in which nothing is heard says neither.
+        Returns whether it did. A period in which nothing is heard says neither.
         """
-        priors = [*heard.priors, *late]
-        if not priors or not self._options.defence:
+        shares = self._prior_shares
+        if not shares or not self._options.defence:
             return False
-        shares = self._prior_shares + (prior_shares([plain_moments(*prior) for prior in late], own) if late else [])
         far = len(shares) - shares.count(1.0)
         contradicted = len(shares) >= LOST_NEIGHBOURS and 2 * far > max(len(shares), len(self._share.heard))
         self._contradicted = self._contradicted + 1 if contradicted else 0
@@ -376,7 +381,7 @@ class InformationEstimator:
             return False
         self._contradicted = 0
         self._origins = Origins()
-        self.restart(median_belief(priors))
+        self.restart(median_belief(pool.priors))
         self._prior, self._increment = as_sent(self.own.prior.numbers), _NOTHING
         self._prior_shares = self._used_shares = []
         return True
@@ -388,22 +393,22 @@ class InformationEstimator:
             self._lanes.restart()
 
     def _moderated(
-        self, heard: HeardFrames, own: Five
+        self, pool: HeardFrames, own: Five
     ) -> tuple[list[Five], list[tuple[float, float]], list[bool] | None]:
         """Return the priors (1 + n,) of the vehicle and those heard, and their means, none far from their median.
 
         No vehicle is dropped: where a few hear what the others cannot know, they are always off, and right. The
         last value (n,) tells which always are, None if nobody is.
         """
-        priors, means_m = [self._prior, *heard.priors], [own[:2], *heard.means_m]
-        if not self._options.defence or not heard.codes:
+        priors, means_m = [self._prior, *pool.priors], [own[:2], *pool.means_m]
+        if not self._options.defence or not pool.codes:
             self.limit_m = math.inf
             return priors, means_m, None
-        middle_m, self.limit_m = spread_limit_m([own, *heard.moments])
+        middle_m, self.limit_m = spread_limit_m([own, *pool.moments])
         if self.limit_m == math.inf:
             middle_m = own[:2]
         now_s = self._now_ns / NS_PER_S
-        off_m, leaning = self._origins.without_lean(heard.codes, heard.moments, own, middle_m, now_s)
+        off_m, leaning = self._origins.without_lean(pool.codes, pool.moments, own, middle_m, now_s)
         less_m = cut_to(off_m, self.limit_m)
         if less_m is off_m and leaning is None:
             return priors, means_m, None
@@ -433,28 +438,28 @@ class InformationEstimator:
 
     def _weigh(
         self,
-        heard: HeardFrames,
+        pool: HeardFrames,
         means_m: Sequence[tuple[float, float]],
         own_variance_m2: float,
         leaning: list[bool] | None,
-        punctual_share: float,
+        punctual: int,
     ) -> list[float]:
         """Return the weights (1 + n,) of the priors.
 
         They have means (1 + n,), and the own a covariance with this trace. The weight of who is always to one side,
-        `leaning` (n,), goes to the vehicle itself, and of who is far off in part, and that of late frames, which
-        `punctual_share` leaves: few that are heard in time are not to speak for all.
+        `leaning` (n,), goes to the vehicle itself, and of who is far off in part; also that of priors of the period
+        before, beyond the first `punctual`, that are no more certain than the own: they lack what was used since.
         """
-        self._rule.notice(heard.largest_degrees, len(self._share.heard))
-        variances_m2 = [own_variance_m2, *heard.variances_m2]
-        weights = self._rule.weights(means_m, variances_m2, self.mean_m, heard.degrees)
+        self._rule.notice(pool.largest_degrees, len(self._share.heard))
+        weights = self._rule.weights(means_m, [own_variance_m2, *pool.variances_m2], self.mean_m, pool.degrees)
+        others = weights[1:]
         if self._options.defence:
-            leaning = leaning or [False] * len(heard.codes)
-            each = zip(weights[1:], self._prior_shares, leaning, strict=True)
-            most = (1 - SELF_SHARE) * punctual_share
-            others = [0.0 if leans else most * share * weight for weight, share, leans in each]
-            weights = [1 - math.fsum(others), *others]
-        return weights
+            each = zip(others, self._prior_shares, leaning or [False] * len(others), strict=True)
+            others = [0.0 if leans else (1 - SELF_SHARE) * share * weight for weight, share, leans in each]
+        for row in range(punctual, len(others)):
+            if pool.variances_m2[row] >= own_variance_m2:
+                others[row] = 0.0
+        return [1 - math.fsum(others), *others]
 
     # What is passed on.
 

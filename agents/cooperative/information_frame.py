@@ -16,13 +16,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.cmm.consensus import Share
-from agents.cooperative.cmm.information import Five, plain_moments
+from agents.cooperative.cmm.information import Five, inverted, plain_moments
 from agents.cooperative.cmm.lane_memory import ALL_KINDS, MAX_AGE, information_of
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, VehicleCache, name_of_code
 from vnet.types import Array
@@ -126,6 +126,25 @@ class HeardFrames(NamedTuple):
     def of(cls, frames: Iterable[InformationFrame]) -> HeardFrames:
         """Return the columns of frames."""
         return cls(*zip(*[frame.row for frame in frames], strict=True))
+
+    def and_earlier(self, frames: Sequence[InformationFrame], keep: float, variance_m2: float) -> HeardFrames:
+        """Return these and earlier `frames`, whose priors are moved on: c keeps a share, and gains in variance."""
+        if not frames:
+            return self
+        rows: list[tuple[Any, ...]] = [*zip(*self, strict=True)]
+        for frame in frames:
+            code, _, increment, _, (x, y, xx, xy, yy), _, *others = frame.row
+            x, y, xx, xy, yy = (
+                keep * x,
+                keep * y,
+                keep**2 * xx + variance_m2,
+                keep**2 * xy,
+                keep**2 * yy + variance_m2,
+            )
+            a, b, d = inverted(xx, xy, yy)
+            prior = a, b, d, a * x + b * y, b * x + d * y
+            rows.append((code, prior, increment, (x, y), (x, y, xx, xy, yy), xx + yy, *others))
+        return HeardFrames(*zip(*rows, strict=True))
 
 
 def _row(frame: InformationFrame, code: int, share: Share, passed: tuple[bytes, ...]) -> Row:

@@ -410,6 +410,21 @@ def test_an_increment_that_misses_its_period_is_used_in_the_next(late: list[str]
     assert sum(each.rejected.total() for each in network.estimators) == 0
 
 
+@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("reach", [1, 2])
+def test_what_frames_that_miss_their_period_know_goes_round(every: int, reach: int) -> None:
+    """None of it twice, and more than half of what goes round in time."""
+    punctual, network = Network(12, reach), Network(12, reach)
+    network.late = network.ids[::every]
+    for each in (punctual, network):
+        each.run(60)
+    usual, known = (
+        [Information.of(*e.common_error).matrix.trace() for e in each.estimators] for each in (punctual, network)
+    )
+    assert 0.53 * min(usual) < min(known) < max(known) < max(usual)
+    assert network.errors_m().mean() < 0.5
+
+
 @pytest.mark.parametrize("late", [[], ["v0", "v2", "v4"], [f"v{k}" for k in range(6)]])
 def test_on_a_map_none_that_misses_its_period_is_used_twice(late: list[str]) -> None:
     network, told = RoadNetwork(6, reach=1), []
