@@ -463,6 +463,21 @@ def test_increments_of_origins_that_are_invented_hardly_draw(
     assert np.sqrt(np.mean(np.square(honest_m))) < 0.5 * off_m
 
 
+@pytest.mark.parametrize("off_m", [1.0, 2.0])
+def test_two_hundred_origins_that_one_invents_in_one_period_move_nobody_far(off_m: float) -> None:
+    network = Network(8)
+    network.run(30)
+    false = np.zeros(200, dtype=PASSED)
+    false["name"] = np.arange(200)
+    false["information"] = 0.5, 0.0, 0.5, 0.5 * (COMMON_M[0] + off_m), 0.5 * COMMON_M[1]
+    before = [e.common_error[0] for e in network.estimators]
+    network.run(
+        1, lambda name, frame: replace(frame, passed=np.append(frame.passed, false)) if name == "v0" else frame
+    )
+    moved_m = [np.linalg.norm(e.common_error[0] - was) for e, was in zip(network.estimators, before, strict=True)]
+    assert max(moved_m[1:]) < 0.2
+
+
 def _off(liars: Collection[str], off_m: float, claim: float = 1.0) -> Change:
     """Return the lie that c is off, by priors and by increments, of so many times the claim."""
 
