@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.fault_plan import PlannedFault
+from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Outcome
 from emulator.radio.own_rules import LONGEST_DELAY_S, MOST_COPIES
 from emulator.records.distributions import binomial_interval
@@ -30,6 +31,7 @@ from emulator.scenario.faults import (
     StaleMessages,
     Throttle,
 )
+from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Scenario
 from emulator.world.radio_inputs import LinkTable
 from vnet.errors import counted, first_names
@@ -117,7 +119,7 @@ def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
 
 
 def _orphans(recorded: RecordedRun) -> Mask:
-    """Copies that name no fault, or no original that was sent by then."""
+    """Copies that name no fault, or no original that was sent by then, be it that nobody was in range of it."""
     copies = recorded.copy > 0
     if not copies.any():
         return copies
@@ -127,7 +129,10 @@ def _orphans(recorded: RecordedRun) -> Mask:
     named = recorded.trace["cause"].combine_chunks()
     nameless = np.asarray(named.to_numpy(zero_copy_only=False) == "", dtype=bool)
     nameless &= recorded.attempt < 2  # what is transmitted again is a copy, but no fault's
-    return np.asarray(copies & (nameless | (original_ns[index] > recorded.sent_ns)))
+    orphans = copies & (original_ns[index] > recorded.sent_ns)
+    rows = np.flatnonzero(orphans & (original_ns[index] == END_OF_TIME_NS))
+    orphans[rows[unseen_frames(recorded).may_hold(rows, recorded.sent_ns[rows])]] = False
+    return np.asarray(orphans | (copies & nameless))
 
 
 def _out_of_order(recorded: RecordedRun) -> Mask:
@@ -151,18 +156,70 @@ def _missing_numbers(recorded: RecordedRun) -> int:
 
     Frames sent while no receiver is in range have no rows, so their numbers may be missing.
     """
+    unseen = unseen_frames(recorded)
+    sender, sent_ns = recorded.sender[unseen.before], recorded.sent_ns[unseen.before]
+    missing = int(unseen.count[~recorded.places.were_lonely(sender, unseen.after_ns, sent_ns)].sum())
     first = recorded.emissions.first
-    originals = first[recorded.copy[first] == 0]  # by sender, and in the order of their numbers
-    sender, seq, sent_ns = recorded.sender[originals], recorded.seq[originals], recorded.sent_ns[originals]
-    begins = np.diff(sender, prepend=-1) != 0
-    after, after_ns = np.where(begins, -1, np.roll(seq, 1)), np.where(begins, 0, np.roll(sent_ns, 1))
-    missing = int((seq - after - 1)[~recorded.places.were_lonely(sender, after_ns, sent_ns)].sum())
     copies = first[recorded.copy[first] > 0]
     copies = copies[~recorded.places.ever_lonely[recorded.sender[copies]]]
     frame, index = np.unique(recorded.frame[copies], return_inverse=True)
     last = np.zeros(len(frame), dtype=np.int64)
     np.maximum.at(last, index, recorded.copy[copies])
     return missing + int(last.sum()) - len(copies)
+
+
+@dataclass(frozen=True)
+class UnseenFrames:
+    """Frames that nobody was in range of: they have no rows, and only the numbers of others tell of them.
+
+    `count` (n,) are missing before each original, of the row `before`, since the last one of its sender, sent at
+    `after_ns`. The originals are in the order of sender and number.
+    """
+
+    recorded: RecordedRun
+    before: NDArray[np.intp]
+    count: IntArray
+    after_ns: IntArray
+
+    def may_hold(self, rows: NDArray[np.intp], until_ns: IntArray, since_ns: int = 0) -> Mask:
+        """Return whether the frame of each row (n,), which has no original, may have been sent in that time."""
+        recorded = self.recorded
+        return self._may_lie(
+            np.searchsorted(recorded.frame[self.before], recorded.frame[rows]), rows, until_ns, since_ns
+        )
+
+    def may_follow(self, rows: NDArray[np.intp], until_ns: IntArray, since_ns: int = 0) -> Mask:
+        """Return whether the last frame up to an instant, of the sender of each row (n,), may be one of them."""
+        return self._may_lie(self.place(rows, until_ns), rows, until_ns, since_ns)
+
+    def place(self, rows: NDArray[np.intp], time_ns: IntArray) -> NDArray[np.intp]:
+        """Return the number of the first original after each of these instants, of the sender of each row (n,)."""
+        recorded = self.recorded
+        longest_ns = int(recorded.sent_ns.max(initial=0)) + 2
+        sent = recorded.sender[self.before] * longest_ns + recorded.sent_ns[self.before]
+        return np.searchsorted(sent, recorded.sender[rows] * longest_ns + np.maximum(time_ns, -1), side="right")
+
+    def _may_lie(self, place: NDArray[np.intp], rows: NDArray[np.intp], until_ns: IntArray, since_ns: int) -> Mask:
+        """Return whether some were sent before these originals, in that time, by the sender of each row (n,)."""
+        recorded = self.recorded
+        if not len(self.before):
+            return np.zeros(len(rows), dtype=bool)
+        there = np.append(recorded.sender[self.before], -1)[place] == recorded.sender[rows]
+        place = np.where(there, place, 0)
+        from_ns = np.maximum(self.after_ns[place], since_ns)
+        to_ns = np.minimum(recorded.sent_ns[self.before[place]], until_ns)
+        lonely = recorded.places.were_lonely(recorded.sender[rows], from_ns, to_ns)
+        return np.asarray(there & (self.count[place] > 0) & (from_ns <= to_ns) & lonely)
+
+
+def unseen_frames(recorded: RecordedRun) -> UnseenFrames:
+    """Return the frames of a run that have no rows."""
+    first = recorded.emissions.first
+    originals = first[recorded.copy[first] == 0]  # by sender, and in the order of their numbers
+    sender, seq, sent_ns = recorded.sender[originals], recorded.seq[originals], recorded.sent_ns[originals]
+    begins = np.diff(sender, prepend=-1) != 0
+    after, after_ns = np.where(begins, -1, np.roll(seq, 1)), np.where(begins, 0, np.roll(sent_ns, 1))
+    return UnseenFrames(recorded, originals, seq - after - 1, after_ns)
 
 
 def check_range(recorded: RecordedRun) -> Finding:
@@ -356,26 +413,23 @@ def frame_digests(recorded: RecordedRun) -> tuple[NDArray[np.uint64], Mask]:
 
 
 def _replaced(recorded: RecordedRun) -> Mask:
-    """Originals that a stale frame, or a rule's, may have replaced. (If a fault cut them, they name that fault.)
-
-    A sender's frames are remembered from when a fault first makes it misbehave.
-    """
+    """Originals that a stale frame, or a rule's, may have replaced. (If a fault cut them, they name that fault.)"""
     replaced: Mask = recorded.may_reach_of(CustomSender) & (recorded.copy == 0)
-    remembered_ns = np.full(len(recorded.node_ids), END_OF_TIME_NS)
-    for planned in recorded.plan:
-        if isinstance(planned.fault, SenderFault):
-            remembered_ns[planned.nodes] = np.minimum(remembered_ns[planned.nodes], planned.start_ns)
     for planned in recorded.plan:
         if isinstance(planned.fault, StaleMessages):
             old_ns = recorded.sent_ns - round(planned.fault.age_s * NS_PER_S) + recorded.guard_ns
             acts = recorded.may_reach(planned) & (recorded.copy == 0)
-            replaced |= acts & (old_ns >= remembered_ns[recorded.sender])
+            replaced |= acts & (old_ns >= planned.start_ns)
     return replaced
 
 
 def _not_of_that_age(recorded: RecordedRun, replaced: Mask) -> Mask:
-    """Stale frames that differ from the frame their sender sent that long ago, unless that was stale itself."""
+    """Stale frames that differ from the frame their sender sent that long ago, unless that was stale itself.
+
+    Nor is known of a frame that nobody was in range of what was in it.
+    """
     wrong = np.zeros(len(replaced), dtype=bool)
+    unseen = unseen_frames(recorded)
     sound = ~recorded.caused_by("corrupt")
     for planned in recorded.plan:
         mine = np.flatnonzero(recorded.cause == planned.number)
@@ -388,9 +442,9 @@ def _not_of_that_age(recorded: RecordedRun, replaced: Mask) -> Mask:
             before_ns = recorded.sent_ns[late] - round(planned.fault.age_s * NS_PER_S)
             index = np.searchsorted(recorded.sent_ns[own], before_ns, side="right") - 1
             old = own[np.maximum(index, 0)]
-            wrong[late] = (index < 0) | (
-                sound[old] & ~replaced[old] & (recorded.digest[late] != recorded.digest[old])
-            )
+            too_old = (index < 0) | (recorded.sent_ns[old] < planned.start_ns - recorded.guard_ns)
+            differs = sound[old] & ~replaced[old] & (recorded.digest[late] != recorded.digest[old])
+            wrong[late] = (too_old | differs) & ~unseen.may_follow(late, before_ns, planned.start_ns)
     return wrong
 
 
@@ -421,25 +475,28 @@ def _claims_beyond(recorded: RecordedRun) -> list[dict[str, Any]]:
 class Bounds:
     """Bounds of each row: the earliest and latest arrival, the airtime, and whether its frame waited for no other.
 
-    Times in nanoseconds; `latest_ns` supposes that every access delay was the longest.
+    Times in nanoseconds; `latest_ns` supposes that every access delay was the longest. `unsure` frames may have
+    waited for some that nobody was in range of, whose sizes are not known.
     """
 
     earliest_ns: Array
     latest_ns: Array
     airtime_ns: Array
     alone: Mask
+    unsure: Mask
 
 
 def bounds(recorded: RecordedRun, without: PlannedFault | None = None) -> Bounds:
     """Return the bounds on the arrival of each row's frame, if it arrived; as if `without` one of the faults."""
     radio = recorded.scenario.radio
     plan = [planned for planned in recorded.plan if planned is not without]
-    start_ns, end_ns, airtime_ns, alone = _queue(recorded, plan)
+    start_ns, end_ns, airtime_ns, alone, unsure = _queue(recorded, plan)
     latency_ns = radio.latency_ms * NS_PER_MS
     sooner_ns, later_ns = _delays(recorded, plan)
     most_ns = latency_ns + radio.jitter_ms * NS_PER_MS + _rounding_us(recorded.scenario) * 1_000
     earliest_ns = start_ns + airtime_ns + max(latency_ns, 1_000) + sooner_ns - ROUNDING_NS
-    return Bounds(earliest_ns, end_ns + most_ns + later_ns + ROUNDING_NS, airtime_ns, alone & (later_ns == 0))
+    latest_ns = end_ns + most_ns + later_ns + ROUNDING_NS
+    return Bounds(earliest_ns, latest_ns, airtime_ns, alone & (later_ns == 0), unsure)
 
 
 def _rounding_us(scenario: Scenario) -> int:
@@ -447,32 +504,72 @@ def _rounding_us(scenario: Scenario) -> int:
     return scenario.radio.delivery_tick_us + scenario.run.order_slack_us
 
 
-def _queue(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array, Array, Mask]:
-    """For each row: the earliest start and the latest end of its transmission, its airtime, whether it was alone.
+def _queue(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array, Array, Mask, Mask]:
+    """For each row: the earliest start and latest end of its transmission, its airtime, if it was alone, or unsure.
 
     The sender's queue is monotonic in its access delays: with none of them everything is at its earliest, with the
-    longest at its latest. Frames of one instant are taken as one batch, so that their order does not matter. Where
-    all share the air, the trace tells when each frame was on it.
+    longest at its latest. Frames of one instant are taken as one batch, so that their order does not matter. So are
+    those that nobody was in range of, at the last instant at which that was so: they may have taken no time, or as
+    long as a full queue of the longest. Where all share the air, the trace tells when each frame was on it.
     """
     usual_ns = recorded.airtime_ns.astype(float)
     if recorded.shares_air:
         start_ns = recorded.on_air_ns.astype(float)
-        return start_ns, start_ns + usual_ns, usual_ns, recorded.arrived
+        return start_ns, start_ns + usual_ns, usual_ns, recorded.arrived, np.zeros(len(usual_ns), dtype=bool)
     fast_mbps, slow_mbps = _bitrates(recorded, plan)
     bits = recorded.column("size_bytes") * 8_000
     slowed_ns = [np.maximum(usual_ns, np.rint(bits / mbps)) for mbps in (fast_mbps, slow_mbps)]
     airtimes_ns = [usual_ns, *slowed_ns]
     longest_ns = int(recorded.sent_ns.max(initial=0)) + 1
-    key, batch = np.unique(recorded.sender * longest_ns + recorded.sent_ns, return_inverse=True)
+    absent, absent_ns, longest = _may_have_waited(recorded, plan)
+    keys = np.append(recorded.sender, absent) * longest_ns + np.append(recorded.sent_ns, absent_ns)
+    key, batch = np.unique(keys, return_inverse=True)
+    batch, hidden = batch[: len(recorded.trace)], batch[len(recorded.trace) :]
     offered = ~received_twice(recorded) & ~recorded.outcome_is("oversize") & ~recorded.dropped_by_sender
     first = recorded.first_rows(offered)
     taken = first[~recorded.outcome_is("queue_full")[first]]
     sums = [np.bincount(batch[taken], weights=air[taken], minlength=len(key)) for air in airtimes_ns]
     sums.append(np.bincount(batch[first], weights=airtimes_ns[0][first], minlength=len(key)))
+    sums.append(sums[0])
+    more = [np.bincount(hidden, weights=longest_each_ns, minlength=len(key)) for longest_each_ns in longest]
+    sums[2:] = sums[2] + more[1], sums[3] + more[0], sums[4] + more[0]
     sender, sent_ns = np.divmod(key, longest_ns)
     start, end, waits = _courses(recorded, plan, sender, sent_ns, np.column_stack(sums))
     alone = ~waits & (np.bincount(batch[first], minlength=len(key)) == 1)
-    return start[batch], end[batch], airtimes_ns[1], alone[batch]
+    began = ~waits | (np.diff(sender, prepend=-1) != 0)
+    began[hidden] = False
+    last_began, last_hidden = np.full((2, len(key)), -1)
+    last_began[began], last_hidden[hidden] = np.flatnonzero(began), hidden
+    unsure = np.maximum.accumulate(last_hidden) > np.maximum.accumulate(last_began)
+    return start[batch], end[batch], airtimes_ns[1], alone[batch], unsure[batch]
+
+
+def _may_have_waited(
+    recorded: RecordedRun, plan: list[PlannedFault]
+) -> tuple[NDArray[np.intp], IntArray, tuple[Array, Array]]:
+    """For each time in which frames have no rows: the sender, when it ended, and how long they waited at most.
+
+    That is the airtime of the longest frames, no more than a queue holds, usually and if a fault throttles them.
+    """
+    radio, unseen = recorded.scenario.radio, unseen_frames(recorded)
+    before, count = unseen.before[unseen.count > 0], unseen.count[unseen.count > 0]
+    sender = recorded.sender[before]
+    until_ns = recorded.places.last_lonely_ns(sender, recorded.sent_ns[before])
+    known = until_ns >= unseen.after_ns[unseen.count > 0]  # else a number is missing without any reason
+    for planned in plan:
+        if isinstance(planned.fault, SenderFault):  # that may send each of them many times
+            count = np.where(planned.nodes[sender], radio.queue_frames + 1, count)
+    chosen = "bitrate_mbps" in recorded.trace.column_names
+    mbps = np.full(len(sender), min(RATES_MBPS) if chosen else radio.bitrate_mbps)
+    bytes_ = np.full(len(sender), radio.max_payload_bytes)
+    usual_ns = airtimes_ns(radio, bytes_, mbps).astype(float)
+    slow_ns = usual_ns.copy()
+    for planned in plan:
+        if isinstance(planned.fault, Throttle):
+            throttled_ns = np.rint(bytes_ * 8_000 / planned.fault.bitrate_mbps)
+            slow_ns = np.where(planned.nodes[sender], np.maximum(slow_ns, throttled_ns), slow_ns)
+    waiting = np.minimum(count, radio.queue_frames + 1)
+    return sender[known], until_ns[known], ((waiting * usual_ns)[known], (waiting * slow_ns)[known])
 
 
 def _courses(
@@ -480,9 +577,10 @@ def _courses(
 ) -> tuple[Array, Array, Mask]:
     """Earliest start, latest end and whether it may have waited, of each batch (B,), in order of sender and time.
 
-    `airtime_ns` (B, 4) is of what was sent, at the bitrate of the radio, and at the fastest and the slowest that
-    faults leave; and of all that was offered, at that of the radio. A throttled sender has a queue of its own,
-    which begins as the plain one stands; afterwards the plain one goes on, as if it had never been slowed.
+    `airtime_ns` (B, 5) is of what was sent, at the bitrate of the radio, and at the fastest and the slowest that
+    faults leave; of all that was offered, at that of the radio; and the most of what was sent, at that. A throttled
+    sender has a queue of its own, which begins as the plain one stands; afterwards the plain one goes on, as if it
+    had never been slowed.
     """
     delay_ns = recorded.scenario.radio.access_jitter_ms * NS_PER_MS
     start, end, waits = np.zeros(len(sender)), np.zeros(len(sender)), np.zeros(len(sender), dtype=bool)
@@ -491,7 +589,7 @@ def _courses(
     for first, last in pairwise([*edges, len(sender)]):
         of = slice(first, last)
         if (episode[of] == NO_EPISODE).all():
-            start[of], end[of], waits[of] = _plain_course(sent_ns[of], airtime_ns[of, 0], delay_ns)
+            start[of], end[of], waits[of] = _plain_course(sent_ns[of], airtime_ns[of], delay_ns)
         else:
             start[of], end[of], waits[of] = _throttled_course(sent_ns[of], airtime_ns[of], delay_ns, episode[of])
     return start, end, waits
@@ -499,9 +597,9 @@ def _courses(
 
 def _plain_course(sent_ns: IntArray, airtime_ns: Array, delay_ns: float) -> tuple[Array, Array, Mask]:
     """As `_courses` of one sender's batches (B,) that no fault throttles: each waits for those before it."""
-    before_ns = np.cumsum(airtime_ns) - airtime_ns
-    start_ns = before_ns + np.maximum.accumulate(sent_ns - before_ns)
-    end_ns = before_ns + airtime_ns + np.maximum.accumulate(sent_ns + delay_ns - before_ns)
+    least_ns, most_ns = (np.cumsum(airtime_ns[:, column]) - airtime_ns[:, column] for column in (0, 4))
+    start_ns = least_ns + np.maximum.accumulate(sent_ns - least_ns)
+    end_ns = most_ns + airtime_ns[:, 4] + np.maximum.accumulate(sent_ns + delay_ns - most_ns)
     waits = np.zeros(len(sent_ns), bool)
     waits[1:] = end_ns[:-1] > sent_ns[1:]
     return start_ns, end_ns, waits
@@ -514,10 +612,10 @@ def _throttled_course(
     start, end, waits = np.zeros(len(sent_ns)), np.zeros(len(sent_ns)), np.zeros(len(sent_ns), dtype=bool)
     plain, slow, within = (0.0, 0.0), (0.0, 0.0), NO_EPISODE
     batches = zip(sent_ns.tolist(), episode.tolist(), airtime_ns.tolist(), strict=True)
-    for index, (time_ns, number, (usual, fast, slowest, offered)) in enumerate(batches):
+    for index, (time_ns, number, (usual, fast, slowest, offered, most)) in enumerate(batches):
         waits[index] = number != NO_EPISODE or plain[1] > time_ns
         if number == NO_EPISODE:
-            start[index], end[index] = max(time_ns, plain[0]), max(time_ns + delay_ns, plain[1]) + usual
+            start[index], end[index] = max(time_ns, plain[0]), max(time_ns + delay_ns, plain[1]) + most
             plain = start[index] + usual, end[index]
         else:
             slow = slow if number == within else plain

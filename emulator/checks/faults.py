@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.checks.channel import binomial_band, bounds, frame_digests, received_twice
+from emulator.checks.channel import binomial_band, bounds, frame_digests, received_twice, unseen_frames
 from emulator.fault_plan import PlannedFault
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import SLOT_NS
@@ -66,6 +66,8 @@ Rows = NDArray[np.intp]
 CERTAIN = 1e-6
 """Probability below which a sum of fixes is not that of a receiver without faults."""
 RATE_BAND = 1 - 1e-6
+MANY = 1e6
+"""More frames than any chain of losses remembers."""
 RATE_SIGMAS = 4.9
 """As wide as RATE_BAND: a run may have dozens of faults, and each has a check."""
 
@@ -123,27 +125,34 @@ def _due(recorded: RecordedRun, rows: Rows) -> IntArray:
 
 
 def _replayed_wrongly(recorded: RecordedRun, late: Rows, originals: Rows) -> list[int]:
-    """Late copies that are not of the last frame old enough for a replay that acted on the sender."""
+    """Late copies that are not of the last frame old enough for a replay that acted on the sender.
+
+    Of frames that nobody was in range of the times are not known: there it may be any of those.
+    """
     frame_ns = dict(_of(recorded, originals))
     sent_ns = {
         sender: np.sort(recorded.sent_ns[originals[recorded.sender[originals] == sender]])
         for sender in np.unique(recorded.sender[late]).tolist()
     }
-    replays = [planned for planned in recorded.plan if isinstance(planned.fault, DataReplay)]
-    wrong = []
-    for row, (frame, time_ns) in zip(late.tolist(), _of(recorded, late), strict=True):
-        sender = int(recorded.sender[row])
-        acting = [planned for planned in replays if planned.nodes[sender] and planned.acts_at(time_ns)]
-        if frame_ns.get(frame) not in [_last_before(sent_ns[sender], time_ns, planned) for planned in acting]:
-            wrong.append(row)
-    return wrong
-
-
-def _last_before(sent_ns: IntArray, time_ns: int, planned: PlannedFault) -> int | None:
-    """Time at which the last frame was sent that is old enough for a replay, in ns."""
-    assert isinstance(planned.fault, DataReplay)
-    index = int(np.searchsorted(sent_ns, time_ns - round(planned.fault.age_s * NS_PER_S), side="right"))
-    return int(sent_ns[index - 1]) if index else None
+    unseen = unseen_frames(recorded)
+    wrong = np.ones(len(late), dtype=bool)
+    for planned in recorded.plan:
+        if not isinstance(planned.fault, DataReplay):
+            continue
+        old_ns = recorded.sent_ns[late] - round(planned.fault.age_s * NS_PER_S)
+        is_hidden = unseen.may_hold(late, old_ns, planned.start_ns)
+        is_hidden &= unseen.may_follow(late, old_ns, planned.start_ns)
+        acts = planned.nodes[recorded.sender[late]] & recorded.acting(planned, recorded.sent_ns[late])
+        for index in np.flatnonzero(acts).tolist():
+            row = late[index]
+            if (original_ns := frame_ns.get(int(recorded.frame[row]))) is None:
+                wrong[index] &= not is_hidden[index]
+            else:
+                before = sent_ns[int(recorded.sender[row])]
+                last = int(np.searchsorted(before, old_ns[index], side="right")) - 1
+                due = last >= 0 and before[last] == original_ns >= planned.start_ns - recorded.guard_ns
+                wrong[index] &= not due
+    return late[wrong].tolist()  # type: ignore[no-any-return]
 
 
 def check_gnss(recorded: RecordedRun) -> Finding:
@@ -452,33 +461,59 @@ def loss_band(
 def _(fault: BurstLoss, recorded: RecordedRun, planned: PlannedFault, drawing: Mask) -> tuple[float, float, float]:
     """Return the same for a two-state chain a link that starts good (Gilbert, Elliott).
 
-    Losses of a link are correlated over 1 / (1 - λ) frames, λ = 1 - enter - leave, which widens the band.
+    Losses of a link are correlated over 1 / (1 - λ) frames, λ = 1 - enter - leave, which widens the band. So does
+    what is not known of frames that nobody was in range of, which move the chain as well.
     """
     memory = 1 - fault.enter - fault.leave
     mostly_bad = fault.enter / (fault.enter + fault.leave)
-    bad = mostly_bad * (1 - memory ** _steps(recorded, planned)[drawing])
-    rate: Array = fault.loss_good + (fault.loss_bad - fault.loss_good) * bad
+    _, least, most = (steps[drawing] for steps in frames_since(recorded, planned))
+    bad = mostly_bad * (1 - memory ** np.stack([least, np.minimum(least + 1, most), most]))
+    rates: Array = fault.loss_good + (fault.loss_bad - fault.loss_good) * bad
+    lowest, highest = rates.min(axis=0), rates.max(axis=0)
+    rate = (lowest + highest) / 2
     mean = float(rate.sum())
     frames_a_link = max(1.0, len(np.unique(recorded.emission[drawing])))
     length = min(1 / (1 - memory), frames_a_link) if memory < 1 else frames_a_link
     stretch = max(1.0, 2 * length - 1)
     variance = float(np.sum(rate * (1 - rate))) * stretch
     away = RATE_SIGMAS * sqrt(variance) + stretch * log(1e6) / 3 if 0 < mean < len(rate) else 0.5
-    return mean / len(rate), max(0.0, mean - away), min(float(len(rate)), mean + away)
+    return (
+        mean / len(rate),
+        max(0.0, float(lowest.sum()) - away),
+        min(float(len(rate)), float(highest.sum()) + away),
+    )
 
 
-def _steps(recorded: RecordedRun, planned: PlannedFault) -> Array:
-    """Number of frames that each row's sender had sent since a fault began, the row's included."""
+def frames_since(recorded: RecordedRun, planned: PlannedFault) -> tuple[Array, Array, Array]:
+    """Return how many frames each row's sender had sent since a fault began, the row's included.
+
+    Those that have rows, and with the others at least and at most.
+    """
     while_acting = recorded.acting(planned, recorded.sent_ns, recorded.guard_ns) & ~received_twice(recorded)
     first = recorded.first_rows(while_acting)
     first = first[np.lexsort((recorded.emission[first], recorded.sent_ns[first], recorded.sender[first]))]
     sender = recorded.sender[first]
-    index = np.arange(len(first)) - np.searchsorted(sender, sender) + 1
+    begin = np.searchsorted(sender, sender)
     order = np.argsort(recorded.emission[first])
-    steps = np.zeros(len(recorded.trace))
     where = np.searchsorted(recorded.emission[first][order], recorded.emission[while_acting])
-    steps[while_acting] = index[order][where]
-    return steps
+    unseen = unseen_frames(recorded)
+    began_ns = np.maximum(unseen.after_ns, planned.start_ns)
+    possible = unseen.count * recorded.places.were_lonely(
+        recorded.sender[unseen.before], began_ns, np.maximum(recorded.sent_ns[unseen.before], began_ns)
+    )
+    copying = [p.nodes[recorded.sender[unseen.before]] for p in recorded.plan if isinstance(p.fault, SenderFault)]
+    copied = np.logical_or.reduce(copying) if copying else np.zeros(len(unseen.before), dtype=bool)
+    counts = np.zeros((3, len(recorded.emissions.first)))
+    counts[1:, recorded.emissions.of_row[unseen.before]] = (
+        np.where(unseen.after_ns >= planned.start_ns, possible, 0),
+        np.where(copied & (possible > 0), MANY, possible),
+    )
+    steps = np.zeros((3, len(recorded.trace)))
+    each = 1 + counts[:, recorded.emissions.of_row[first]]
+    total = np.cumsum(each, axis=1)
+    total -= (total - each)[:, begin]
+    steps[:, while_acting] = total[:, order][:, where]
+    return steps[0], steps[1], steps[2]
 
 
 PHASE_NS = 1_000_000

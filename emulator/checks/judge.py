@@ -216,8 +216,9 @@ CHECKS: list[Check] = [
         check_latency,
         RADIO,
         "No reception arrives earlier than airtime, latency and delaying faults allow, or later than the "
-        "sender's queue, the jitters, the tick and faults explain. Where nothing queues, the mean is as "
-        "expected. On a shared medium these times count from the start of the transmission.",
+        "sender's queue, the jitters, the tick and faults explain; the queue may have held frames that nobody was "
+        "in range of. Where nothing queues, the mean is as expected. On a shared medium these times count from the "
+        "start of the transmission.",
         invalid="an arrival out of bounds, or a mean beyond 4.9 σ",
         unknown="nothing arrived",
         not_applicable=NOBODY_IN_RANGE,

@@ -328,6 +328,17 @@ class Places:
 
     def were_lonely(self, sender: NDArray[np.intp], start_ns: IntArray, end_ns: IntArray) -> Mask:
         """(n,), whether each of these senders had nobody in range at some time from one instant to another."""
-        lonely = np.cumsum(self._degrees[0] == 0, axis=0)
-        before = np.vstack([np.zeros_like(lonely[:1]), lonely])
-        return np.asarray(lonely[self._epoch(end_ns), sender] > before[self._epoch(start_ns), sender])
+        return np.asarray(self._last_lonely[self._epoch(end_ns), sender] >= self._epoch(start_ns))
+
+    def last_lonely_ns(self, sender: NDArray[np.intp], time_ns: IntArray) -> IntArray:
+        """(n,), the last instants up to these at which each of these senders had nobody in range; or else -1."""
+        epoch = self._last_lonely[self._epoch(time_ns), sender]
+        ends_ns = np.append(self.starts_ns[1:], self._end_ns)
+        return np.where(epoch < 0, -1, np.minimum(ends_ns[epoch] - 1, time_ns))
+
+    @cached_property
+    def _last_lonely(self) -> NDArray[np.intp]:
+        """(E, N), the last epoch up to each in which a sender had nobody in range; -1 if there was none."""
+        lonely = self._degrees[0] == 0
+        epochs = np.where(lonely, np.arange(len(lonely))[:, None], -1)
+        return np.asarray(np.maximum.accumulate(epochs, axis=0))

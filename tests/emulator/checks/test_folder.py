@@ -5,7 +5,9 @@ import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -19,6 +21,7 @@ from emulator.scenario.scenario import Scenario
 from tests.support.folder_edits import EDITS, Edit, forge, listing, table
 from tests.support.paths import ROOT
 from tests.support.recorded import recorded
+from vnet import Node
 
 pytestmark = pytest.mark.slow
 
@@ -290,3 +293,82 @@ def test_a_folder_is_valid_where_vehicles_meet_or_part_in_a_period_that_the_run_
         "program": {"entry": "tests.emulator.checks.test_faults:talks_on"},
     }
     assert broken(check_run(emulator.simulate(scenario, out=tmp_path / "run").folder)) == set()
+
+
+async def counts_frames(node: Node) -> None:
+    """Send frames that differ; `a` sends ten of them at each fix until 2.2 s, then one."""
+    count = 0
+    async for fix in node.gnss:
+        for _ in range(10 if node.id == "a" and fix.time_ns < 2_200_000_000 else 1):
+            await node.radio.broadcast(count.to_bytes(4, "little") * 200)
+            count += 1
+
+
+def parting(folder: Path, seed: int = 1, **fault: Any) -> Path:
+    """`b` is in range of `a` until 0.7 s, and from 2.3 s on; in between nobody hears what `a` sends."""
+    rows = [f"b,{time_s},{90 if 1 <= time_s <= 2 else 40},0" for time_s in np.arange(0, 6.1, 0.5)]
+    folder.mkdir()
+    (folder / "trips.csv").write_text("\n".join(["id,time_s,x_m,y_m", "a,0,0,0", "a,6,0,0", *rows]))
+    scenario = {
+        "run": {"duration_s": 5.0, "settle_s": 0.0, "seed": seed},
+        "network": {"kind": "trips", "path": str(folder / "trips.csv"), "longest_gap_s": 10.0},
+        "world": {"gnss": {"rate_hz": 20}},
+        "radio": {"range_m": 60.0, "bitrate_mbps": 0.3},
+        "fault": [{"at_s": 1.2, "duration_s": 3.0, "nodes": ["a"]} | fault] if fault else [],
+    }
+    return emulator.simulate(scenario, program=counts_frames, out=folder / "run").folder
+
+
+LONELY_FAULTS: list[dict[str, Any]] = [
+    {},
+    {"kind": "throttle", "bitrate_mbps": 0.02},
+    {"kind": "DataReplay", "age_s": 0.9},
+    {"kind": "DataReplay", "age_s": 0.9, "at_s": 0.1},
+    {"kind": "StaleMessages", "age_s": 0.9},
+    {"kind": "StaleMessages", "age_s": 0.9, "at_s": 0.1},
+    {"kind": "DoS", "factor": 20},
+    {"kind": "Sybil", "ghosts": 5},
+    {"kind": "burst_loss", "enter": 0.005, "leave": 1e-6, "at_s": 0.1},
+]
+
+
+@pytest.mark.parametrize("fault", LONELY_FAULTS, ids=lambda fault: str(fault.get("kind", "queue")))
+def test_frames_that_nobody_was_in_range_of_make_no_run_invalid(tmp_path: Path, fault: dict[str, Any]) -> None:
+    """They fill the sender's queue, are sent again, and move the chain of losses, and no row tells of them."""
+    for seed in range(1, 4):
+        folder = parting(tmp_path / str(seed), seed, **fault)
+        run = RecordedRun.open(folder)
+        assert run.seq.max() + 1 > len(np.unique(run.seq[run.sender == 0])), "each frame has rows"
+        assert broken(check_run(folder)) == set()
+
+
+def changes_last(name: str, wanted: Callable[[dict[str, Any]], bool], change: Callable[[Any], Any]) -> Any:
+    """Return what changes a column of the last row of the trace that is `wanted`."""
+
+    def apply(rows: list[dict[str, Any]]) -> None:
+        row = [row for row in rows if wanted(row)][-1]
+        row[name] = change(row[name])
+
+    return table("trace", apply)
+
+
+@pytest.mark.parametrize(
+    ("fault", "edit", "found_by"),
+    [
+        ({}, changes_last("arrival_ns", lambda row: row["arrival_ns"], lambda ns: ns + 50_000_000), "latency"),
+        ({}, changes_last("arrival_ns", lambda row: row["arrival_ns"], lambda ns: ns + 1_000), "outcomes"),
+        (
+            LONELY_FAULTS[4] | {"at_s": 2.0, "duration_s": 1.7},
+            changes_last("payload_digest", lambda row: row["cause"], lambda _: 1),
+            "isolation",
+        ),
+        (LONELY_FAULTS[2], changes_last("seq", lambda row: row["copy"], lambda seq: 1), "copies"),
+    ],
+)
+def test_what_such_frames_have_no_part_in_is_judged(
+    tmp_path: Path, fault: dict[str, Any], edit: Callable[[Path], None], found_by: str
+) -> None:
+    folder = parting(tmp_path / "run", **fault)
+    edit(folder)
+    write_manifest(RunFolder(folder))
+    assert found_by in broken(check_run(folder))
