@@ -264,7 +264,9 @@ class SenderFaults:
             self._sent[frame.sender].append(frame)
         original = frame
         for planned in acting:
-            if isinstance(planned.fault, StaleMessages) and (old := self._older(original, planned.fault.age_s)):
+            if isinstance(planned.fault, StaleMessages) and (
+                old := self._older(original, planned, planned.fault.age_s)
+            ):
                 frame = replace(_again(original, old), cause=planned.number)
         further: dict[int, list[bytes]] = {}
         for planned in acting:
@@ -290,7 +292,7 @@ class SenderFaults:
                 for ghost in range(1, ghosts + 1):
                     yield self._copy(planned, frame, ghost, f"~{ghost}")
             case DataReplay(age_s=age_s):
-                if old := self._older(frame, age_s):
+                if old := self._older(frame, planned, age_s):
                     yield self._copy(planned, replace(_again(frame, old), seq=old.seq), frame.seq - old.seq)
 
     def _copy(self, planned: PlannedFault, frame: Frame, index: int, suffix: str = "") -> Frame:
@@ -305,10 +307,11 @@ class SenderFaults:
             ticket=0,
         )
 
-    def _older(self, frame: Frame, age_s: float) -> Frame | None:
-        """Return the latest frame of a frame's sender that is at least `age_s` older, or None."""
+    def _older(self, frame: Frame, planned: PlannedFault, age_s: float) -> Frame | None:
+        """Return the latest frame of a frame's sender, since a fault began, that is `age_s` older, or None."""
         before_ns = frame.sent_ns - round(age_s * NS_PER_S)
-        return next((sent for sent in reversed(self._sent[frame.sender]) if sent.sent_ns <= before_ns), None)
+        old = next((sent for sent in reversed(self._sent[frame.sender]) if sent.sent_ns <= before_ns), None)
+        return old if old is not None and old.sent_ns >= planned.start_ns else None
 
 
 def _again(frame: Frame, old: Frame) -> Frame:

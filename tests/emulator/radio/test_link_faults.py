@@ -238,8 +238,17 @@ def payloads(air: FaultyEngine, receiver: int = 0) -> list[tuple[str, int, bytes
     return [(d.packet.sender, d.packet.sent_ns, d.packet.payload) for d in air.delivered if d.receiver == receiver]
 
 
-def test_stale_messages_are_those_of_some_time_ago() -> None:
-    air = FaultyEngine([fault("StaleMessages", 1.0, 3.0, nodes={"ids": ["v1"]}, age_s=0.5)], count=2)
+BEFORE_THEM: list[list[dict[str, Any]]] = [
+    [],
+    [fault("DataReplay", 0.0, 1.5, nodes={"ids": ["v1"]}, age_s=9.0)],
+    [fault("StaleMessages", 0.0, 5.0, nodes={"ids": ["v1"]}, age_s=9.0)],
+]
+"""Other faults on the same vehicle, which have nothing old enough to send."""
+
+
+@pytest.mark.parametrize("others", BEFORE_THEM)
+def test_stale_messages_are_those_of_some_time_ago(others: list[dict[str, Any]]) -> None:
+    air = FaultyEngine([fault("StaleMessages", 1.0, 3.0, nodes={"ids": ["v1"]}, age_s=0.5), *others], count=2)
     for number in range(60):
         air.send(number * PERIOD_NS, 1, bytes([number]))
     air.go(10 * S)
@@ -250,8 +259,9 @@ def test_stale_messages_are_those_of_some_time_ago() -> None:
     assert causes == ["" if n < 15 or n >= 40 else "StaleMessages-0" for n in range(60)]
 
 
-def test_replayed_data_come_beside_the_fresh_ones() -> None:
-    air = FaultyEngine([fault("DataReplay", 1.0, 3.0, nodes={"ids": ["v1"]}, age_s=0.5)], count=2)
+@pytest.mark.parametrize("others", BEFORE_THEM)
+def test_replayed_data_come_beside_the_fresh_ones(others: list[dict[str, Any]]) -> None:
+    air = FaultyEngine([fault("DataReplay", 1.0, 3.0, nodes={"ids": ["v1"]}, age_s=0.5), *others], count=2)
     for number in range(60):
         air.send(number * PERIOD_NS, 1, bytes([number]))
     air.go(10 * S)
