@@ -530,7 +530,7 @@ def check_fault_effects(recorded: RecordedRun) -> Iterator[Finding]:
 
 def _effect_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
     if planned.start_ns == planned.end_ns:
-        return not_exercised("it was healed before it began")
+        return not_exercised("it was healed before it began, or lasts less than a nanosecond")
     if planned.start_ns >= recorded.closed_ns:
         return unknown("the run ended before it began")
     if isinstance(planned.fault, SenderFault) and _held_down(recorded, planned):

@@ -342,7 +342,7 @@ CHECKS: list[Check] = [
         FAULTS,
         "The fault took effect.",
         unknown="nothing shows that it did, or the run ended before it began",
-        not_applicable="nothing could show it, or it was healed before it began",
+        not_applicable="nothing could show it, it was healed before it began, or lasts less than a nanosecond",
         name="effect:LABEL",
     ),
     Check(

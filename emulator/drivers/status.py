@@ -197,7 +197,8 @@ class Course:
 
 def fault_state(planned: PlannedFault, emulation: Emulation, now_ns: int) -> FaultState:
     """A fault as its user sees it at an emulated instant."""
-    state = "acting" if planned.acts_at(now_ns) else ("ended" if planned.end_ns <= now_ns else "to come")
+    over_ns = planned.end_ns if planned.end_ns > planned.start_ns else now_ns  # else it was healed before it began
+    state = "acting" if planned.acts_at(now_ns) else ("ended" if over_ns <= now_ns else "to come")
     nodes = tuple(node for node, number in emulation.number.items() if planned.nodes[number])
     return FaultState(planned.label, state, planned.start_ns / NS_PER_S, planned.end_ns / NS_PER_S, nodes)
 

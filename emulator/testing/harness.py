@@ -245,8 +245,9 @@ class RunHarness:
     def _heal(self, planned: PlannedFault) -> None:
         if planned.label in self._open:
             self._open.remove(planned.label)
-            # A fault lasts a nanosecond at least: what never acted would act in the replay.
-            self._emulation.heal(planned.label, max(self._now_ns - 1, planned.start_ns))
+            # One that has begun lasts a nanosecond at least; another never acts, nor does it in the replay.
+            has_begun = planned.start_ns <= self._now_ns
+            self._emulation.heal(planned.label, max(self._now_ns - 1, planned.start_ns if has_begun else 0))
 
     # Promises, judged at its end as checks of one's own: `own:NAME`, by default the predicate's name.
 

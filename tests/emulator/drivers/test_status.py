@@ -95,6 +95,13 @@ def test_vehicles_faults_and_events(shots: list[Snapshot]) -> None:
     assert kinds == ["started", "fault_started", "fault_ended", "restarted"]
 
 
+def test_a_fault_that_was_healed_before_it_began_is_not_to_come(tmp_path: Path) -> None:
+    emulation = emulate(tmp_path / "run", fault=[KILLED])
+    assert Course(emulation, Clock()).snapshot(500_000_000).faults[0].state == "to come"
+    emulation.heal("kill-0", 500_000_000)
+    assert Course(emulation, Clock()).snapshot(600_000_000).faults[0].state == "ended"
+
+
 def test_figures_over_time_are_in_equal_parts_of_the_run(shots: list[Snapshot]) -> None:
     half = next(shot for shot in shots if shot.emulated_s == 2.0)
     assert len(half.over_time["position_rmse_m"]) == BINS / 2

@@ -289,6 +289,19 @@ async def test_all(vnet_emulation, kind, live):
 """).assert_outcomes(passed=4)
 
 
+def test_a_fault_whose_block_is_left_before_it_begins_never_acts(run_tests: RunTests) -> None:
+    run_tests("""
+@pytest.mark.parametrize("live", [False, True])
+async def test_left(vnet_emulation, live):
+    async with vnet_emulation(BEACON, vehicles=2, duration=4, settle=1, live=live) as emu:
+        with emu.fault("kill", nodes=["v02"], at_s=2.0):
+            await emu.run_until(0.5)
+        await emu.run_until(4.0)
+    assert "kill-0" not in (emu.folder / "events.jsonl").read_text()
+    assert "effect:kill-0" in [check.name for check in emu.end().not_exercised]
+""").assert_outcomes(passed=2)
+
+
 def test_a_block_that_an_error_leaves_ends_its_run_where_it_stands(run_tests: RunTests) -> None:
     run_tests("""
 import asyncio
