@@ -25,7 +25,7 @@ import operator
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, cast, get_args
+from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, cast, get_args, get_origin
 
 import numpy as np
 from pydantic import (
@@ -49,6 +49,10 @@ RENAMED_SELECTORS = {"random": "count"}
 """Keys of selectors: the old name, and today's."""
 Probability = Annotated[float, Field(ge=0, le=1)]
 Point = tuple[float, float]
+FURTHEST_M = 1e8
+"""Largest offset of fixes; with much more a double has no room for a receiver's noise beside it."""
+_Far = Annotated[float, Field(ge=-FURTHEST_M, le=FURTHEST_M)]
+_Fast = Annotated[float, Field(ge=-1000, le=1000)]
 DEFAULT_RULE = "rule"
 """Function of a file that is named as a rule without one."""
 
@@ -211,7 +215,7 @@ class Fault(Section):
         """Draw every parameter with a `Drawn`, in the order of the fields; `ranges` are used in place of theirs."""
         drawn: dict[str, Any] = {}
         for name, law in (cls.drawn_ranges() | dict(ranges or {})).items():
-            pair = get_args(cls.model_fields[name].annotation) == get_args(Point)
+            pair = get_origin(cls.model_fields[name].annotation) is tuple
             drawn[name] = (law.draw(choose), law.draw(choose)) if pair else law.draw(choose)
         return drawn
 
@@ -615,7 +619,7 @@ class GnssJump(GnssFault):
     """Fixes are off by a constant."""
 
     kind: Literal["gnss_jump"]
-    offset_m: Annotated[Point, Drawn(-50, 50)]
+    offset_m: Annotated[tuple[_Far, _Far], Drawn(-50, 50)]
     """Offset of the fixes, east and north."""
 
     def displacement_m(self, since_ns: int) -> Array | None:
@@ -627,7 +631,7 @@ class GnssRamp(GnssFault):
     """Fixes drift away, from 0 at the start."""
 
     kind: Literal["gnss_ramp"]
-    rate_m_s: Annotated[Point, Drawn(-3, 3)]
+    rate_m_s: Annotated[tuple[_Fast, _Fast], Drawn(-3, 3)]
     """Speed of the drift, east and north."""
 
     def displacement_m(self, since_ns: int) -> Array | None:
@@ -636,7 +640,7 @@ class GnssRamp(GnssFault):
 
 
 class GnssFreeze(GnssFault):
-    """Fixes repeat the last position, with new times."""
+    """Fixes repeat the receiver's own last position, with new times; offsets of other faults are added to it."""
 
     follows_vehicles: ClassVar[bool] = False
 
@@ -671,7 +675,7 @@ class ConstPosOffset(GnssFault):
     chapter: ClassVar[str] = "Misbehaviour"
 
     kind: Literal["ConstPosOffset"]
-    offset_m: Annotated[Point, Drawn(-50, 50)] = (50.0, 0.0)
+    offset_m: Annotated[tuple[_Far, _Far], Drawn(-50, 50)] = (50.0, 0.0)
     """Offset of the fixes, east and north."""
 
     def displacement_m(self, since_ns: int) -> Array | None:
@@ -685,7 +689,7 @@ class RandomPos(GnssFault):
     chapter: ClassVar[str] = "Misbehaviour"
 
     kind: Literal["RandomPos"]
-    radius_m: Annotated[float, Drawn(1, 300)] = Field(300.0, gt=0)
+    radius_m: Annotated[float, Drawn(1, 300)] = Field(300.0, gt=0, le=FURTHEST_M)
     """Radius of the disc."""
 
 

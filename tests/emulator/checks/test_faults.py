@@ -21,6 +21,7 @@ from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
 from tests.support.exchange_programs import exchange_run
 from tests.support.motion import scenario_of_trips, still, write_trips
+from vnet.errors import ScenarioError
 from vnet.node import Node
 
 NEEDED: dict[str, dict[str, Any]] = {
@@ -331,6 +332,21 @@ def test_a_delay_that_a_fault_owed_is_missed() -> None:
     """Had the delay been planned half a second earlier, those frames came too early."""
     found = not_valid(shifted(with_fault("delay"), -0.5))
     assert found == {"latency": Verdict.INVALID, "fault_events": Verdict.INVALID}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("kind", "key"), [("gnss_jump", "offset_m"), ("ConstPosOffset", "offset_m"), ("gnss_ramp", "rate_m_s")]
+)
+def test_offsets_of_fixes_are_judged_as_far_as_they_may_be_and_refused_beyond(kind: str, key: str) -> None:
+    limit = {"offset_m": 1e8, "rate_m_s": 1e3}[key]
+    for sigma_m in (0.0, 2.0):
+        recorded = simulated(fault(kind, **{key: [limit, -limit]}), world={"gnss": {"sigma_m": sigma_m}})
+        assert verdict(recorded, "gnss") is Verdict.VALID
+    for beyond in (limit * 1.1, -1e18, 1e300):
+        with pytest.raises(ScenarioError, match=key):
+            parse_fault(fault(kind, **{key: [0.0, beyond]}))
 
 
 @pytest.mark.slow
