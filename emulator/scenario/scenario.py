@@ -261,7 +261,7 @@ class Radio(Section):
     access_jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
     """Random wait before the transmission: uniform from 0, drawn for each frame."""
     delivery_tick_us: int = Field(0, ge=0, le=MANY)
-    """Arrivals are rounded up to a multiple of it; 0 means no rounding."""
+    """Arrivals are rounded up to a multiple of it, before faults delay them; 0 means no rounding."""
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
     """A longer payload is refused."""
     bitrate_mbps: float = Field(6.0, ge=1e-6)
