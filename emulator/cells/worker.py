@@ -133,7 +133,7 @@ class Worker:
         self.place = place
         mine, its = socket.socketpair()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the process
-        with its, tempfile.TemporaryFile() as shown:
+        with its, os.fdopen(os.memfd_create("vnet-running-node"), "wb") as shown:  # on no disk, which may be full
             shown.truncate(LONGEST_ID + 1)
             self._running = RunningNode(shown.fileno())
             passed = its.fileno(), shown.fileno()

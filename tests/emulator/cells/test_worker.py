@@ -14,7 +14,14 @@ from unittest.mock import patch
 import pytest
 
 from emulator.cells.cells import WorkerPool, each_done, open_executor
-from emulator.cells.worker import Place, Worker, WorkerDiedError, WorkerTimeoutError, call_fitly, is_fit
+from emulator.cells.worker import (
+    Place,
+    Worker,
+    WorkerDiedError,
+    WorkerTimeoutError,
+    call_fitly,
+    is_fit,
+)
 from emulator.scenario.scenario import Scenario
 from tests.support.paths import ROOT
 from vnet.errors import PayloadTooLargeError, ScenarioError, VnetError
@@ -79,6 +86,20 @@ def test_a_worker_that_dies_or_takes_too_long_says_so() -> None:
     with pytest.raises(WorkerTimeoutError, match=r"not over within 0\.1 s"):
         one.call(time.sleep, 1000, limit_s=0.1)
     assert not one.is_alive
+
+
+def mapped_files() -> str:
+    return Path("/proc/self/maps").read_text()
+
+
+def test_no_memory_of_a_worker_lies_on_the_disk_of_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory that a full disk cannot give ends a process by SIGBUS."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    one = Worker(Place.here(SCENARIO))
+    assert str(tmp_path) not in one.call(mapped_files) + mapped_files()
+    one.close()
 
 
 def test_a_thread_keeps_its_worker_and_takes_it_along() -> None:
