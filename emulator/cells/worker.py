@@ -175,7 +175,7 @@ class Worker:
         `stall_limit_s` without a pause. Ctrl-C interrupts the function.
         """
         if not self._entered:
-            self._ask(self.place.enter, (), None, math.inf)
+            self._ask(_enter, (self.place, tempfile.gettempdir()), None, math.inf)
             self._entered = True
         return self._ask(function, arguments, limit_s, stall_limit_s)
 
@@ -283,6 +283,12 @@ def _receive(connection: Connection, jobs: SimpleQueue[bytes]) -> None:
             jobs.put(connection.recv_bytes())
         except (EOFError, OSError):
             os._exit(0)
+
+
+def _enter(place: Place, temporary: str) -> None:
+    """Enter a place; keep temporary folders where `_end` looks for them, though that disk be full by now."""
+    tempfile.tempdir = temporary
+    place.enter()
 
 
 def _portable(error: BaseException) -> BaseException:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from emulator.cells.worker import (
     WorkerTimeoutError,
     call_fitly,
     is_fit,
+    temporary_prefix,
 )
 from emulator.scenario.scenario import Scenario
 from tests.support.paths import ROOT
@@ -100,6 +102,17 @@ def test_no_memory_of_a_worker_lies_on_the_disk_of_temporary_files(
     one = Worker(Place.here(SCENARIO))
     assert str(tmp_path) not in one.call(mapped_files) + mapped_files()
     one.close()
+
+
+def test_the_temporary_folders_of_a_worker_lie_where_its_starter_removes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that looks for a place by itself takes another where the disk has become full."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    one = Worker(Place.here(SCENARIO))
+    left = Path(one.call(tempfile.mkdtemp, "", temporary_prefix(one.pid)))
+    one.close()
+    assert not left.exists()
 
 
 def test_a_thread_keeps_its_worker_and_takes_it_along() -> None:
