@@ -6,6 +6,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -84,6 +85,8 @@ class Entry:
     without: str
     """The badge of a run without a record, in two words."""
     problem: str
+    files: Sequence[str]
+    """Names of those of its files that the list links."""
 
 
 def write_index(folder: Path) -> Path:
@@ -168,39 +171,47 @@ def _studies(folder: Path, file: str, page: str, read: Callable[[Path], dict[str
 
 def _entries(folder: Path) -> Iterator[Entry]:
     try:
-        below = [path for path in folder.iterdir() if is_run_folder(path)]
+        below = list(folder.iterdir())
     except OSError as error:
         raise VnetError(f"{folder}: cannot be read: {error.strerror or error}") from None
     for path in below:
-        if path.is_symlink() and path.resolve().parent == folder.resolve():
-            continue  # `latest`, which is listed under its own name
-        run = RecordedRun.open(path)
-        record, without = None, "no verdict"
-        problem = "no verdict.json: it is still going on, or was ended from outside"
-        if run.has_record:
+        with suppress(VnetError):  # it has just been removed
+            if path.is_symlink() and path.resolve().parent == folder.resolve():
+                continue  # `latest`, which is listed under its own name
             try:
-                record = run.record
-            except VnetError as error:
-                without, problem = "broken", str(error).removeprefix(f"{path}/")
+                if is_run_folder(path):
+                    yield _entry(path)
+            except OSError as error:
+                problem = f"cannot be read: {error.strerror or error}"
+                yield Entry(path, RecordedRun.open(path).when, None, "unreadable", problem, [])
+
+
+def _entry(path: Path) -> Entry:
+    """Return a run's entry. Raises OSError if the folder cannot be entered, and VnetError if it is gone."""
+    run = RecordedRun.open(path)
+    record, without = None, "no verdict"
+    problem = "no verdict.json: it is still going on, or was ended from outside"
+    if run.has_record:
         try:
-            yield Entry(path, run.when, record, without, problem)
-        except VnetError:
-            continue  # it has just been removed
+            record = run.record
+        except VnetError as error:
+            without, problem = "broken", str(error).removeprefix(f"{path}/")
+    files = [name for name in (REPORT, SCENARIO_FILE, VERDICT_FILE, RECORDING) if (path / name).is_file()]
+    return Entry(path, run.when, record, without, problem, files)
 
 
 def _row(entry: Entry, is_latest: bool, numbers: Sequence[FigureColumn]) -> dict[str, Any]:
     folder, record = entry.folder, entry.record
-    files = [name for name in (SCENARIO_FILE, VERDICT_FILE, RECORDING) if (folder / name).is_file()]
     return {
         "name": folder.name,
-        "link": _link(folder, REPORT if (folder / REPORT).is_file() else ""),
+        "link": _link(folder, REPORT if REPORT in entry.files else ""),
         "is_latest": is_latest,
         "note": f"trace {record.trace_sha256[:12]}" if record else entry.problem,
         "verdict": record.verdict if record else None,
         "without": entry.without,
         "when": entry.when,
         "numbers": [(each.kind, *(each.read(record) if record else ("", "", ""))) for each in numbers],
-        "files": {name: _link(folder, name) for name in files},
+        "files": {name: _link(folder, name) for name in entry.files if name != REPORT},
     }
 
 

@@ -249,6 +249,16 @@ def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Pa
     assert share is not None and f"{100 * share:.2f}" in page.text
 
 
+def test_a_run_that_cannot_be_entered_is_a_row_of_the_index_and_hides_no_other(tmp_path: Path) -> None:
+    for name in ("another-1", "closed-1"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "another-1" / "verdict.json").write_text("{")
+    (tmp_path / "closed-1" / "scenario.toml").symlink_to("n" * 300)  # which root, too, cannot read
+    page = Page(write_index(tmp_path).read_text())
+    assert "2 runs" in page.text and "broken" in page.text
+    assert "cannot be read: File name too long" in page.text and "./closed-1/" in page.references
+
+
 @pytest.mark.usefixtures("no_charts")
 def test_simulate_writes_the_report_and_a_failure_leaves_the_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
