@@ -74,7 +74,7 @@ MOST_ZYGOTES = 3
 
 
 class ZygoteGoneError(Exception):
-    """The zygote has ended before it answered."""
+    """The zygote has ended before it answered; its last line says why."""
 
 
 class ForkedProcess:
@@ -212,12 +212,14 @@ class Zygote:
     def _describe_end(self) -> str:
         assert self._process is not None
         status = self._process.wait()
-        self._output.seek(0)
-        said = self._output.read().decode(errors="replace").splitlines() or ["it said nothing"]
-        last = said[-1]
+        last = self._last_line()
         if "No module named" in last and (foreign := foreign_on_path("agents")):
             last = f"{last}; {foreign}"
         return f"the process from which agents are forked ended before the start (status {status}): {last}"
+
+    def _last_line(self) -> str:
+        self._output.seek(0)
+        return (self._output.read().decode(errors="replace").splitlines() or ["it said nothing"])[-1]
 
     def fork(self, request: forking.ForkRequest, descriptors: Sequence[int]) -> forking.ForkReply:
         """Fork the agents of a request, with two descriptors each. Raises VnetError and ZygoteGoneError."""
@@ -237,7 +239,7 @@ class Zygote:
         except ConnectionError:
             data = b""
         if not data:
-            raise ZygoteGoneError
+            raise ZygoteGoneError(self._last_line())
         return forking.decode_reply(data)
 
     def start_if_gone(self) -> None:
@@ -461,13 +463,14 @@ class Launcher:
         An agent that never gets its credentials ends; so none is there twice if a zygote ends meanwhile.
         """
         request = forking.ForkRequest(list(agents.values()))
-        names = list(agents)
+        names, last = list(agents), ""
         for _ in range(MOST_ZYGOTES):
             with ExitStack() as stack:
                 ends = [self._open_ends(name, stack) for name in names]
                 try:
                     reply = zygote.fork(request, [end for read_end, _, log in ends for end in (read_end, log)])
-                except ZygoteGoneError:
+                except ZygoteGoneError as gone:
+                    last = str(gone)
                     zygote.start()
                     continue
                 for name, pid, (_, write_end, _) in zip(names, reply.pids, ends, strict=False):
@@ -477,7 +480,7 @@ class Launcher:
             if reply.failure:
                 raise _cannot_start(names[len(reply.pids)], reply.failure)
             return
-        raise _cannot_start(names[0], f"{MOST_ZYGOTES} zygotes in a row have ended")
+        raise _cannot_start(names[0], f"{MOST_ZYGOTES} zygotes in a row have ended: {last}")
 
     def _open_ends(self, name: str, stack: ExitStack) -> tuple[int, int, int]:
         """Open a pipe for the credentials of an agent (both ends) and its log; `stack` closes them."""

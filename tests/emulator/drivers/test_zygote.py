@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -172,7 +173,7 @@ class Failing(Zygote):
     def fork(self, request: forking.ForkRequest, descriptors: Sequence[int]) -> forking.ForkReply:
         answer = self.answers.pop(0)
         if answer is None:
-            raise ZygoteGoneError
+            raise ZygoteGoneError("AssertionError: it has threads")
         return answer
 
 
@@ -184,9 +185,17 @@ def test_a_system_without_room_for_more_processes_is_one_line(tmp_path: Path) ->
 
 def test_zygotes_that_never_stay_are_one_line(tmp_path: Path) -> None:
     failing = Failing([None] * MOST_ZYGOTES)
-    with pytest.raises(VnetError, match="cannot start the process of v01: 3 zygotes in a row have ended"):
+    with pytest.raises(VnetError, match=r"process of v01: 3 zygotes in a row have ended: .*: it has threads"):
         Launcher(tmp_path, zygote=failing).start_agents(REFUSED, ACCESS, [["v01"]])
     assert failing.starts == MOST_ZYGOTES
+
+
+def test_a_zygote_that_ends_when_it_is_asked_says_why() -> None:
+    with closing(Zygote([])) as zygote:
+        zygote.start()
+        wait_until(zygote.is_ready)
+        with pytest.raises(ZygoteGoneError, match=r"^msgspec\.\w+Error: "):
+            zygote.fork(cast("forking.ForkRequest", forking.ForkReply([], "")), [])
 
 
 def test_a_zygote_that_cannot_import_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
