@@ -12,7 +12,9 @@ megabytes. `agents/zygote.py` is the other side of the `Zygote` here.
 
 from __future__ import annotations
 
+import _posixsubprocess
 import ctypes
+import inspect
 import os
 import select
 import signal
@@ -147,6 +149,15 @@ def _prctl(option: int, argument: object) -> None:
 
 
 _subreaper = _Subreaper()
+
+
+def can_fork() -> bool:
+    """Return whether agents can be forked here.
+
+    A debugger that follows new processes (that of VS Code, of PyCharm) starts itself in each, with threads, so that
+    a zygote could not fork: it then follows agents that are interpreters of their own.
+    """
+    return sys.platform == "linux" and inspect.isbuiltin(_posixsubprocess.fork_exec)
 
 
 class Zygote:

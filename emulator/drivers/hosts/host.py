@@ -25,7 +25,7 @@ import zenoh
 from emulator.drivers.agent_keys import AgentKeys, Hear
 from emulator.drivers.hosts import messages
 from emulator.drivers.hosts.messages import Call, Calls, HostHello, HostWelcome, encode
-from emulator.drivers.launch import Launcher, Zygote
+from emulator.drivers.launch import Launcher, Zygote, can_fork
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
 from emulator.records.code_digest import vnet_digest
@@ -204,7 +204,7 @@ def run_host(
         on_state(f"host {name}: {agents} of run {run}")
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="vnet-host-")))
         (folder / "logs").mkdir()
-        zygote = Zygote(welcome.modules) if welcome.start == "fork" and sys.platform == "linux" else None
+        zygote = Zygote(welcome.modules) if welcome.start == "fork" and can_fork() else None
         launcher = Launcher(folder / "logs", folders, zygote, join_timeout_s)
         launcher.disks = folder / "disks"
         stack.callback(launcher.stop, SHUT_DOWN_S)

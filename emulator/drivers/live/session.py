@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-import sys
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import ExitStack
@@ -22,7 +21,7 @@ from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.control import answer, control_endpoint
 from emulator.drivers.debugging import debug_point
 from emulator.drivers.emulation import Emulation, PeriodView
-from emulator.drivers.launch import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Launcher, Zygote
+from emulator.drivers.launch import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Launcher, Zygote, can_fork
 from emulator.drivers.live.processes import RECORDER, LiveProcesses, to_its_end
 from emulator.drivers.live.supervisor import SHUT_DOWN_S
 from emulator.drivers.lockstep import HorizonCallback, Lockstep, no_horizon, run_in_lockstep
@@ -97,7 +96,7 @@ async def run_live(
 
 def _zygote(scenario: Scenario) -> Zygote | None:
     """The process from which agents are forked, if they are to be, and this system can."""
-    if scenario.run.start == "spawn" or sys.platform != "linux" or scenario.has_gateways:
+    if scenario.run.start == "spawn" or not can_fork() or scenario.has_gateways:
         return None
     return Zygote([entry.partition(":")[0] for entry in entries_of(scenario)], _agent_environment(scenario))
 

@@ -1,5 +1,6 @@
 """Agents that are forked from a zygote: whose children they are, what they get, and a zygote that ends."""
 
+import _posixsubprocess
 import os
 import signal
 import socket
@@ -12,7 +13,7 @@ from typing import cast
 import pytest
 
 from emulator.drivers import launch as zygotes
-from emulator.drivers.launch import MOST_ZYGOTES, Exit, ForkedProcess, Launcher, Zygote, ZygoteGoneError
+from emulator.drivers.launch import MOST_ZYGOTES, Exit, ForkedProcess, Launcher, Zygote, ZygoteGoneError, can_fork
 from tests.support.processes import has_ended, wait_until
 from vnet.errors import VnetError
 from vnet.runtime import forking
@@ -196,6 +197,14 @@ def test_a_zygote_that_ends_when_it_is_asked_says_why() -> None:
         wait_until(zygote.is_ready)
         with pytest.raises(ZygoteGoneError, match=r"^msgspec\.\w+Error: "):
             zygote.fork(cast("forking.ForkRequest", forking.ForkReply([], "")), [])
+
+
+def test_no_agent_is_forked_where_a_debugger_follows_new_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It starts itself in each, with threads, and may only stop in agents that are interpreters of their own."""
+    assert can_fork()
+    start = _posixsubprocess.fork_exec
+    monkeypatch.setattr("_posixsubprocess.fork_exec", lambda *arguments: start(*arguments))
+    assert not can_fork()
 
 
 def test_a_zygote_that_cannot_import_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
