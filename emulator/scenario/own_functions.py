@@ -193,6 +193,21 @@ class WaitedError(NoAnswerError):
         return f"{WAIT_LIMIT_S:g} s of waiting"
 
 
+class NoThreadError(VnetError):
+    """This process has no room for a thread that watches a call: not the function's fault."""
+
+
+def _start(function: Callable[..., object], *arguments: object, name: str) -> threading.Thread:
+    thread = threading.Thread(target=function, args=arguments, name=name, daemon=True)
+    try:
+        thread.start()
+    except RuntimeError as error:
+        raise NoThreadError(
+            f"no room for a thread that watches own figures, rules and sensors: {error}: see ulimit -v and -u"
+        ) from None
+    return thread
+
+
 @dataclass(eq=False)
 class _Call:
     """A call that is on: its thread, the clock of that thread, and its time by that clock at the start, in ns.
@@ -291,8 +306,7 @@ class _Watch:
             self._calls.add(call)
             self._last_s = time.monotonic()
             if self._thread is None or not self._thread.is_alive():  # a fork has no threads but its own
-                self._thread = threading.Thread(target=self._look, name="rule watch", daemon=True)
-                self._thread.start()
+                self._thread = _start(self._look, name="rule watch")
 
     def end(self, call: _Call) -> None:
         call.is_on = False
@@ -341,7 +355,7 @@ def _call_aside(function: Callable[..., T], *arguments: object) -> T:
         else:
             answers.put(lambda: answer)
 
-    threading.Thread(target=copy_context().run, args=(run,), name="rule", daemon=True).start()
+    _start(copy_context().run, run, name="rule")
     return answers.get()()
 
 
@@ -373,8 +387,10 @@ def _call_here(call: _Call, function: Callable[..., T], *arguments: object) -> T
 def told(error: BaseException, *files: str) -> tuple[str, str]:
     """Return in one line how a function of the user's own failed, with its line, and the traceback from there on.
 
-    `files` are those of vnet in the traceback, besides this one.
+    `files` are those of vnet in the traceback, besides this one. Raises NoThreadError if that is the error.
     """
+    if isinstance(error, NoThreadError):
+        raise error
     if isinstance(error, NonsenseError):
         return f"answers {error}", ""
     frames = outside(error, __file__, *files)

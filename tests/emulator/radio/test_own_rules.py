@@ -1,6 +1,7 @@
 """Rules of the user's own on the radio: what they see, what they may answer, and what happens if they fail."""
 
 import signal
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +21,7 @@ from emulator.scenario.scenario import Scenario
 from tests.support import rules
 from tests.support.answers import answers
 from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, Row, S, digest, fault
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, VnetError
 from vnet.radio import SentFrame
 
 pytestmark = pytest.mark.slow
@@ -248,6 +249,16 @@ def test_a_rule_that_never_answers_is_interrupted_after_its_processor_time(monke
     (failure,) = air.failures
     assert failure.error.startswith("does not answer within 0.05 s of processor time (rules.py:")
     assert air.rows() == free.rows()
+
+
+def test_a_machine_without_room_for_the_watch_is_no_failure_of_the_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(own_functions, "_WATCH", own_functions._Watch())
+    monkeypatch.setattr("threading.Thread.start", start)
+    with pytest.raises(VnetError, match=r"own figures, rules and sensors: can't start new thread: see ulimit"):
+        chatted(rule("loops"), periods=1)
 
 
 @pytest.fixture
