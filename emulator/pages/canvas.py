@@ -39,6 +39,7 @@ CURVES = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 for _library in map(logging.getLogger, ("matplotlib", "PIL")):
     if _library.level == logging.NOTSET:  # a program may have asked for all that anybody logs
         _library.setLevel(logging.WARNING)
+    _library.addHandler(logging.NullHandler())  # else Python prints warnings of it, as of a home without a cache
 _VARIABLE = {colour.light: f"var(--{name})" for name, colour in PALETTE.items()}
 
 WIDTH_PX, PLOT_PX = 400, 190

@@ -1,7 +1,10 @@
 """Pages escape, cut and make printable what others wrote, and their templates are shipped."""
 
 import logging
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from collections import Counter
 from collections.abc import Callable
@@ -139,6 +142,15 @@ def test_a_program_that_logs_all_gets_nothing_of_the_drawing(caplog: pytest.LogC
         logging.getLogger("matplotlib.font_manager").debug("findfont: score")
         logging.getLogger("theirs").debug("said")
     assert caplog.messages == ["said"]
+
+
+@pytest.mark.slow
+def test_nothing_is_printed_where_the_home_cannot_be_written() -> None:
+    """Standard error may be for JSON alone; a process of its own, as pytest takes what is logged."""
+    words = [sys.executable, "-c", "import emulator.pages.canvas, matplotlib.font_manager"]
+    environment = {**os.environ, "MPLCONFIGDIR": "/dev/null"}
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_every_file_of_the_packages_is_shipped() -> None:
