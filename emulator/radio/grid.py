@@ -307,7 +307,7 @@ class SensedGrid:
         step = min(wanted.period, hundred) if wanted.period else hundred
         slots = np.arange(wanted.first, wanted.last + 1)
         latest = slots - step * -(-(slots - now + 1) // step)
-        each = latest - step * np.arange((self._slots - 1) // step)[:, None]
+        each = latest - step * np.arange(self._slots // step)[:, None]
         known = each >= max(now - self._slots, 0)
         rows = each % self._ring
         counts = np.add.reduce(known & ~self._deaf[wanted.node].take(rows), axis=0, dtype=np.intp)

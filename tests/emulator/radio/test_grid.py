@@ -155,6 +155,20 @@ def test_the_quietest_fifth_is_taken_and_equal_ones_by_lot() -> None:
     assert set(chosen) == set(even[np.argsort(ties[even])[:20]])
 
 
+@pytest.mark.parametrize(("period", "samples"), [(20, 50), (50, 20), (100, 10), (500, 10)])
+@pytest.mark.parametrize("ago", [1, 450, 900, 901, 1000, 1001])
+def test_ranking_averages_all_periods_of_the_sensing_window(period: int, samples: int, ago: int) -> None:
+    """The window is 1000 ms, with a sample every period, or every 100 ms (TS 36.213, 14.1.1.6)."""
+    mac, now = lte(subchannels=1), 2000
+    grid = SensedGrid(mac, 2)
+    sense(grid, mac, now - ago, [(0, 1, 0, LOUD_DBM)])
+    found = grid.candidates(now, Wanted(0, now + 1, now + 100, 1, period, 10))
+    assert found.power_mw is not None
+    step = min(period, 100)
+    expected = [1e-6 / samples if ago <= 1000 and (1 + n + ago) % step == 0 else 0 for n in range(100)]
+    assert found.power_mw[:, 0] == pytest.approx(expected)
+
+
 def test_nr_takes_any_of_the_candidates() -> None:
     mac = NrMode2.model_validate({"kind": "nr-mode2", "scs_khz": 60, "subchannels": 2, "sensing_ms": 100})
     grid = SensedGrid(mac, 1)
