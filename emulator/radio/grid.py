@@ -37,7 +37,7 @@ class Wanted(NamedTuple):
     """Resources that a vehicle looks for: `length` subchannels in a slot from `first` to `last`.
 
     It will use them again every `period` slots, `times` times in all. It transmits anyway in the slots `booked`.
-    A resource that it `checks` again is in slot `first`, and stays unless others have reserved it.
+    The slots of resources that it `checks` again are left unless others have reserved these.
     """
 
     node: int
@@ -47,7 +47,7 @@ class Wanted(NamedTuple):
     period: int
     times: int
     booked: frozenset[int] = frozenset()
-    checks: bool = False
+    checks: tuple[int, ...] = ()
 
 
 class Candidates(NamedTuple):
@@ -117,13 +117,14 @@ class Places(NamedTuple):
 class Heard(NamedTuple):
     """Frames of some slots: received powers (K, N) in mW, who decoded what they reserve, and their places.
 
-    Their `periods` (K,) are in slots; 0 reserves nothing.
+    They have `told` their periods in slots and, where frames are sent twice, how many resources later their second
+    transmission begins, counted slot by slot: (1 or 2, K), and 0 reserves nothing.
     """
 
     power_mw: Array
     decoded: Mask
     places: Places
-    periods: IntArray
+    told: IntArray
 
 
 class SensedGrid:
@@ -136,7 +137,7 @@ class SensedGrid:
         self._busy_mw = milliwatts(mac.busy_dbm)
         shape = count, self._ring, mac.subchannels
         self._reserved_dbm = np.full(shape, NOT_RESERVED_DBM, np.float16)
-        self._period = np.zeros(shape, np.int16)
+        self._told = np.zeros((1 + mac.retransmit, *shape), np.int16)
         self._power_mw = np.zeros(shape, np.float32) if mac.ranks_power else None
         self._deaf = np.zeros((count, self._ring), bool)
         self._next = 0
@@ -147,7 +148,7 @@ class SensedGrid:
         if first >= slot:
             return
         for rows, _ in self._spans(first, slot - first):
-            self._reserved_dbm[:, rows], self._period[:, rows], self._deaf[:, rows] = NOT_RESERVED_DBM, 0, False
+            self._reserved_dbm[:, rows], self._told[:, :, rows], self._deaf[:, rows] = NOT_RESERVED_DBM, 0, False
             if self._power_mw is not None:
                 self._power_mw[:, rows] = 0
         self._next = slot
@@ -169,7 +170,7 @@ class SensedGrid:
         self.advance(slots[0])
         index = np.array(slots) - slots[0]
         shape = slots[-1] - slots[0] + 1, *power_mw.shape[1:]
-        reserved_dbm, period = self._reservations(shape, index, heard)
+        reserved_dbm, told = self._reservations(shape, index, heard)
         silent = np.zeros((shape[0], shape[2]), bool)
         silent[index] = deaf
         sensed_mw = None
@@ -178,7 +179,7 @@ class SensedGrid:
             sensed_mw[index] = np.where(deaf[:, None] | (power_mw < self._busy_mw), 0, power_mw)
         for rows, some in self._spans(slots[0], shape[0]):
             self._reserved_dbm[:, rows] = reserved_dbm[some].transpose(2, 0, 1)
-            self._period[:, rows] = period[some].transpose(2, 0, 1)
+            self._told[:, :, rows] = told[:, some].transpose(0, 3, 1, 2)
             self._deaf[:, rows] = silent[some].T
             if self._power_mw is not None and sensed_mw is not None:
                 self._power_mw[:, rows] = sensed_mw[some].transpose(2, 0, 1)
@@ -187,29 +188,30 @@ class SensedGrid:
     def _reservations(
         self, shape: tuple[int, ...], index: IntArray, heard: Heard
     ) -> tuple[NDArray[np.float16], NDArray[np.int16]]:
-        """Return the strongest reservation that each vehicle decodes on each resource, and its period.
+        """Return the strongest reservation that each vehicle decodes on each resource, and what is told there.
 
-        Both have the `shape` (slots, subchannels, N); `index` are the slots of the frames.
+        The first has the `shape` (slots, subchannels, N); `index` are the slots of the frames.
         """
         each_dbm = np.full(heard.power_mw.shape, NOT_RESERVED_DBM)
         np.log10(heard.power_mw, out=each_dbm, where=heard.decoded)
         each_dbm *= 10
-        each_dbm[heard.periods == 0] = NOT_RESERVED_DBM
-        each_period = (each_dbm > NOT_RESERVED_DBM) * heard.periods[:, None].astype(np.int16)
+        each_dbm[~heard.told.any(axis=0)] = NOT_RESERVED_DBM
+        each_told = (each_dbm > NOT_RESERVED_DBM) * heard.told[:, :, None].astype(np.int16)
         frame, slot, subchannel = heard.places.resources()
         row, index = index[slot] * shape[1] + subchannel, np.arange(len(frame))
         first = np.zeros(shape[0] * shape[1], np.intp)
         first[row[::-1]] = index[::-1]  # of several the one assigned last stays
         is_first = first[row] == index
         reserved_dbm = np.full((len(first), shape[2]), NOT_RESERVED_DBM, np.float16)
-        period = np.zeros((len(first), shape[2]), np.int16)
-        reserved_dbm[row[is_first]], period[row[is_first]] = each_dbm[frame[is_first]], each_period[frame[is_first]]
+        told = np.zeros((len(each_told), len(first), shape[2]), np.int16)
+        reserved_dbm[row[is_first]] = each_dbm[frame[is_first]]
+        told[:, row[is_first]] = each_told[:, frame[is_first]]
         for number in np.flatnonzero(~is_first).tolist():
             place, dbm = row[number], each_dbm[frame[number]].astype(np.float16)
             stronger = dbm > reserved_dbm[place]
             np.copyto(reserved_dbm[place], dbm, where=stronger)
-            np.copyto(period[place], each_period[frame[number]], where=stronger)
-        return reserved_dbm.reshape(shape), period.reshape(shape)
+            np.copyto(told[:, place], each_told[:, frame[number]], where=stronger)
+        return reserved_dbm.reshape(shape), told.reshape(-1, *shape)
 
     def candidates(self, now: int, wanted: Wanted) -> Candidates:
         """Return the candidates among the resources that a vehicle looks for in slot `now`.
@@ -222,7 +224,8 @@ class SensedGrid:
         if wanted.booked:
             free[[slot - wanted.first for slot in wanted.booked if 0 <= slot - wanted.first < len(free)]] = False
         monitored = free & ~self._unmonitored(now, wanted)
-        monitored[0] |= wanted.checks & free[0]
+        checked = [slot - wanted.first for slot in wanted.checks]
+        monitored[checked] = free[checked]
         least = int(np.ceil(self._mac.candidate_share * strongest_dbm.size))
         if monitored.sum() * strongest_dbm.shape[1] < least:
             monitored = free
@@ -242,15 +245,15 @@ class SensedGrid:
 
     def _strongest_dbm(self, now: int, wanted: Wanted) -> Array:
         """Return the strongest signal (slots, places) whose sender has reserved a part of each resource."""
-        periods = self._period[wanted.node].ravel()
-        place = np.flatnonzero(periods != 0)
+        told = self._told[:, wanted.node].reshape(len(self._told), -1)
+        place = np.flatnonzero(np.bitwise_or.reduce(told))
         row = place // self._mac.subchannels
         slot = self._slot_of(row)
         known = (slot < now) & (slot >= now - self._slots)
         if not known.all():
             place, row, slot = place[known], row[known], slot[known]
         subchannel = place - row * self._mac.subchannels
-        period = periods[place].astype(np.int64)
+        period = told[0, place].astype(np.int64)
         dbm = self._reserved_dbm[wanted.node].ravel()[place].astype(float)
         window = wanted.last - wanted.first + 1
         strongest_dbm = np.full((window, self._mac.subchannels), NOT_RESERVED_DBM)
@@ -258,6 +261,13 @@ class SensedGrid:
         repeats = np.ones(len(period), np.int64)
         short = np.flatnonzero((period < scale) & (now - slot <= period))
         repeats[short] = -(-scale // period[short])
+        if len(told) > 1:
+            twice = np.flatnonzero(told[1, place])
+            later = subchannel[twice] + told[1, place[twice]]
+            slots, subchannels = slot[twice] + later // self._mac.subchannels, later % self._mac.subchannels
+            self._mark(wanted, strongest_dbm, slots, subchannels, dbm[twice])
+            slot, subchannel = np.concatenate([slot, slots]), np.concatenate([subchannel, subchannels])
+            period, dbm, repeats = (np.concatenate([each, each[twice]]) for each in (period, dbm, repeats))
         for nth in range(1, int(repeats.max(initial=0)) + 1):
             if nth > 1:
                 again = nth <= repeats

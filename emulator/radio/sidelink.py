@@ -375,16 +375,18 @@ class Sidelink(Mac):
         first, subchannel, repeat = self._choose(found, sent.frame, _CHOICE)
         self._book(_Booking(flow, first, subchannel, length, sent, repeat=repeat, last=last), checks=True)
 
-    def _choose(self, found: Candidates, frame: Frame, which: int) -> tuple[int, int, tuple[int, int] | None]:
+    def _choose(
+        self, found: Candidates, frame: Frame, which: int, kept: tuple[int, int] | None = None
+    ) -> tuple[int, int, tuple[int, int] | None]:
         """Return the slot and the subchannel of a candidate, and (slots later, subchannel) of a second one.
 
-        The earlier one of the two that are chosen is used first.
+        The earlier one of the two is used first. The second one may be there already, and `kept`.
         """
         first = found.chosen(self._draw(frame, which))
         near = found.around(first[0], REPEAT_SLOTS)
-        if not self._mac.retransmit or not near.mask.any():
+        if not self._mac.retransmit or not (kept or near.mask.any()):
             return *first, None
-        first, second = sorted([first, near.chosen(self._draw(frame, _REPEAT))])
+        first, second = sorted([first, kept or near.chosen(self._draw(frame, _REPEAT))])
         return *first, (second[0] - first[0], second[1])
 
     def _candidates(self, station: _Station, frame: Frame, wanted: Wanted) -> Candidates:
@@ -426,14 +428,18 @@ class Sidelink(Mac):
             self._plan(check_ns, CHECK, booking.station.node, booking)
 
     def _check_again(self, booking: _Booking) -> None:
-        """Select another resource if the one that was selected has been reserved meanwhile (re-evaluation)."""
+        """Replace those of the selected resources that have been reserved meanwhile (re-evaluation)."""
         flow, station, grant = booking.flow, booking.station, booking.grant
         if grant is not None and (flow.grant is not grant or not flow.queue):
             return
         sent = booking.sent or flow.queue[0][1]  # the first use of a grant is that of the frame it was selected for
         times = 10 * grant.counter if grant is not None else 1
+        chosen = [(booking.slot, booking.subchannel)]
+        if booking.repeat is not None:
+            chosen.append((booking.slot + booking.repeat[0], booking.repeat[1]))
+        checks = tuple(slot for slot, _ in chosen)
         wanted = Wanted(
-            station.node, booking.slot, booking.last, booking.length, booking.period, times, checks=True
+            station.node, booking.slot, booking.last, booking.length, booking.period, times, checks=checks
         )
         station.booked -= booking.slots
         if grant is not None:
@@ -441,11 +447,14 @@ class Sidelink(Mac):
         found = self._candidates(station, sent.frame, wanted)
         if grant is not None:
             flow.grant = grant
-        if found.has(booking.slot, booking.subchannel) or not found.mask.any():
+        kept = [each for each in chosen if found.has(*each)]
+        if kept:
+            found = found.around(kept[0][0], REPEAT_SLOTS)
+        if len(kept) == len(chosen) or not found.mask.any():
             station.booked |= booking.slots
             return
         self._booked[booking.slot].remove(booking)
-        booking.slot, booking.subchannel, booking.repeat = self._choose(found, sent.frame, _AGAIN)
+        booking.slot, booking.subchannel, booking.repeat = self._choose(found, sent.frame, _AGAIN, *kept)
         if grant is not None:
             grant.slot, grant.subchannel, grant.repeat = booking.slot, booking.subchannel, booking.repeat
         self._book(booking)
@@ -571,10 +580,17 @@ class Sidelink(Mac):
         busy[places.slot, nodes] = places.length
         for booking, own_mw, each_mw, index in zip(on_air, power_mw, others_mw, places.slot.tolist(), strict=True):
             _signal(booking.sent).slots.append(InSlot(own_mw, each_mw, deaf[index], booking.length))
-        periods = np.array([booking.period for booking in on_air])
-        self._grid.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods))
+        told = [[booking.period for booking in on_air]]
+        if self._mac.retransmit:
+            told.append([self._resources_until_repeat(booking) for booking in on_air])
+        self._grid.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, np.array(told)))
         for slot, each in zip(slots, busy, strict=True):
             self._meter.add(slot, each)
+
+    def _resources_until_repeat(self, booking: _Booking) -> int:
+        """Return how many resources later a frame is transmitted again, or 0: its first transmission tells it."""
+        gap, subchannel = booking.repeat or (0, booking.subchannel)
+        return gap * self._mac.subchannels + subchannel - booking.subchannel
 
     def _power_mw(self, booking: _Booking) -> Array:
         """Return the powers (N,) of a transmission: a second one has fading of its own."""

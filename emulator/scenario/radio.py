@@ -152,7 +152,7 @@ class NrMode2(Sidelink):
     scheduling: Literal["sps", "dynamic"] = "sps"
     """`sps` reserves a resource for the frames to come; `dynamic` selects one for each frame."""
     re_evaluation: Switch = True
-    """True if a new resource is checked once more, `t1_slots` before it is used, and replaced if it is taken."""
+    """True if new resources are checked once more, `t1_slots` before they are used, and replaced if taken."""
 
     @property
     def slot_ns(self) -> int:

@@ -18,8 +18,13 @@ def lte(**keys: Any) -> LteMode4:
     return LteMode4.model_validate({"kind": "lte-mode4", "busy_dbm": -120, **keys})
 
 
-def sense(grid: SensedGrid, mac: Sidelink, slot: int, frames: list[tuple[int, int, int, float]]) -> None:
-    """Let vehicle 1 transmit frames, which vehicle 0 hears: first subchannel, length, period, power in dBm."""
+def sense(
+    grid: SensedGrid, mac: Sidelink, slot: int, frames: list[tuple[int, int, int, float]], later: int = 0
+) -> None:
+    """Let vehicle 1 transmit frames, which vehicle 0 hears: first subchannel, length, period, power in dBm.
+
+    Each is transmitted again so many resources `later`, counted slot by slot.
+    """
     power_mw = np.zeros((mac.subchannels, 2))
     for first, length, _, dbm in frames:
         power_mw[first : first + length, 0] += 10 ** (dbm / 10) / length
@@ -27,7 +32,8 @@ def sense(grid: SensedGrid, mac: Sidelink, slot: int, frames: list[tuple[int, in
     decoded = np.array([[True, False]] * len(frames))
     starts, lengths, periods, _ = (np.array(column) for column in zip(*frames, strict=True))
     places = Places(np.zeros(len(frames), np.int64), starts, lengths)
-    grid.sense([slot], power_mw[None], np.array([[False, True]]), Heard(own_mw, decoded, places, periods))
+    told = np.array([periods, np.full(len(frames), later)][: 1 + mac.retransmit])
+    grid.sense([slot], power_mw[None], np.array([[False, True]]), Heard(own_mw, decoded, places, told))
 
 
 frame_lists = st.lists(
@@ -100,7 +106,7 @@ def test_slots_that_are_sensed_at_once_are_as_if_one_by_one(
     for own_mw, (slot, start, count) in zip(power_mw, np.column_stack(places).tolist(), strict=True):
         sensed_mw[slot, start : start + count, 0] += own_mw[0] / count
     deaf = np.array([[False, True]] * len(slots))
-    at_once.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods))
+    at_once.sense(slots, sensed_mw, deaf, Heard(power_mw, decoded, places, periods[None]))
     for slot in slots:
         sense(one_by_one, mac, slot, [each[1:] for each in frames if each[0] == slot])
     for node in (0, 1):
@@ -109,6 +115,27 @@ def test_slots_that_are_sensed_at_once_are_as_if_one_by_one(
         assert np.array_equal(found.mask, expected.mask)
         assert found.power_mw is not None and expected.power_mw is not None
         assert np.array_equal(found.power_mw, expected.power_mw)
+
+
+@pytest.mark.parametrize(("period", "uses"), [(0, [0]), (30, [0, 1, 2, 3, 4]), (100, [0, 1])])
+@pytest.mark.parametrize("length", [1, 2])
+@pytest.mark.parametrize("kind", ["lte-mode4", "nr-mode2"])
+def test_a_first_transmission_reserves_the_second_one(kind: str, length: int, period: int, uses: list[int]) -> None:
+    """It is in the same control information, whether or not that tells a period (TS 38.214, 8.1.4 and 8.1.5)."""
+    options: dict[str, Any] = {"subchannels": 4, "retransmit": True, "busy_dbm": 0}
+    mac = (
+        lte(**options) if kind == "lte-mode4" else NrMode2.model_validate({"kind": kind, "scs_khz": 15, **options})
+    )
+    for gap, first, second in ((1, 3 - length, 0), (9, 0, 4 - length), (15, 1, 1)):
+        grid, slot = SensedGrid(mac, 2), 200
+        sense(grid, mac, slot, [(first, length, period, LOUD_DBM)], gap * 4 + second - first)
+        found = grid.candidates(slot + 1, Wanted(0, slot + 1, slot + 150, 1, 0, 1))
+        taken = {(slot + gap + period * use, second + n) for use in uses for n in range(length)}
+        taken |= {(slot + period * use, first + n) for use in uses[1:] for n in range(length)}
+        expected = {(at, sub) for at, sub in taken if found.first <= at < found.first + len(found.mask)}
+        assert {(found.first + at, sub) for at, sub in np.argwhere(~found.mask).tolist()} == expected
+    grid.advance(2 * 1100)
+    assert grid.candidates(2 * 1100, Wanted(0, 2201, 2300, 1, 0, 1)).mask.all()
 
 
 def test_threshold_rises_until_a_fifth_remains() -> None:

@@ -212,6 +212,39 @@ def test_re_evaluation_leaves_a_resource_alone_that_nobody_has_reserved(
     assert one == other
 
 
+def selected(seed: int, scheduling: str, checks: bool) -> list[tuple[int, int]]:
+    """Let two vehicles send a frame, the second one 3 slots later; return the two slots of each."""
+    mac = {"scs_khz": 15, "subchannels": 1, "t1_slots": 2, "t2_ms": 12, "retransmit": True}
+    radio = with_mac(NR, scheduling=scheduling, re_evaluation=checks, **mac)
+    subject = engine(line(0, 50), seed, access_jitter_ms=0.0, **radio)
+    for node in (0, 1):
+        subject.advance(3 * node * MS)
+        subject.transmit(3 * node * MS, node, [b"x"])
+    rows = sorted(drained(subject), key=lambda row: row["sender"])
+    return [(row["on_air_ns"] // MS, row["left_ns"] // MS - 1) for row in rows]
+
+
+@pytest.mark.parametrize("scheduling", ["sps", "dynamic"])
+def test_re_evaluation_replaces_those_resources_that_another_has_told(scheduling: str) -> None:
+    replaced = Counter[str]()
+    for seed in range(200):
+        before, after = (selected(seed, scheduling, checks) for checks in (False, True))
+        (first, told), mine = before
+        if first < 3:
+            assert told not in mine, "known as the second vehicle selects"
+        if first >= mine[0] - 2 or mine[0] > 10:
+            continue
+        assert after[0] == before[0]
+        if told not in mine:
+            assert after == before
+            continue
+        kept = mine[told == mine[0]]
+        other = sum(after[1]) - kept
+        assert kept in after[1] and other != told and mine[0] <= other <= 15 and 0 < abs(other - kept) <= 15
+        replaced["second" if told == mine[1] else "first"] += 1
+    assert min(replaced["first"], replaced["second"]) >= 5, replaced
+
+
 @pytest.mark.parametrize("again", [False, True])
 @pytest.mark.parametrize(("scs_khz", "periods_ms"), [(15, (1, 100)), (30, (1, 2, 5, 100))])
 def test_flows_that_use_all_slots_leave_some_frames_without_a_place(
