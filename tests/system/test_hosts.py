@@ -9,12 +9,15 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import tomli_w
 import zenoh
 
+from emulator.drivers.hosts import host as host_side
+from emulator.drivers.hosts import messages
 from tests.support.forked_commands import VNET, Command, run
 from tests.support.namespaces import NetworkHost, network, why_impossible
 from tests.support.paths import ROOT
@@ -132,6 +135,20 @@ def test_a_host_that_is_cut_off_ends_the_run_as_unknown(three_hosts: list[Networ
     assert stalled == {"v05": ASKED_NS, "v06": ASKED_NS}
     assert [event["host"] for event in done.events_of("host_silent")] == ["c"]
     assert (done.folder / "logs" / "v01.log").exists(), "the other hosts have handed in what they have"
+
+
+def test_a_host_without_a_place_for_its_files_tells_the_emulator(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[messages.HostHello] = []
+    welcome = messages.HostWelcome(b"", [["v01"]], "spawn", [], False, 1.0, 1, 1.0)
+    monkeypatch.setattr(host_side, "Up", lambda *given: SimpleNamespace(nonce=b"", say_hello=said.append))
+    monkeypatch.setattr(host_side._Join, "until_welcome", lambda join: welcome)
+    monkeypatch.setattr(host_side, "set_time_slice", lambda *given: None)
+    monkeypatch.setattr("tempfile.tempdir", "/dev/null")
+    with pytest.raises(NotADirectoryError):
+        host_side.run_host("tcp/127.0.0.1:1", "r", "a", None, [], 1.0, lambda line: None)
+    (hello,) = said
+    assert (hello.failure or "").startswith("/dev/null/vnet-host-")
+    assert (hello.failure or "").endswith(": Not a directory")
 
 
 def test_a_host_gets_and_says_nothing_but_its_own() -> None:

@@ -202,23 +202,26 @@ def run_host(
         welcome = join.until_welcome()
         agents = counted(len(welcome.processes), "agent process", "agent processes")
         on_state(f"host {name}: {agents} of run {run}")
-        folder = Path(stack.enter_context(TemporaryDirectory(prefix="vnet-host-")))
-        (folder / "logs").mkdir()
-        zygote = Zygote(welcome.modules) if welcome.start == "fork" and can_fork() else None
-        launcher = Launcher(folder / "logs", folders, zygote, join_timeout_s)
-        launcher.disks = folder / "disks"
-        stack.callback(launcher.stop, SHUT_DOWN_S)
-        down = Down(
-            Access.create(run, welcome.processes, units=welcome.units),
-            welcome.realtime,
-            lambda *event: events.put(event),
-        )
-        stack.enter_context(signals_handled(lambda *_: events.put(("children", "", None)), signal.SIGCHLD))
         try:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="vnet-host-")))
+            (folder / "logs").mkdir()
+            zygote = Zygote(welcome.modules) if welcome.start == "fork" and can_fork() else None
+            launcher = Launcher(folder / "logs", folders, zygote, join_timeout_s)
+            launcher.disks = folder / "disks"
+            stack.callback(launcher.stop, SHUT_DOWN_S)
+            down = Down(
+                Access.create(run, welcome.processes, units=welcome.units),
+                welcome.realtime,
+                lambda *event: events.put(event),
+            )
+            stack.enter_context(signals_handled(lambda *_: events.put(("children", "", None)), signal.SIGCHLD))
             launcher.prepare()
             down.open(stack)
             while not launcher.is_prepared():
                 time.sleep(READY_POLL_S)
+        except OSError as error:
+            join.say(failure=": ".join(filter(None, (error.filename, error.strerror))))
+            raise
         except VnetError as error:
             join.say(failure=str(error))
             raise

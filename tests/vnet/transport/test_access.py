@@ -1,6 +1,7 @@
 """Users, passwords and certificates: files only for their owner, nothing that shows a secret, one-line errors."""
 
 import os
+import resource
 import stat
 import sys
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ import pytest
 
 from vnet.errors import TransportError
 from vnet.transport.access import EMULATOR, OBSERVER, Access, certifier, node_user, router_names
-from vnet.transport.credentials import Credentials, common_name
+from vnet.transport.credentials import Credentials, common_name, write_private
 from vnet.transport.session import open_client, open_router
 
 TLS = "tls/127.0.0.1:7447"
@@ -108,3 +109,14 @@ def test_certificates_and_endpoint_go_together(tmp_path: Path) -> None:
 def test_an_endless_file_is_refused() -> None:
     with pytest.raises(TransportError, match="not a credentials file"):
         Credentials.load(Path("/dev/zero"))
+
+
+def test_a_file_for_which_there_is_no_room_is_named(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as raised:
+            write_private(tmp_path / "users.txt", "v01:secret")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert raised.value.filename == str(tmp_path / "users.txt")
