@@ -63,11 +63,11 @@ def print_summary(
     if (order := verdict["order"]) is not None:
         console.print(f"order        {_order(order)}", highlight=False, soft_wrap=True)
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
-    path = folder.path
-    console.print(f"files        {path}", highlight=False, soft_wrap=True)
+    console.print(f"files        {folder.path}", highlight=False, soft_wrap=True)
+    path = folder.path.absolute() if str(folder.path).startswith("-") else folder.path
     quoted = shlex.quote(str(path))
     following = {verdict["reproduce"]: "the same run again", f"vnet check {quoted}": "judge it again"}
-    following[f"vnet report {quoted} --open"] = f"read {path / REPORT}" if report else "have a report of it"
+    following[f"vnet report {quoted} --open"] = f"read {folder.path / REPORT}" if report else "have a report of it"
     if (recording := path / RECORDING).exists():
         following[f"vnet view {quoted}"] = "look at it"
         if not is_closed(recording):
@@ -92,13 +92,23 @@ def as_typed(command: str) -> str:
         return command
     if shutil.which(program) is None:
         program = str(Path(sys.executable).parent / program)
-    return shlex.join(_from_here(word) for word in [program, *rest])
+    return " ".join(_quoted(_from_here(word)) for word in [program, *rest])
 
 
 def _from_here(word: str) -> str:
-    """A path inside the current folder as it is called there; any other word as it is."""
-    inside = Path(word).is_absolute() and Path(word).is_relative_to(Path.cwd())
-    return str(Path(word).relative_to(Path.cwd())) if inside else word
+    """A path inside the current folder as it is called there, and not as an option; any other word as it is."""
+    if not (Path(word).is_absolute() and Path(word).is_relative_to(Path.cwd())):
+        return word
+    there = str(Path(word).relative_to(Path.cwd()))
+    return f"./{there}" if there.startswith("-") else there
+
+
+def _quoted(word: str) -> str:
+    """Quote a word for the shell; tabs and the like, which consoles print as something else, have escapes."""
+    if word.isprintable():
+        return shlex.quote(word)
+    plain = (each if each.isprintable() and each not in "\\'" else f"\\U{ord(each):08x}" for each in word)
+    return f"$'{''.join(plain)}'"
 
 
 def print_checks(judgement: Judgement, console: Console, reproduce: str, verbose: bool = True) -> None:
