@@ -9,7 +9,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -874,7 +874,7 @@ class OpenedRun(RecordedRun):
         """Local time at which the run ended, or last wrote something. Raises VnetError if the folder is gone."""
         for path in (self.folder / VERDICT_FILE, self.folder / EVENTS_FILE, self.folder):
             try:
-                return datetime.fromtimestamp(path.stat().st_mtime).astimezone()
+                return written_at(path)
             except OSError:
                 continue
         raise VnetError(f"{self.folder}: no such folder")
@@ -960,6 +960,18 @@ class OpenedRun(RecordedRun):
         if kind is not STATES or "values" not in wanted:
             return []
         return self._read(path, lambda: value_columns(open_table(path, ()).schema_arrow))
+
+
+def written_at(path: Path) -> datetime:
+    """Return the local time at which a file was last written; that of UTC in a zone that Python does not know.
+
+    TZ may be a whole day away from UTC, and datetime's zones may not. Raises OSError.
+    """
+    at = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    try:
+        return at.astimezone()
+    except ValueError:
+        return at
 
 
 def _from_here(command: str, folder: Path) -> str:

@@ -18,7 +18,7 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from emulator.pages.page import put_page, render
-from emulator.records.recorded_run import RecordedRun
+from emulator.records.recorded_run import RecordedRun, written_at
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE, is_run_folder
 from emulator.records.tables import open_table
 from emulator.records.verdicts import Record, Verdict
@@ -157,7 +157,7 @@ def _studies(folder: Path, file: str, page: str, read: Callable[[Path], dict[str
     found = []
     for path in (each.parent for each in folder.glob(f"*/{file}")):
         try:
-            when = datetime.fromtimestamp((path / file).stat().st_mtime).astimezone()
+            when = written_at(path / file)
         except OSError:
             continue  # it has just been removed
         try:

@@ -1,8 +1,10 @@
 """Reports, the index and comparisons: what stands in the pages, and what must not."""
 
 import json
+import os
 import re
 import shutil
+import time
 import webbrowser
 from html.parser import HTMLParser
 from pathlib import Path
@@ -247,6 +249,23 @@ def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Pa
     assert not list(runs.glob(".*.part"))
     share = RecordedRun.open(beacon).record.packet_delivery_ratio
     assert share is not None and f"{100 * share:.2f}" in page.text
+
+
+@pytest.mark.parametrize("zone", ["UTC+24", "UTC-24", "XYZ-5:30"])
+def test_a_zone_a_day_away_from_utc_is_none_for_the_index(
+    zone: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "another-1").mkdir()
+    (tmp_path / "another-1" / "verdict.json").write_text("{")
+    os.utime(tmp_path / "another-1" / "verdict.json", (0, 0))
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    try:
+        page = write_index(tmp_path).read_text()
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert ("1970-01-01 05:30" if zone == "XYZ-5:30" else "1970-01-01 00:00") in page
 
 
 def test_a_run_that_cannot_be_entered_is_a_row_of_the_index_and_hides_no_other(tmp_path: Path) -> None:
