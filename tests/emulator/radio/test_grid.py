@@ -51,11 +51,22 @@ frame_lists = st.lists(
 
 @pytest.mark.slow
 @settings(max_examples=150, deadline=None)
-@given(frame_lists, st.sampled_from([20, 50, 100]), st.integers(1, 2), st.sampled_from([1, 3, 50]))
+@given(
+    frame_lists,
+    st.sampled_from([20, 50, 100]),
+    st.integers(1, 2),
+    st.sampled_from([1, 3, 50]),
+    st.sampled_from([None, 10, 30, 100]),
+)
 def test_excluded_are_the_resources_that_others_reserved(
-    frames: list[tuple[int, int, int, int, float]], period: int, length: int, times: int
+    frames: list[tuple[int, int, int, int, float]], period: int, length: int, times: int, nr_t2: int | None
 ) -> None:
-    mac, now = lte(subchannels=4, exclusion_dbm=-100.0), 120
+    """A short interval counts for all uses within 100 ms, in mode 2 within T2."""
+    mac: Sidelink = lte(subchannels=4, exclusion_dbm=-100.0)
+    if nr_t2 is not None:
+        keys = {"kind": "nr-mode2", "scs_khz": 15, "t2_ms": nr_t2, "subchannels": 4, "exclusion_dbm": -100}
+        mac = NrMode2.model_validate(keys)
+    now, scale = 120, nr_t2 or 100
     grid = SensedGrid(mac, 2)
     strongest: dict[tuple[int, int], tuple[float, int]] = {}
     for slot in sorted({each[0] for each in frames}):
@@ -70,7 +81,7 @@ def test_excluded_are_the_resources_that_others_reserved(
     found = grid.candidates(now, wanted)
     met: dict[tuple[int, int], float] = {}
     for (slot, subchannel), (dbm, reserved) in strongest.items():
-        repeats = -(-100 // reserved) if reserved < 100 and now - slot <= reserved else 1
+        repeats = -(-scale // reserved) if reserved < scale and now - slot <= reserved else 1
         for nth in range(1, repeats + 1):
             for use in range(times):
                 candidate = slot + nth * reserved - use * period
