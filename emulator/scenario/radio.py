@@ -37,7 +37,6 @@ class Sidelink(Section):
     """Reservation intervals that the standard has."""
     ranks_power: ClassVar[bool] = True
     """True if the quietest of the candidates are taken, and not any of them."""
-    most_t1: ClassVar[int] = 4
 
     subchannels: int = Field(4, ge=1, le=MOST_SUBCHANNELS)
     """Subchannels, side by side in frequency."""
@@ -57,7 +56,10 @@ class Sidelink(Section):
     The standards have 100, 200, … 1000 ms; mode 4 also 20 and 50 ms, mode 2 also 1 to 99 ms.
     """
     t1_slots: int = Field(4, ge=1)
-    """Slots from a frame to its selection window, to process it: in mode 4 at most 4, in mode 2 at most 9."""
+    """Slots from a frame to its selection window: at most 4; in mode 2 at 30 and 60 kHz at most 5 and 9.
+
+    In mode 2 at 15 kHz the standard has at most 3 (TS 38.214, table 8.1.4-2).
+    """
     t2_ms: int = Field(100, ge=10, le=100)
     """End of the selection window, and the delay beyond which a frame gets a resource of its own."""
     retransmit: Switch = False
@@ -85,6 +87,11 @@ class Sidelink(Section):
     def block_khz(self) -> int:
         """Width of a resource block."""
         return 180
+
+    @property
+    def most_t1(self) -> int:
+        """The largest `t1_slots`."""
+        return 4
 
     @property
     def most_blocks(self) -> int:
@@ -144,7 +151,6 @@ class NrMode2(Sidelink):
 
     periods_ms: ClassVar[tuple[int, ...]] = (*range(1, 100), *LONG_PERIODS_MS)
     ranks_power: ClassVar[bool] = False
-    most_t1: ClassVar[int] = 9
 
     kind: Literal["nr-mode2"]
     """This MAC."""
@@ -173,6 +179,11 @@ class NrMode2(Sidelink):
     def block_khz(self) -> int:
         """Width of a resource block."""
         return 12 * self.scs_khz
+
+    @property
+    def most_t1(self) -> int:
+        """The largest `t1_slots` (TS 38.214, table 8.1.4-2, which has 3 at 15 kHz)."""
+        return {15: 4, 30: 5, 60: 9}[self.scs_khz]
 
     @property
     def most_blocks(self) -> int:

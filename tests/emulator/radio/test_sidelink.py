@@ -96,6 +96,14 @@ def test_winner_b1_is_the_published_formula() -> None:
     assert high == pytest.approx(22.7 * np.log10(300) + 27 + 20 * np.log10(5.91)), "beyond the breakpoint"
 
 
+@pytest.mark.parametrize(("scs_khz", "most"), [(15, 4), (30, 5), (60, 9)])
+def test_t1_slots_have_the_limit_of_their_spacing(scs_khz: int, most: int) -> None:
+    """TS 38.214, table 8.1.4-2, has 3, 5 and 9; our default of 4 is allowed at 15 kHz, too."""
+    assert Radio.model_validate(with_mac(NR, scs_khz=scs_khz, t1_slots=most)).sidelink
+    with pytest.raises(ValueError, match=f"t1_slots = {most + 1}: must be less than or equal to {most}"):
+        Radio.model_validate(with_mac(NR, scs_khz=scs_khz, t1_slots=most + 1))
+
+
 # Time.
 
 
