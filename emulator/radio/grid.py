@@ -246,7 +246,7 @@ class SensedGrid:
     def _strongest_dbm(self, now: int, wanted: Wanted) -> Array:
         """Return the strongest signal (slots, places) whose sender has reserved a part of each resource."""
         told = self._told[:, wanted.node].reshape(len(self._told), -1)
-        place = np.flatnonzero(np.bitwise_or.reduce(told))
+        place = np.flatnonzero(np.bitwise_or.reduce(told) != 0)
         row = place // self._mac.subchannels
         slot = self._slot_of(row)
         known = (slot < now) & (slot >= now - self._slots)
