@@ -410,9 +410,12 @@ class _Branched:
         """The stream of bytes below it."""
         return _BranchedBytes(self)
 
-    def close(self) -> None:
+    def flush(self) -> None:
         """Write what is held back."""
-        self.stream.flush()
+        with running_node.running.pause():
+            self.stream.flush()
+
+    close = flush
 
     def detach(self) -> io.BufferedIOBase:
         """Return the stream of bytes below it."""
@@ -422,7 +425,8 @@ class _Branched:
         """Write to the stream, and to the log of the node on whose behalf the present code runs, if it lives."""
         if is_discarding():
             return len(text)
-        written: int = self.stream.write(text)
+        with running_node.running.pause():
+            written: int = self.stream.write(text)
         self.keep(text)
         return written
 
@@ -459,13 +463,14 @@ class _BranchedBytes(io.BufferedIOBase):
         if is_discarding():
             return len(content)
         self.flush()  # what was written as text before
-        self._text.stream.buffer.write(content)
+        with running_node.running.pause():
+            self._text.stream.buffer.write(content)
         self._text.keep(content.decode(errors="replace"))
         return len(content)
 
     def flush(self) -> None:
         """Write what is held back."""
-        self._text.stream.flush()
+        self._text.flush()
 
     def fileno(self) -> int:
         """Return the descriptor of the stream."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import mmap
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LONGEST_ID = 64
@@ -36,6 +37,17 @@ class RunningNode:
                 written = self._written[node] = node.encode().ljust(LONGEST_ID, b"\0")[:LONGEST_ID]
             self._memory[:LONGEST_ID] = written
             self._memory[LONGEST_ID] = self._count = (self._count + 1) & 255
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Have nobody's code run within the block, which may wait for who reads the output."""
+        node = self._shown
+        self.show("")
+        try:
+            yield
+        finally:
+            if not self._shown:  # else the program's threads go on beside its loop
+                self.show(node)
 
     def read(self) -> str:
         """Return what was written down last, by any process."""

@@ -20,6 +20,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, run_forked, run_together, scenario_of
 from vnet.node import Node
+from vnet.runtime import running_node
 
 
 def log_of(emulation: Emulation, node: str) -> str:
@@ -160,3 +161,32 @@ def test_the_streams_are_given_back_also_by_two_simulations_at_once() -> None:
     assert sys.stdout is not before[0], "the other one still goes on"
     second.__exit__(None, None, None)
     assert (sys.stdout, sys.stderr) == before
+
+
+class Reader(io.StringIO):
+    """A stream that notes whose code runs while it is written to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.running: list[str] = []
+
+    def write(self, text: str) -> int:
+        self.running.append(running_node.running.read())
+        return super().write(text)
+
+    def flush(self) -> None:
+        self.running.append(running_node.running.read())
+
+
+async def prints_and_flushes(node: Node) -> None:
+    print(node.id, flush=True)
+    assert running_node.running.read() == node.id
+
+
+def test_a_program_that_waits_for_who_reads_its_output_does_not_run_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pager that holds a page is no stall."""
+    reader = Reader()
+    monkeypatch.setattr(sys, "stdout", reader)
+    run_together(scenario_of([], f"{__name__}:prints_and_flushes", vehicles=2))
+    assert set(reader.running) == {""}
+    assert reader.getvalue() == "v01\nv02\n"
