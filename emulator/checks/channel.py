@@ -25,10 +25,13 @@ from emulator.records.verdicts import Finding, not_exercised, result, unknown
 from emulator.scenario.faults import (
     Custom,
     CustomSender,
+    DataReplay,
     DelayFault,
+    DoS,
     Duplicate,
     SenderFault,
     StaleMessages,
+    Sybil,
     Throttle,
 )
 from emulator.scenario.radio import RATES_MBPS
@@ -181,6 +184,17 @@ class UnseenFrames:
     count: IntArray
     after_ns: IntArray
 
+    def most(self) -> Array:
+        """Return how many frames (n,) they were at most, with those that sender faults added meanwhile."""
+        recorded, most = self.recorded, self.count.astype(float)
+        sender, until_ns = recorded.sender[self.before], recorded.sent_ns[self.before] + recorded.guard_ns
+        for planned in recorded.plan:
+            if isinstance(planned.fault, SenderFault):
+                acted = planned.nodes[sender] & (planned.start_ns <= until_ns)
+                acted &= planned.end_ns + recorded.guard_ns >= self.after_ns
+                most[acted] *= _frames_of_one(planned.fault)
+        return most
+
     def may_hold(self, rows: NDArray[np.intp], until_ns: IntArray, since_ns: int = 0) -> Mask:
         """Return whether the frame of each row (n,), which has no original, may have been sent in that time."""
         recorded = self.recorded
@@ -210,6 +224,18 @@ class UnseenFrames:
         to_ns = np.minimum(recorded.sent_ns[self.before[place]], until_ns)
         lonely = recorded.places.were_lonely(recorded.sender[rows], from_ns, to_ns)
         return np.asarray(there & (self.count[place] > 0) & (from_ns <= to_ns) & lonely)
+
+
+def _frames_of_one(fault: SenderFault) -> int:
+    """Return how many frames at most a fault makes of one."""
+    match fault:
+        case DoS(factor=factor):
+            return factor
+        case Sybil(ghosts=ghosts):
+            return 1 + ghosts
+        case StaleMessages():
+            return 1
+    return 2 if isinstance(fault, DataReplay) else 1 + MOST_COPIES
 
 
 def unseen_frames(recorded: RecordedRun) -> UnseenFrames:
@@ -552,13 +578,10 @@ def _may_have_waited(
     That is the airtime of the longest frames, no more than a queue holds, usually and if a fault throttles them.
     """
     radio, unseen = recorded.scenario.radio, unseen_frames(recorded)
-    before, count = unseen.before[unseen.count > 0], unseen.count[unseen.count > 0]
+    before, most = unseen.before[unseen.count > 0], unseen.most()[unseen.count > 0]
     sender = recorded.sender[before]
     until_ns = recorded.places.last_lonely_ns(sender, recorded.sent_ns[before])
     known = until_ns >= unseen.after_ns[unseen.count > 0]  # else a number is missing without any reason
-    for planned in plan:
-        if isinstance(planned.fault, SenderFault):  # that may send each of them many times
-            count = np.where(planned.nodes[sender], radio.queue_frames + 1, count)
     chosen = "bitrate_mbps" in recorded.trace.column_names
     mbps = np.full(len(sender), min(RATES_MBPS) if chosen else radio.bitrate_mbps)
     bytes_ = np.full(len(sender), radio.max_payload_bytes)
@@ -568,7 +591,7 @@ def _may_have_waited(
         if isinstance(planned.fault, Throttle):
             throttled_ns = np.rint(bytes_ * 8_000 / planned.fault.bitrate_mbps)
             slow_ns = np.where(planned.nodes[sender], np.maximum(slow_ns, throttled_ns), slow_ns)
-    waiting = np.minimum(count, radio.queue_frames + 1)
+    waiting = np.minimum(most, radio.queue_frames + 1)
     return sender[known], until_ns[known], ((waiting * usual_ns)[known], (waiting * slow_ns)[known])
 
 

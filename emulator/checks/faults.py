@@ -66,8 +66,6 @@ Rows = NDArray[np.intp]
 CERTAIN = 1e-6
 """Probability below which a sum of fixes is not that of a receiver without faults."""
 RATE_BAND = 1 - 1e-6
-MANY = 1e6
-"""More frames than any chain of losses remembers."""
 RATE_SIGMAS = 4.9
 """As wide as RATE_BAND: a run may have dozens of faults, and each has a check."""
 
@@ -501,12 +499,10 @@ def frames_since(recorded: RecordedRun, planned: PlannedFault) -> tuple[Array, A
     possible = unseen.count * recorded.places.were_lonely(
         recorded.sender[unseen.before], began_ns, np.maximum(recorded.sent_ns[unseen.before], began_ns)
     )
-    copying = [p.nodes[recorded.sender[unseen.before]] for p in recorded.plan if isinstance(p.fault, SenderFault)]
-    copied = np.logical_or.reduce(copying) if copying else np.zeros(len(unseen.before), dtype=bool)
     counts = np.zeros((3, len(recorded.emissions.first)))
     counts[1:, recorded.emissions.of_row[unseen.before]] = (
         np.where(unseen.after_ns >= planned.start_ns, possible, 0),
-        np.where(copied & (possible > 0), MANY, possible),
+        np.where(possible > 0, unseen.most(), 0),
     )
     steps = np.zeros((3, len(recorded.trace)))
     each = 1 + counts[:, recorded.emissions.of_row[first]]

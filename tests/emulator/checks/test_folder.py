@@ -304,7 +304,16 @@ async def counts_frames(node: Node) -> None:
             count += 1
 
 
-def parting(folder: Path, seed: int = 1, **fault: Any) -> Path:
+async def sends_seldom(node: Node) -> None:
+    """Send a frame at every sixth fix."""
+    count = 0
+    async for _ in node.gnss:
+        if count % 6 == 0:
+            await node.radio.broadcast(bytes(200))
+        count += 1
+
+
+def parting(folder: Path, seed: int = 1, program: Any = counts_frames, **fault: Any) -> Path:
     """`b` is in range of `a` until 0.7 s, and from 2.3 s on; in between nobody hears what `a` sends."""
     rows = [f"b,{time_s},{90 if 1 <= time_s <= 2 else 40},0" for time_s in np.arange(0, 6.1, 0.5)]
     folder.mkdir()
@@ -316,7 +325,7 @@ def parting(folder: Path, seed: int = 1, **fault: Any) -> Path:
         "radio": {"range_m": 60.0, "bitrate_mbps": 0.3},
         "fault": [{"at_s": 1.2, "duration_s": 3.0, "nodes": ["a"]} | fault] if fault else [],
     }
-    return emulator.simulate(scenario, program=counts_frames, out=folder / "run").folder
+    return emulator.simulate(scenario, program=program, out=folder / "run").folder
 
 
 LONELY_FAULTS: list[dict[str, Any]] = [
@@ -372,3 +381,18 @@ def test_what_such_frames_have_no_part_in_is_judged(
     edit(folder)
     write_manifest(RunFolder(folder))
     assert found_by in broken(check_run(folder))
+
+
+@pytest.mark.parametrize("fault", [{"kind": "DoS", "factor": 3}, {"kind": "StaleMessages", "age_s": 0.1}])
+def test_a_fault_that_acts_later_does_not_lengthen_what_they_may_have_waited(
+    tmp_path: Path, fault: dict[str, Any]
+) -> None:
+    folder = parting(tmp_path / "run", program=sends_seldom, **fault, at_s=4.5, duration_s=0.3)
+    assert broken(check_run(folder)) == set()
+
+    def after_them(row: dict[str, Any]) -> bool:
+        return bool(row["sender"] == "a" and row["arrival_ns"] and 2_300_000_000 < row["sent_ns"] < 2_700_000_000)
+
+    changes_last("arrival_ns", after_them, lambda ns: ns + 1_000_000_000)(folder)
+    write_manifest(RunFolder(folder))
+    assert "latency" in broken(check_run(folder))
