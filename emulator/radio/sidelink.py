@@ -448,8 +448,10 @@ class Sidelink(Mac):
         if grant is not None:
             flow.grant = grant
         kept = [each for each in chosen if found.has(*each)]
-        if kept:
-            found = found.around(kept[0][0], REPEAT_SLOTS)
+        if len(kept) == 1 and (near := found.around(kept[0][0], REPEAT_SLOTS)).mask.any():
+            found = near
+        elif len(kept) == 1:  # the other one has to be near: both are selected anew
+            kept = []
         if len(kept) == len(chosen) or not found.mask.any():
             station.booked |= booking.slots
             return
