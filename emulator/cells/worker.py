@@ -133,7 +133,7 @@ class Worker:
         self.place = place
         mine, its = socket.socketpair()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the process
-        with its, os.fdopen(os.memfd_create("vnet-running-node"), "wb") as shown:  # on no disk, which may be full
+        with its, _memory() as shown:
             shown.truncate(LONGEST_ID + 1)
             self._running = RunningNode(shown.fileno())
             passed = its.fileno(), shown.fileno()
@@ -283,6 +283,13 @@ def _receive(connection: Connection, jobs: SimpleQueue[bytes]) -> None:
             jobs.put(connection.recv_bytes())
         except (EOFError, OSError):
             os._exit(0)
+
+
+def _memory() -> IO[bytes]:
+    """Return a file in memory, which no full disk can fail, where the system has such."""
+    if sys.platform != "linux":
+        return tempfile.TemporaryFile()
+    return os.fdopen(os.memfd_create("vnet-running-node"), "wb")
 
 
 def _enter(place: Place, temporary: str) -> None:
