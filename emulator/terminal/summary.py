@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import sys
@@ -104,10 +105,11 @@ def _from_here(word: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """Quote a word for the shell; tabs and the like, which consoles print as something else, have escapes."""
+    """Quote a word for the shell; the bytes of tabs and the like, which consoles print otherwise, have escapes."""
     if word.isprintable():
         return shlex.quote(word)
-    plain = (each if each.isprintable() and each not in "\\'" else f"\\U{ord(each):08x}" for each in word)
+    bytes_ = os.fsencode(word)
+    plain = (chr(each) if 0x20 <= each < 0x7F and each not in b"\\'" else f"\\{each:03o}" for each in bytes_)
     return f"$'{''.join(plain)}'"
 
 
