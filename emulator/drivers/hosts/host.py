@@ -220,7 +220,8 @@ def run_host(
             while not launcher.is_prepared():
                 time.sleep(READY_POLL_S)
         except OSError as error:
-            join.say(failure=": ".join(filter(None, (error.filename, error.strerror))))
+            where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes) else ""
+            join.say(failure=f"{where}{error.strerror or str(error) or type(error).__name__}")
             raise
         except VnetError as error:
             join.say(failure=str(error))
