@@ -276,7 +276,7 @@ class InformationEstimator:
         self._weighed = pool.codes
         weights = self._weights = self._weigh(pool, means_m, own[2] + own[4], leaning, len(frames))
         passed, onward = self._passed_on(heard, late.records, weights[1 : 1 + len(frames)])
-        self.imported = len(pool.codes) + len(passed)
+        self.imported = len(frames) + sum(weight > 0 for weight in weights[1 + len(frames) :]) + len(passed)
         self._pass_on(heard, onward, own[2] + own[4])
         self._absorb(weights, limited, increments, passed)
         self.fused_m = self.own.estimate_m
@@ -294,9 +294,9 @@ class InformationEstimator:
             self._lanes.follow_own()
             return
         pooled = _pooled(weights, priors, about_c, self._common_m2)
+        heard, others = len(now) - 1, (1 - weights[0]) / (1 - SELF_SHARE)
         now, before = [each for each in now if is_of_lane(each)], [each for each in before if is_of_lane(each)]
-        others = (1 - weights[0]) / (1 - SELF_SHARE)
-        self._lanes.absorb(pooled, now, before, len(weights) - 1, others)
+        self._lanes.absorb(pooled, now, before, heard, others)
 
     def _shares_used(
         self,
