@@ -163,6 +163,7 @@ def test_the_watchdog_of_a_program_ends_with_the_programs(monkeypatch: pytest.Mo
     cancelled: list[bool] = []
     monkeypatch.setattr("faulthandler.cancel_dump_traceback_later", lambda: cancelled.append(True))
     monkeypatch.setattr(own_asyncio, "_watch_later", lambda *_, **__: None)
+    monkeypatch.setattr(own_asyncio, "_users", 1)  # not those of processes that were killed, as tests play them
     for use, ends in ((lambda: None, []), (lambda: faulthandler.dump_traceback_later(60, exit=True), [True])):
         as_node(Fake(1), use)
         own_asyncio.detach()
