@@ -257,7 +257,7 @@ class SensedGrid:
         dbm = self._reserved_dbm[wanted.node].ravel()[place].astype(float)
         window = wanted.last - wanted.first + 1
         strongest_dbm = np.full((window, self._mac.subchannels), NOT_RESERVED_DBM)
-        scale = 100 * NS_PER_MS // self._mac.slot_ns if self._mac.ranks_power else wanted.last - now
+        scale = self._mac.projected_ms * NS_PER_MS // self._mac.slot_ns
         repeats = np.ones(len(period), np.int64)
         short = np.flatnonzero((period < scale) & (now - slot <= period))
         repeats[short] = -(-scale // period[short])

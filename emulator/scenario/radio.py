@@ -103,6 +103,11 @@ class Sidelink(Section):
         """The share of resources that must remain as candidates."""
         return 0.2
 
+    @property
+    def projected_ms(self) -> int:
+        """The time over which reservations with shorter intervals are repeated (TS 36.213, 14.1.1.6)."""
+        return 100
+
     def counters(self, period_ms: int) -> tuple[int, int]:
         """Return the least and the largest value of a new reselection counter (TS 36.321, TS 38.321)."""
         times = -(-100 // max(20, min(period_ms, 100)))
@@ -189,6 +194,11 @@ class NrMode2(Sidelink):
     def candidate_share(self) -> float:
         """The share of resources that must remain as candidates."""
         return self.share_percent / 100
+
+    @property
+    def projected_ms(self) -> int:
+        """The time over which reservations with shorter intervals are repeated (T_scal of TS 38.214, 8.1.4)."""
+        return self.t2_ms
 
 
 class CrLimit(Section):

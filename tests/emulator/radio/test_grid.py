@@ -56,17 +56,17 @@ frame_lists = st.lists(
     st.sampled_from([20, 50, 100]),
     st.integers(1, 2),
     st.sampled_from([1, 3, 50]),
-    st.booleans(),
+    st.sampled_from([None, 10, 30, 100]),
 )
 def test_excluded_are_the_resources_that_others_reserved(
-    frames: list[tuple[int, int, int, int, float]], period: int, length: int, times: int, is_mode_2: bool
+    frames: list[tuple[int, int, int, int, float]], period: int, length: int, times: int, nr_t2: int | None
 ) -> None:
-    """A short interval counts for all uses within 100 ms, in mode 2 within T2, where the window ends."""
+    """A short interval counts for all uses within 100 ms, in mode 2 within T2."""
     mac: Sidelink = lte(subchannels=4, exclusion_dbm=-100.0)
-    if is_mode_2:
-        keys = {"kind": "nr-mode2", "scs_khz": 15, "subchannels": 4, "exclusion_dbm": -100}
+    if nr_t2 is not None:
+        keys = {"kind": "nr-mode2", "scs_khz": 15, "t2_ms": nr_t2, "subchannels": 4, "exclusion_dbm": -100}
         mac = NrMode2.model_validate(keys)
-    now, scale = 120, period if is_mode_2 else 100
+    now, scale = 120, nr_t2 or 100
     grid = SensedGrid(mac, 2)
     strongest: dict[tuple[int, int], tuple[float, int]] = {}
     for slot in sorted({each[0] for each in frames}):
@@ -140,7 +140,7 @@ def test_a_first_transmission_reserves_the_second_one(kind: str, length: int, pe
     for gap, first, second in ((1, 3 - length, 0), (9, 0, 4 - length), (15, 1, 1)):
         grid, slot = SensedGrid(mac, 2), 200
         sense(grid, mac, slot, [(first, length, period, LOUD_DBM)], gap * 4 + second - first)
-        found = grid.candidates(slot + 1, Wanted(0, slot + 1, slot + 101, 1, 0, 1))
+        found = grid.candidates(slot + 1, Wanted(0, slot + 1, slot + 150, 1, 0, 1))
         taken = {(slot + gap + period * use, second + n) for use in uses for n in range(length)}
         taken |= {(slot + period * use, first + n) for use in uses[1:] for n in range(length)}
         expected = {(at, sub) for at, sub in taken if found.first <= at < found.first + len(found.mask)}
