@@ -456,9 +456,11 @@ class InformationEstimator:
         if self._options.defence:
             each = zip(others, self._prior_shares, leaning or [False] * len(others), strict=True)
             others = [0.0 if leans else (1 - SELF_SHARE) * share * weight for weight, share, leans in each]
-        for row in range(punctual, len(others)):
-            if pool.variances_m2[row] >= own_variance_m2:
-                others[row] = 0.0
+        knows_more = [variance_m2 < own_variance_m2 for variance_m2 in pool.variances_m2[punctual:]]
+        share = sum(knows_more) / max(len(knows_more), 1)
+        others[punctual:] = [
+            share * weight if knows else 0.0 for weight, knows in zip(others[punctual:], knows_more, strict=True)
+        ]
         return [1 - math.fsum(others), *others]
 
     # What is passed on.

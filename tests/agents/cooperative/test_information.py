@@ -498,6 +498,19 @@ def test_few_that_are_in_time_are_no_majority_of_the_late() -> None:
     assert network.errors_m()[3:].max() < 1.0
 
 
+def test_a_late_prior_that_claims_more_than_most_draws_nobody_along() -> None:
+    """Late priors that are more certain than one's own count by their share of all that are late."""
+    network = Network(12, reach=1)
+    network.late = network.ids
+    network.run(40)
+
+    def lie(name: str, frame: InformationFrame) -> InformationFrame:
+        return replace(frame, prior=moved(scaled_by(frame.prior, 1.5), 0.5, 0.0)) if name == "v0" else frame
+
+    network.run(100, lie)
+    assert np.sqrt(np.mean(np.square(network.errors_m()[1:]))) < 0.6
+
+
 def test_liars_that_are_most_of_what_is_heard_in_one_period_move_nobody() -> None:
     network = Network(10)
     network.run(60)
