@@ -21,7 +21,7 @@ from emulator.radio.dot11p import SLOT_NS
 from emulator.records.distributions import chi2_cdf, chi2_sf
 from emulator.records.events import EventKind
 from emulator.records.radio_metrics import sent_by_programs
-from emulator.records.recorded_run import NO_FAULT, ON_AIR, UNHEARD_OF, RecordedRun
+from emulator.records.recorded_run import END_OF_TIME_NS, NO_FAULT, ON_AIR, UNHEARD_OF, RecordedRun
 from emulator.records.verdicts import (
     MOST_ROWS,
     NO_FAULTS,
@@ -674,6 +674,8 @@ def _silenced(recorded: RecordedRun, planned: PlannedFault) -> int:
     ends = isinstance(planned.fault, ProcessFault) and planned.fault.ends
     count = 0
     for node in np.flatnonzero(planned.nodes).tolist():
+        if recorded.deaths_ns.get(node, END_OF_TIME_NS) <= planned.start_ns:
+            continue  # it has ended by itself
         sent = recorded.sender == node
         spoke = bool((sent & sends_before).any() or recorded.reported[before, node].any())
         speaks = bool((sent & sends_during).any() or recorded.reported[during, node].any())

@@ -378,7 +378,7 @@ class Infrastructure(Fault):
 
 
 class Kill(ProcessFault):
-    """The processes are killed (SIGKILL); when the fault ends the programs start again.
+    """The processes are killed (SIGKILL); when the fault ends the programs start again, but those that had ended.
 
     `node.incarnation` is then one higher, and `node.rng` another stream.
     """

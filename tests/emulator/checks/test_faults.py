@@ -735,6 +735,19 @@ def test_a_corruption_of_all_receptions_is_seen_by_their_cause() -> None:
     assert not_valid(recorded) == {}
 
 
+async def talks_a_second(node: Node) -> None:
+    """Talk, and end."""
+    for _ in range(10):
+        await node.radio.broadcast(b"x")
+        await asyncio.sleep(0.1)
+
+
+@pytest.mark.parametrize("kind", ["kill", "pause"])
+def test_a_fault_of_programs_that_have_ended_has_no_effect(kind: str) -> None:
+    recorded = simulated(fault(kind, at_s=3.0), program=f"{__name__}:talks_a_second")
+    assert not_valid(recorded)[f"effect:{kind}-0"] is Verdict.UNKNOWN
+
+
 async def talks_on(node: Node) -> None:
     """Talk all the time."""
     while True:
