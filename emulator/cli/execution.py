@@ -137,12 +137,15 @@ def _agent_words(command: str, scenario: Scenario) -> list[str]:
     return [program, *words[1:]]
 
 
-def run_simulated(request: Request, processes: str, on_folder: Callable[[Path], None], apart: str | None) -> None:
+def run_simulated(
+    request: Request, processes: str, on_folder: Callable[[Path], None], apart: str | None, stalled: bool
+) -> None:
     """Run the programs in this process, or in so many others, without Zenoh; exits with the verdict's status.
 
-    `on_folder` is told the run's folder once it is made; `apart` is a vehicle that needs a process of its own.
+    `on_folder` is told the run's folder once it is made; `apart` is a vehicle that needs a process of its own, as
+    it has ended that of all, or `stalled`.
     """
-    session = request.session(Local(processes, request.debug, apart)).open()
+    session = request.session(Local(processes, request.debug, apart, stalled)).open()
     emulation = session.emulation
     on_folder(emulation.folder.path)
     request.output.keep_in(emulation.folder.logs)

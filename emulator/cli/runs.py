@@ -108,7 +108,7 @@ def simulate(
             from emulator.cli.execution import Request, run_simulated
 
         request = Request(loaded, asked, sinks, stdout, check_determinism, target)
-        run_simulated(request, processes, child.told, apart)
+        run_simulated(request, processes, child.told, apart, child.ending == "stalled")
 
 
 @spread

@@ -54,12 +54,13 @@ class Local:
     """Programs in this process, or in so many `processes` that are forked from it, without Zenoh.
 
     `debug` has a debugger stop in a program. `apart` is a vehicle that gets a process of its own, because it has
-    ended the process of an earlier attempt.
+    ended the process of an earlier attempt, or has `stalled` there.
     """
 
     processes: ProcessCount | str = 1
     debug: DebugTarget | None = None
     apart: str | None = None
+    stalled: bool = False
 
 
 def over_zenoh(emulation: Emulation) -> LiveOptions:
@@ -167,8 +168,9 @@ class Session:
         """
         if self.live is None:
             where = self._local
+            earlier = where.apart, where.stalled
             self.wall_s, self.interrupted = simulate(
-                self.emulation, no_horizon, stop, on_interrupt, where.debug, self._processes, where.apart
+                self.emulation, no_horizon, stop, on_interrupt, where.debug, self._processes, *earlier
             )
         else:
             from emulator.drivers.live import run_live  # slow to import, and simulations do without

@@ -41,6 +41,7 @@ def simulate(
     debug: DebugTarget | None = None,
     processes: int = 1,
     apart: str | None = None,
+    stalled: bool = False,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end; returns the wall-clock seconds, and whether it was interrupted.
 
@@ -52,7 +53,8 @@ def simulate(
     many processes run the programs, and not this one; the vehicles of one that ends before its time have died.
     `apart` is the vehicle that has ended the process of an earlier attempt, "" if unknown: each vehicle has a
     process of its own (beyond `MOST_APART` others, these share so many), and what they print has been printed then.
-    If none dies now, that one has, at the end; raises VnetError if it is unknown.
+    If none dies now, that one has, at the end, unless it had `stalled`, as on a machine that stands; raises
+    VnetError if it is unknown.
     """
     node_ids = emulation.world.node_ids
     groups = split_evenly(node_ids, processes)
@@ -85,7 +87,7 @@ def simulate(
         emulation.finish(lockstep.now_ns)
     if (
         apart is not None
-        and not (interrupted or programs.is_cut_short)
+        and not (stalled or interrupted or programs.is_cut_short)
         and not any(each.kind == EventKind.died for each in emulation.folder.events)
     ):
         if not apart:

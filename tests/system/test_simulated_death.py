@@ -70,6 +70,13 @@ def test_a_program_that_stalls_ends_the_run_with_its_name(
     assert "v02" in {event["node"] for event in events(tmp_path / "run") if event["kind"] == kind}
 
 
+def test_a_program_that_stalls_once_and_not_again_has_not_died(tmp_path: Path) -> None:
+    """It was the machine that stood, or who reads the output."""
+    stalls = "is_first = not os.path.exists('once'); open('once', 'w').close()\n            while is_first: pass"
+    ended([*command(tmp_path, stalls), "--set", "run.stall_timeout_s=2"], tmp_path, 0)
+    assert died(tmp_path / "run") == set()
+
+
 @pytest.mark.parametrize("end", ["while True: pass", FAULT])
 def test_what_ends_the_process_after_the_run_is_a_death_then_and_no_earlier(tmp_path: Path, end: str) -> None:
     words = [*command(tmp_path, "pass"), "--set", "run.stall_timeout_s=0.3"]
