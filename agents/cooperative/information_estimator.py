@@ -449,6 +449,7 @@ class InformationEstimator:
         They have means (1 + n,), and the own a covariance with this trace. The weight of who is always to one side,
         `leaning` (n,), goes to the vehicle itself, and of who is far off in part; also that of priors of the period
         before, beyond the first `punctual`, that are no more certain than the own: they lack what was used since.
+        The others of those weigh by their share, so that one that claims more does not speak for all.
         """
         self._rule.notice(pool.largest_degrees, len(self._share.heard))
         weights = self._rule.weights(means_m, [own_variance_m2, *pool.variances_m2], self.mean_m, pool.degrees)

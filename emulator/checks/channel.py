@@ -204,14 +204,11 @@ class UnseenFrames:
 
     def may_follow(self, rows: NDArray[np.intp], until_ns: IntArray, since_ns: int = 0) -> Mask:
         """Return whether the last frame up to an instant, of the sender of each row (n,), may be one of them."""
-        return self._may_lie(self.place(rows, until_ns), rows, until_ns, since_ns)
-
-    def place(self, rows: NDArray[np.intp], time_ns: IntArray) -> NDArray[np.intp]:
-        """Return the number of the first original after each of these instants, of the sender of each row (n,)."""
         recorded = self.recorded
         longest_ns = int(recorded.sent_ns.max(initial=0)) + 2
         sent = recorded.sender[self.before] * longest_ns + recorded.sent_ns[self.before]
-        return np.searchsorted(sent, recorded.sender[rows] * longest_ns + np.maximum(time_ns, -1), side="right")
+        until = recorded.sender[rows] * longest_ns + np.maximum(until_ns, -1)
+        return self._may_lie(np.searchsorted(sent, until, side="right"), rows, until_ns, since_ns)
 
     def _may_lie(self, place: NDArray[np.intp], rows: NDArray[np.intp], until_ns: IntArray, since_ns: int) -> Mask:
         """Return whether some were sent before these originals, in that time, by the sender of each row (n,)."""

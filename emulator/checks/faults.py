@@ -150,7 +150,8 @@ def _replayed_wrongly(recorded: RecordedRun, late: Rows, originals: Rows) -> lis
                 last = int(np.searchsorted(before, old_ns[index], side="right")) - 1
                 due = last >= 0 and before[last] == original_ns >= planned.start_ns - recorded.guard_ns
                 wrong[index] &= not due
-    return late[wrong].tolist()  # type: ignore[no-any-return]
+    rows: list[int] = late[wrong].tolist()
+    return rows
 
 
 def check_gnss(recorded: RecordedRun) -> Finding:
