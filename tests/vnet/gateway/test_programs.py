@@ -1055,16 +1055,24 @@ def test_what_is_closed_ends_what_waits_as_at_zenoh_itself(drive: Drive) -> None
             ["1.0", "0.5"],
         ),
         ("lambda sample: sys.exit(5)", "SystemExit(5)", "in a callback", []),
-        ("lambda: None", "TypeError", "program0.py:4", []),
+        ("cancelled", "CancelledError", "in a callback", []),
+        ("aborted", "GeneratorExit", "in a callback", []),
+        ("lambda: None", "TypeError", "program0.py:9", []),
     ],
 )
 def test_a_callback_that_fails_is_told_and_zenoh_goes_on(
     drive: Drive, callback: str, error: str, place: str, printed: list[str]
 ) -> None:
     run = drive(f"""
-        import sys, time, zenoh
+        import asyncio, sys, time, zenoh
+        def cancelled(sample):
+            asyncio.run(asyncio.sleep(0.01))
+            raise asyncio.CancelledError
+        def aborted(sample):
+            raise GeneratorExit
         session = zenoh.open(zenoh.Config())
         session.declare_subscriber("a", {callback})
+        session.declare_subscriber("a", lambda sample: print("another", sample.payload.to_string()))
         for number in ("1", "0", "2"):
             session.put("a", number)
         time.sleep(0.1)
@@ -1073,7 +1081,9 @@ def test_a_callback_that_fails_is_told_and_zenoh_goes_on(
     told = events(run, "exception")
     assert len(told) == 3 - len(printed)
     assert error in told[0]["error"] and place in told[0]["place"]
-    assert {*printed, "goes on"} <= set(log(run)) and run.verdict == "invalid"
+    assert {*printed, "another 1", "another 0", "another 2", "goes on"} <= set(
+        log(run)
+    ) and run.verdict == "invalid"
 
 
 def test_what_the_program_lets_go_of_has_ended_as_at_zenoh_itself(drive: Drive) -> None:

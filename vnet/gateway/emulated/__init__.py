@@ -126,8 +126,9 @@ async def main(node: Node) -> None:
     try:
         with children_outside():
             async with asyncio.TaskGroup() as tasks:
-                for words in commands:
-                    tasks.create_task(run_program(vehicle, filled_in(words, node.id, ENDPOINT), environment))
+                for number, words in enumerate(commands):
+                    filled = filled_in(words, node.id, ENDPOINT)
+                    tasks.create_task(run_program(vehicle, filled, environment, number))
     except ExceptionGroup as errors:
         error = errors.exceptions[0]
         raise error.with_traceback(_without_imports(error.__traceback__)) from None
@@ -153,13 +154,13 @@ def _is_import(frame: FrameType) -> bool:
     return module == ProgramModules.__module__ or module.startswith("importlib._bootstrap")
 
 
-async def run_program(vehicle: Vehicle, words: Sequence[str], environment: Mapping[str, str]) -> None:
+async def run_program(vehicle: Vehicle, words: Sequence[str], environment: Mapping[str, str], number: int) -> None:
     """Run a program of a vehicle to its end. Raises what ends it, ProgramError for a status other than 0."""
     python = Path(words[0])
     if len(python.parts) > 1 and python.parent.resolve() != Path(sys.executable).parent.resolve():
         text = f"{python} is taken for {sys.executable}: on virtual time programs have this Python and its packages"
         vehicle.node.log(text, "warning")
-    modules = ProgramModules(vehicle.node, environment)
+    modules = ProgramModules(vehicle.node, environment, number)
     modules.modules.update(zenoh_modules(vehicle, modules))
     try:
         await modules.threads.run_main(partial(modules.run, words))

@@ -243,19 +243,19 @@ for _environ in os.environ, os.environb:
 
 
 class ProgramModules:
-    """The modules of one program of a vehicle, as `sys.modules` has them."""
+    """The modules of one program of a vehicle, as `sys.modules` has them; its commands have a `number`."""
 
     _open: ClassVar[set[ProgramModules]] = set()
     """Those of programs that are there, whose local time is the same on all machines."""
 
-    def __init__(self, node: Node, environment: Mapping[str, str]) -> None:
+    def __init__(self, node: Node, environment: Mapping[str, str], number: int) -> None:
         self.node = node
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualTimeLoop)
         self.steady_ns = partial(loop.steady_ns, node.id, loop.now_ns)
         """Returns nanoseconds on the clock that nobody sets: a skew does not move it."""
         self.threads = Threads()
-        self.process = OwnProcess(self.threads)
+        self.process = OwnProcess(self.threads, f"{node.id}/{node.incarnation}/{number}")
         self.threads.on_interrupt = partial(self.process.send, signal.SIGINT)
         self.at_exit: list[Callable[[], object]] = []
         self.has_session = False

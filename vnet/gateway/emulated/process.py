@@ -17,14 +17,17 @@ from math import ceil
 from operator import index
 from types import FrameType, ModuleType, TracebackType
 from typing import Any, NoReturn
+from zlib import crc32
 
 from vnet.gateway import STARTUP
 from vnet.gateway.emulated.strands import HardExit, Threads, Waiting, current_strand, leave_hard
 
 OUTSIDE = "VNET_OUTSIDE"
 """Variable by which a child process knows that it has no radio, as its Zenoh would reach the machine's network."""
-PID = 1
-"""Number of the program's process."""
+FIRST_PID = 1 << 22
+"""Least number of a program's process: above all of Linux, so that no process of the machine has it."""
+PIDS = 1 << 30
+"""Numbers of processes from there on."""
 INTERRUPTED = 130
 """Status of a program that an interrupt has ended."""
 _IGNORED = (signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH)
@@ -35,8 +38,10 @@ _TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 class OwnProcess:
     """Signals that a program sends to itself, and ends without a farewell. No signal comes from elsewhere."""
 
-    def __init__(self, threads: Threads) -> None:
+    def __init__(self, threads: Threads, name: str) -> None:
+        """The process that has a `name` in the run, from which its number is derived."""
         self._threads = threads
+        self._pid = FIRST_PID + crc32(name.encode()) % PIDS
         self._handlers: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
         self._timer: asyncio.TimerHandle | None = None
         self._interval_s = 0.0
@@ -51,7 +56,7 @@ class OwnProcess:
         """Return what stands for functions of `os`."""
         return {
             "chdir": self._threads.folder.change,
-            **dict.fromkeys(["getpid", "getpgid", "getpgrp"], lambda *pid: PID),
+            **dict.fromkeys(["getpid", "getpgid", "getpgrp"], lambda *pid: self._pid),
             "getppid": lambda: 0,
             **dict.fromkeys(["kill", "killpg"], self._kill),
             "_exit": self._exit,
@@ -70,7 +75,7 @@ class OwnProcess:
             "pthread_kill": lambda thread, number: self.send(number),
             "pause": self._pause,
             "sigwait": lambda signals: _named(self._await(signals)),
-            "sigwaitinfo": lambda signals: _siginfo(self._await(signals)),
+            "sigwaitinfo": lambda signals: self._siginfo(self._await(signals)),
             "sigtimedwait": self._await_for,
             "sigpending": lambda: set(map(_named, self._pending)),
             "pthread_sigmask": self._set_mask,
@@ -146,7 +151,10 @@ class OwnProcess:
         if timeout < 0:
             raise ValueError("timeout must be non-negative")
         number = self._await(signals, timeout)
-        return _siginfo(number) if number else None
+        return self._siginfo(number) if number else None
+
+    def _siginfo(self, number: int) -> signal.struct_siginfo:
+        return signal.struct_siginfo((number, 0, 0, self._pid, 0, 0, 0))
 
     def _await(self, signals: Iterable[int], timeout: float = -1) -> int:
         """Block until one of these signals comes, which is then not handled; return 0 after `timeout` seconds."""
@@ -163,7 +171,7 @@ class OwnProcess:
         return min(came)
 
     def _kill(self, pid: int, number: int) -> None:
-        if pid in (PID, -PID, 0, -1):
+        if pid in (self._pid, -self._pid, 0, -1):
             self.send(number)
         else:  # a child
             os.kill(pid, number)
@@ -222,10 +230,6 @@ def _program_frame(frame: FrameType) -> FrameType | None:
 
 def _named(number: int) -> int:
     return signal.Signals(number) if number in set(signal.Signals) else number
-
-
-def _siginfo(number: int) -> signal.struct_siginfo:
-    return signal.struct_siginfo((number, 0, 0, PID, 0, 0, 0))
 
 
 def _refuse(*args: object, **options: object) -> NoReturn:

@@ -19,6 +19,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 import msgspec
 import numpy as np
 import zenoh
+from greenlet import GreenletExit
 from zenoh.handlers import Callback
 
 from vnet.gateway.emulated.strands import (
@@ -602,7 +603,9 @@ class CallbackSink(_Queue):
         except SystemExit as leave:  # which ends a callback at most
             error = RuntimeError(f"SystemExit({leave.code!r}) in a callback ends nothing")
             fail(error.with_traceback(leave.__traceback__), "in a callback of Zenoh")
-        except Exception as error:
+        except (GreenletExit, KeyboardInterrupt):  # the program is ended
+            raise
+        except BaseException as error:
             is_called = error.__traceback__ is not None and error.__traceback__.tb_next is not None
             code = None if is_called else getattr(function, "__code__", None)
             of = "" if code is None else f" defined at {Path(code.co_filename).name}:{code.co_firstlineno}"
