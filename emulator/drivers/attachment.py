@@ -16,6 +16,7 @@ import zenoh
 from emulator.drivers.agent_keys import AgentKeys, Hear, hear_payloads, hear_tokens
 from emulator.drivers.router import SeparateRouter
 from emulator.viewer.sinks import Sinks
+from vnet.errors import TransportError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.transport import keys, wire
 from vnet.transport.access import EMULATOR, Access
@@ -69,8 +70,11 @@ class Attachment:
         self._host_rx: dict[str, zenoh.Publisher] = {}
         self._observers: dict[str, zenoh.Publisher] = {}
 
-    def open(self) -> None:
-        """Listen or connect, and declare what is said and heard. Raises TransportError."""
+    def open(self, again: bool = False) -> None:
+        """Listen or connect, and declare what is said and heard. Raises TransportError.
+
+        At a router of others no other emulator may have this run, unless this one opens `again`.
+        """
         stack, options = self._stack, self._options
         if self._connect is None:
             session = stack.enter_context(
@@ -80,6 +84,9 @@ class Attachment:
         else:
             login = options.access.credentials(EMULATOR)
             session = stack.enter_context(open_client(self._connect, login, self._lease_ms))
+            alive = keys.emulator_alive(self._run)
+            if not again and any(reply.ok for reply in session.liveliness().get(alive)):
+                raise TransportError(f"{self._connect}: run {self._run} has an emulator there already")
         run, hosts = self._run, options.access.hosts
         control = zenoh.CongestionControl
         full = control.DROP if self._drops else control.BLOCK  # one host that is cut off must not stall the others

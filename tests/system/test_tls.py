@@ -135,7 +135,12 @@ def test_agents_and_a_separate_router_over_tls_do_the_same_as_one_process(vnet: 
         assert router.stdout is not None
         assert router.stdout.readline() == "up\n"
         folder = tmp_path / "separate"
-        emulator, _ = start_emulator(stack, folder, "--connect", endpoint, "--access", str(access))
+        there = ["--connect", endpoint, "--access", str(access)]
+        emulator, _ = start_emulator(stack, folder, *there)
+        command = [*VNET, "emulator", SCENARIO, *OPTIONS, *there, "--out", str(tmp_path / "second")]
+        second = run(command, cwd=ROOT, timeout=TIMEOUT_S, capture_output=True, text=True)
+        assert second.returncode == 2
+        assert "run beacon has an emulator there already" in second.stderr
         start_agents(stack, endpoint, access)
         separate = finish(emulator, folder)
         router.communicate("\n", timeout=TIMEOUT_S)

@@ -594,7 +594,7 @@ class LiveProcesses(Processes):
                 await asyncio.sleep(0.0 if cancelled else fault.down_s)
             except asyncio.CancelledError:  # as the run is interrupted, all are told of its end
                 cancelled = True
-            cancelled |= await to_its_end(asyncio.to_thread(self.attachment.open))
+            cancelled |= await to_its_end(asyncio.to_thread(self.attachment.open, again=True))
             if cancelled:
                 self._tell_restarted(fault)  # until now all were silent by plan
                 raise asyncio.CancelledError
