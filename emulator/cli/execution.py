@@ -237,16 +237,17 @@ def _finish(session: Session, progress: Progress, request: Request) -> None:
     """Judge a run and print its summary; exits with the verdict's status. A second Ctrl-C ends that, too."""
     asked, how = request.asked, request.check_determinism
     say = partial(_say, request, "the run is being judged and written; Ctrl-C again ends without")
-    with first_interrupt_told(say):
+    with first_interrupt_told(say) as is_told:
         progress.judging()
         judgement, verdict = session.close()
         progress.close()
         for line in session.folder.unkept:
             tell(line, asked.log_format)
-        if how is not None and not session.interrupted:
+        interrupted = session.interrupted or (how is not None and is_told())
+        if how is not None and not interrupted:
             again = ["--quiet"] if asked.only_the_result else []
             verdict = run_again(session.emulation, judgement, verdict, session.command, how, again)
-        status = 130 if session.interrupted else judgement.exit_status
+        status = 130 if interrupted else judgement.exit_status
         folder = session.folder.path
         progress.ended(verdict, str(folder), status)
         if asked.log_format is LogFormat.JSON:

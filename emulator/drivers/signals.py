@@ -69,8 +69,11 @@ async def cancelled_by_signals() -> AsyncIterator[None]:
 
 
 @contextmanager
-def first_interrupt_told(tell: Callable[[], None]) -> Iterator[None]:
-    """Tell of the block's first Ctrl-C or SIGTERM, and go on; at the second raise KeyboardInterrupt."""
+def first_interrupt_told(tell: Callable[[], None]) -> Iterator[Callable[[], bool]]:
+    """Tell of the block's first Ctrl-C or SIGTERM, and go on; at the second raise KeyboardInterrupt.
+
+    The block gets a function that returns whether there was one.
+    """
     told = False
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -81,7 +84,7 @@ def first_interrupt_told(tell: Callable[[], None]) -> Iterator[None]:
         tell_from_handler(tell)
 
     with signals_handled(interrupt, *ENDING):
-        yield
+        yield lambda: told
 
 
 def tell_from_handler(tell: Callable[[], None]) -> None:

@@ -255,10 +255,10 @@ class RadioEnvironment(BaseParallelWrapper):
                 raise PayloadTooLargeError(len(payload), most)
             if payload is not None:
                 payloads[number] = payload
-        for number, payload in payloads.items():
+        observations, *rest = self.env.step(actions)
+        for number, payload in payloads.items():  # a step that env refuses has sent nothing
             self._engine.transmit(self._time_ns, number, [payload])
             self._frames += 1
-        observations, *rest = self.env.step(actions)
         self._time_ns += self._step_ns
         packets: dict[str, list[Packet]] = {agent: [] for agent in self._node_ids}
         for delivery in self._engine.advance(self._time_ns):

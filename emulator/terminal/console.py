@@ -147,6 +147,9 @@ def _say_unexpected(error: Exception, arguments: Sequence[str]) -> int:
             return interrupts.INTERRUPTED
         chain = chain.__cause__ or chain.__context__
     log_format = _asked_for(arguments)
+    if isinstance(error, FileNotFoundError) and error.filename is None:
+        _say("the current folder is not there any more", log_format)
+        return WRONG_USAGE
     if isinstance(error, OSError) and error.errno in REFUSED_BY_THE_SYSTEM:
         where = "" if error.filename is None else f"{printable(str(error.filename))}: "
         _say(f"{where}{error.strerror}", log_format)

@@ -7,7 +7,6 @@ the file is closed cleanly.
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import signal
@@ -97,8 +96,8 @@ class Inbox:
 def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: Sinks) -> None:
     """Record `run` into `sinks` until its end; see the module's text.
 
-    Raises TransportError if no router at `endpoint` accepts, or no emulator is there under this name, and VnetError
-    if the file cannot be written.
+    Raises TransportError if no router at `endpoint` accepts, or no emulator is there under this name, VnetError if
+    the file cannot be written, and KeyboardInterrupt if it is to end before anything has been heard.
     """
     inbox = Inbox()
 
@@ -115,7 +114,6 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
     set_time_slice(DEFAULT_SLICE)  # what started it may have a shorter one
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with (
-        contextlib.suppress(KeyboardInterrupt),
         open_client(endpoint, credentials, LEASE_MS) as session,
         Recorder(sinks, run) as recorder,
     ):
@@ -138,6 +136,8 @@ def _record_all(inbox: Inbox, recorder: Recorder, run: str) -> None:
         count = inbox.gather(taker.left_s, GATHER_S)
         taker.take(count)
         if inbox.is_closed:
+            if not taker.heard:
+                raise KeyboardInterrupt
             return
         if not count:
             if not taker.heard:

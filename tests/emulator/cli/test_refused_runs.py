@@ -1,5 +1,6 @@
 """A run that is refused leaves nothing: no folder, no number used up, and `runs/latest` where it was."""
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from emulator.terminal.console import run_app
 from tests.support.command_line import app
 from tests.support.paths import ROOT
 
@@ -50,6 +52,17 @@ def test_a_missing_extra_is_the_only_line(command: str, monkeypatch: pytest.Monk
     status, stderr = vnet(command, "80211p", "--duration", "1")
     assert status == 2 and stderr.startswith("vnet: a physical radio (radio.path_loss, radio.mac) needs scipy: pip")
     assert stderr.count("\n") == 1
+
+
+def test_a_current_folder_that_is_gone_is_one_line(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONHASHSEED", "0")
+    (here / "gone").mkdir()
+    os.chdir(here / "gone")
+    (here / "gone").rmdir()
+    assert run_app(app, ["simulate", BEACON, *SHORT]) == 2
+    assert capsys.readouterr().err == "vnet: the current folder is not there any more\n"
 
 
 def test_users_of_a_run_are_made_for_its_program(here: Path) -> None:

@@ -9,7 +9,14 @@ from collections.abc import Iterator
 import pytest
 
 from emulator.drivers.live.processes import to_its_end
-from emulator.drivers.signals import ENDING, cancelled_by_signals, gets_signals, signals_handled, signals_ignored
+from emulator.drivers.signals import (
+    ENDING,
+    cancelled_by_signals,
+    first_interrupt_told,
+    gets_signals,
+    signals_handled,
+    signals_ignored,
+)
 
 
 def usual(number: int, frame: object) -> None:
@@ -120,3 +127,12 @@ def test_what_fails_as_programs_end_is_told() -> None:
 
     with pytest.raises(ValueError, match="no"):
         asyncio.run(to_its_end(shut_down()))
+
+
+def test_one_while_a_run_is_judged_is_told_once() -> None:
+    said = threading.Event()
+    with pytest.raises(KeyboardInterrupt), first_interrupt_told(said.set) as is_told:
+        assert not is_told()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert is_told() and said.wait()
+        os.kill(os.getpid(), signal.SIGINT)

@@ -190,6 +190,27 @@ def test_agents_whose_episode_is_over_neither_send_nor_receive() -> None:
     assert told == ["car_0", "car_1", "car_2", "car_0", "car_1"]
 
 
+def test_a_step_that_the_environment_refuses_has_sent_nothing() -> None:
+    class Refusing(Crossing):
+        def step(self, actions: dict[str, Any]) -> Any:
+            if actions["car_0"] is None:
+                raise LookupError("no such action")
+            return super().step(actions)
+
+    env = Refusing(2)
+    radio = emulator.radio_for(
+        env,
+        PERFECT,
+        position_m=env.position_m,
+        send=lambda *_: b"here",
+        receive=lambda agent, observation, packets: len(packets),
+    )
+    radio.reset(seed=1)
+    with pytest.raises(LookupError):
+        radio.step({"car_0": None, "car_1": 1})
+    assert radio.step({"car_0": 1, "car_1": 1})[0] == {"car_0": 1, "car_1": 1}
+
+
 @pytest.mark.parametrize(
     ("wrong", "line"),
     [

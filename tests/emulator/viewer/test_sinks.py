@@ -359,3 +359,7 @@ def test_an_emulator_that_never_comes_is_not_awaited_for_ever(monkeypatch: pytes
     monkeypatch.setattr("emulator.viewer.watch.FIRST_SIGN_S", 0.0)
     with pytest.raises(TransportError, match=r"^run nobody: .* is it running"):
         _record_all(Inbox(), recorder, "nobody")
+    inbox = Inbox()
+    inbox.close()
+    with pytest.raises(KeyboardInterrupt):  # which a script must not take for a recording
+        _record_all(inbox, recorder, "nobody")
