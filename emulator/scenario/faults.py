@@ -774,6 +774,7 @@ def _adapter(kinds: tuple[type[Fault], ...]) -> TypeAdapter[Any]:
 def _validate(data: object) -> Fault:
     """Return the fault that plain data describe. Raises ValidationError."""
     fault: Fault = _adapter(tuple(KINDS.values())).validate_python(data)
+    type(fault).model_rebuild()  # pydantic before 2.14 cannot write one whose class is not complete
     return fault
 
 
