@@ -8,6 +8,7 @@ from pathlib import Path
 from textwrap import dedent
 from types import ModuleType
 from typing import Any
+from zipapp import create_archive
 
 import pytest
 
@@ -915,6 +916,18 @@ def test_the_end_of_a_run_is_no_failure_of_a_task_that_blocks(drive: Drive) -> N
         asyncio.run(main())
         """)
     assert log(run) == ["begins"]
+
+
+def test_a_command_may_name_a_folder_and_no_archive(drive: Drive, tmp_path: Path) -> None:
+    folder, archive = tmp_path / "car", tmp_path / "car.pyz"
+    folder.mkdir()
+    (folder / "wheel.py").write_text("SIZE = 3\n")
+    (folder / "__main__.py").write_text("import sys, wheel\nprint(sys.argv, __file__, wheel.SIZE)\n")
+    run = drive(program={"command": ["python", str(folder), "{id}"]})
+    assert log(run)[0] == f"{[str(folder), 'v01']} {folder / '__main__.py'} 3"
+    create_archive(folder, archive)
+    (crash,) = events(drive(program={"command": ["python", str(archive)]}), "crashed")
+    assert "car.pyz': no script in Python" in crash["error"]
 
 
 @pytest.mark.parametrize(

@@ -678,6 +678,42 @@ def test_a_program_that_puts_without_a_pause_comes_to_the_end_of_the_run(drive: 
     assert log(run)[0] in ("19", "20")
 
 
+def test_locks_of_multiprocessing_wait_on_emulated_time(drive: Drive) -> None:
+    run = drive("""
+        import multiprocessing, threading, time
+        def begin(*shared):
+            global lock, event, value
+            lock, event, value = shared
+        def work(number):
+            event.wait()
+            with lock, value.get_lock():
+                before = value.value
+                time.sleep(0.1)
+                value.value = before + 1
+        shared = multiprocessing.Lock(), multiprocessing.Event(), multiprocessing.Value("i", 0)
+        with multiprocessing.Pool(3, begin, shared) as pool:
+            jobs = pool.map_async(work, range(6))
+            time.sleep(0.2)
+            shared[1].set()
+            jobs.get()
+        print(shared[2].value, f"{time.monotonic():.2f}")
+        condition, semaphore = multiprocessing.Condition(), multiprocessing.Semaphore(0)
+        with condition:
+            print(condition.wait(0.2), f"{time.monotonic():.2f}")
+        threading.Timer(0.1, semaphore.release).start()
+        print(semaphore.acquire(timeout=0.05), semaphore.acquire(), f"{time.monotonic():.2f}")
+        lock = multiprocessing.RLock()
+        with lock, lock:
+            print(multiprocessing.pool.ThreadPool(1).apply(lock.acquire, (False,)))
+        done = multiprocessing.Event()
+        child = multiprocessing.get_context("fork").Process(target=lambda: time.sleep(0.01) or done.set())
+        child.start()
+        print(done.wait(5), f"{time.monotonic():.2f}")
+        child.join()
+        """)
+    assert printed(run) == ["6 0.80", "False 1.00", "False True 1.10", "False", "True 1.10"]
+
+
 def test_pools_of_multiprocessing_are_threads_on_emulated_time(drive: Drive) -> None:
     text = """
         import multiprocessing, multiprocessing.dummy, threading, time

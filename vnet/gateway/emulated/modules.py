@@ -16,6 +16,7 @@ import importlib.machinery
 import importlib.metadata
 import importlib.util
 import multiprocessing
+import multiprocessing.synchronize
 import os
 import random
 import select
@@ -39,7 +40,7 @@ from greenlet import GreenletExit
 from vnet.errors import ProgramError, shown
 from vnet.gateway import client_config, python_words, session_variables
 from vnet.gateway.emulated.loops import prepare_asyncio
-from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, subprocess_functions, take_output
+from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, Semaphore, subprocess_functions, take_output
 from vnet.gateway.emulated.shown import facade, hide, import_shared, show
 from vnet.gateway.emulated.strands import Threads, fail, look, set_generator_hooks, sleep
 from vnet.node import Node
@@ -377,13 +378,17 @@ class ProgramModules:
             return compile(words[2], "<string>", "exec", dont_inherit=True), "", None
         script = words[1]
         path = Path(script)
+        if path.is_dir():
+            path = path / "__main__.py"
         try:
             source = path.read_bytes()
         except OSError as error:
             raise ProgramError(f"program.command: {shown(script)}: {error.strerror}") from None
+        if b"\0" in source:
+            raise ProgramError(f"program.command: {shown(script)}: no script in Python")
         self.path[:] = [str(path.resolve().parent), *self._searched]
         self.argv[:] = list(words[1:])
-        return compile(source, script, "exec", dont_inherit=True), script, None
+        return compile(source, str(path), "exec", dont_inherit=True), str(path), None
 
     def _find_module(self, name: str) -> ModuleSpec:
         spec = self._find(name)
@@ -511,6 +516,7 @@ class ProgramModules:
 
     def _multiprocessing(self) -> ModuleType:
         package, chosen = self._package("multiprocessing"), ""
+        multiprocessing.synchronize._multiprocessing = SimpleNamespace(SemLock=Semaphore)  # type: ignore[attr-defined]
 
         def new_pool(*args: Any, **options: Any) -> Any:
             return vars(self.load("multiprocessing.pool"))["Pool"](*args, **options)

@@ -5,22 +5,34 @@ Python's own functions act on the whole process, which has the emulator and all 
 
 from __future__ import annotations
 
+import _multiprocessing  # type: ignore[import-not-found]
 import asyncio
 import errno
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from math import ceil
+from math import ceil, inf
+from multiprocessing.synchronize import RECURSIVE_MUTEX  # type: ignore[attr-defined]
 from operator import index
 from types import FrameType, ModuleType, TracebackType
 from typing import Any, NoReturn
 from zlib import crc32
 
 from vnet.gateway import STARTUP
-from vnet.gateway.emulated.strands import HardExit, Threads, Waiting, current_strand, leave_hard
+from vnet.gateway.emulated.strands import (
+    BUSY_WAIT_S,
+    HardExit,
+    Strand,
+    Threads,
+    Waiting,
+    current_strand,
+    leave_hard,
+    sleep,
+)
 
 OUTSIDE = "VNET_OUTSIDE"
 """Variable by which a child process knows that it has no radio, as its Zenoh would reach the machine's network."""
@@ -218,6 +230,37 @@ class OwnProcess:
         self._threads.interrupt(leave)
         if strand is not None:
             leave_hard(None)
+
+
+class Semaphore(_multiprocessing.SemLock):  # type: ignore[misc]
+    """A lock or semaphore of `multiprocessing`, for which a program waits on emulated time.
+
+    While it has child processes, which may hold it, it waits in the machine's time, as for these.
+    """
+
+    _holder: Strand | None = None
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
+        strand = current_strand()
+        if strand is None or multiprocessing.active_children() or multiprocessing.parent_process() is not None:
+            return bool(super().acquire(block, timeout))
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + (inf if timeout is None else timeout)
+        while not self._is_taken(strand):
+            if not block or loop.time() >= end_s:
+                return False
+            sleep(BUSY_WAIT_S)
+        return True
+
+    def _is_taken(self, strand: Strand) -> bool:
+        """Take it, if it is free; to Python all strands are the one that holds it."""
+        is_others = self.kind == RECURSIVE_MUTEX and self._is_mine() and self._holder is not strand
+        if is_others or not super().acquire(False):
+            return False
+        self._holder = strand
+        return True
+
+    __enter__ = acquire
 
 
 def _program_frame(frame: FrameType) -> FrameType | None:
