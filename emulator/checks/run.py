@@ -301,14 +301,15 @@ def _longest_silence(recorded: RecordedRun, window: int) -> IntArray:
         its_own = [each for each, of in zip(apart, programs, strict=True) if of == program]
         usual = np.percentile(np.concatenate(its_own), 75)
         longest[program] = min(max(window, int(2 * usual)), 2 * window)
-    expected = able | _taken(recorded, able, programs, window)
-    return np.where(expected, [longest.get(program, 0) for program in programs], 0)
+    of_program = np.array([longest.get(program, 0) for program in programs])
+    return np.where(able | _taken(recorded, able, programs, window, of_program), of_program, 0)
 
 
-def _taken(recorded: RecordedRun, able: Mask, programs: list[str], window: int) -> Mask:
+def _taken(recorded: RecordedRun, able: Mask, programs: list[str], window: int, longest: IntArray) -> Mask:
     """Return the nodes (N,) that a fault took, or their fixes, after a report or before they had time to begin.
 
-    That is as much as the last of their program that is `able` took before any fault, and `window` periods.
+    That is as much as the last of their program that is `able` took before any fault, and `window` periods. One
+    whose last report was by then longer ago than its program may be silent reports less often than elsewhere.
     """
     taking = [each for each in recorded.plan if isinstance(each.fault, (ProcessFault, GnssOutage))]
     if not taking:
@@ -326,7 +327,11 @@ def _taken(recorded: RecordedRun, able: Mask, programs: list[str], window: int) 
         if not begun.any():
             begun = its_own & able
         time_ns[its_own] = (first_ns - up_ns)[begun].max() + window * recorded.scenario.period_ns
-    reported = recorded.reported.any(axis=0)
+    start_ns = recorded.period_starts_ns()
+    before = recorded.reported & (start_ns[:, None] < struck_ns)
+    last_ns = np.where(before, start_ns[:, None], -END_OF_TIME_NS).max(axis=0)
+    is_seldom = before.any(axis=0) & (struck_ns - last_ns > longest * recorded.scenario.period_ns)
+    reported = recorded.reported.any(axis=0) & ~is_seldom
     taken: Mask = (struck_ns - up_ns < time_ns) | (reported & (struck_ns < END_OF_TIME_NS))
     return taken
 

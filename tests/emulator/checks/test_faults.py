@@ -566,6 +566,7 @@ REPORTS: dict[str, Callable[[Node, int], bool]] = {
     "v02 from 1.2 s on, and never after a restart": lambda node, period: (
         node.id != "v02" or (period >= 12 and not node.incarnation)
     ),
+    "every fifth second, v02 always": lambda node, period: node.id == "v02" or period % 50 == 0,
     "from the third second on": lambda node, period: period >= 30,
 }
 """At which of its fixes a vehicle reports, by its period of 0.1 s."""
@@ -608,6 +609,8 @@ LATE = of("gnss_outage", 0.0, 3.0, "v02")
         ("from 0.5 s on, v01 never", [of("kill", 0.0, 1.0)], Verdict.UNKNOWN),
         # What a fault kept from reporting is no measure of the time that others take.
         ("from 0.5 s on, v01 never", [LATE, of("kill", 2.0, 1.0)], Verdict.VALID),
+        # Nor is another vehicle, whose program may have other options, where its own reports were seldom before.
+        ("every fifth second, v02 always", [of("restart", 2.0, 0.5)], Verdict.VALID),
         # One that had reported once before a fault is expected to again.
         ("v02 from 1.2 s on, and never after a restart", [of("kill", 1.25, 0.5, "v02")], Verdict.INVALID),
     ],
