@@ -19,6 +19,7 @@ sender's other flows leave no slot, it is dropped.
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -534,7 +535,9 @@ class Sidelink(Mac):
     def _count_use(self, booking: _Booking, slot: int) -> None:
         """Note for congestion control that a station occupies a slot."""
         if self._congestion is not None:
-            booking.station.used.append((slot, booking.length))
+            insort(
+                booking.station.used, (slot, booking.length)
+            )  # second transmissions are noted ahead of their time
 
     def _transmit(self, slot: int, on_air: list[_Booking]) -> None:
         """Put frames on air in a slot."""

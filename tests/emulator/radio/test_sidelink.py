@@ -446,6 +446,27 @@ def test_occupancy_limit_drops_frames_of_a_busy_channel_alone(again: bool) -> No
     assert "no_grant" not in {row["outcome"] for row in quiet}
 
 
+@pytest.mark.slow
+def test_occupancy_limit_drops_no_frame_that_has_room() -> None:
+    """Second transmissions are booked before first ones of other flows that precede them."""
+    limit = {"congestion": {"kind": "cr_limit", "busy": [0.0], "most": [0.012]}}
+    flows = (50, 150, 7), (100, 150, 31), (200, 500, 83)
+    frames = sorted(((n * ms + at) * MS, size, ms) for ms, size, at in flows for n in range(12_000 // ms))
+    rows = sent(with_mac(LTE, retransmit=True) | limit, frames, seed=6)
+    dropped = [row for row in rows if row["outcome"] == "no_grant"]
+    used = [  # slots, when they were booked, and resources
+        (begin // MS, row["on_air_ns"] // MS, -(-row["size_bytes"] // 190))
+        for row in rows
+        if row["on_air_ns"] is not None
+        for begin in {row["on_air_ns"], row["left_ns"] - MS}
+    ]
+    assert len(dropped) > 50
+    for row in dropped:
+        slot = row["left_ns"] // MS - 1 + 4
+        held = sum(length for at, booked, length in used if slot - 1000 < at and booked <= slot)
+        assert held - (-row["size_bytes"] // 190) > 0.012 * 4 * 1000
+
+
 def test_a_full_queue_and_a_throttle_act_as_on_other_macs() -> None:
     subject = engine(line(0, 50), queue_frames=1, **LTE)
     subject.transmit(0, 0, [b"x", b"y", b"z"])
