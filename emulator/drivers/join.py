@@ -38,7 +38,9 @@ class Membership:
 
     def hello(self, key_node: str, hello: wire.Hello) -> str | None:
         """Take a hello that came on the key of `key_node`; returns why it is refused, or None."""
-        if hello.node != key_node or key_node not in self._node_ids or hello.process_id not in self._node_ids:
+        if hello.node != key_node:
+            return f"a hello on the key of {key_node} names {hello.node!r}"
+        if key_node not in self._node_ids or hello.process_id not in self._node_ids:
             return f"{hello.node!r} is not a node of this run"
         if self._alone and hello.process_id != hello.node:
             return f"{hello.node}: vehicles enter and leave one by one: start an agent for each"

@@ -369,11 +369,13 @@ class RealTime:
         if self._emulation.ended_ns is None:
             self._emulation.give_up_starts(self._emulation.duration_ns, self._held_ns)
         self._emulation.finish(self._emulation.duration_ns)
+        end_ns = self._emulation.ended_ns
+        assert end_ns is not None
         for waiting in self._unacknowledged.values():
             for sent in waiting.values():
                 self._lose(sent.deliveries)
         if self.gaps:
-            self._emulation.folder.event(self._emulation.duration_ns, EventKind.transport_gap, count=self.gaps)
+            self._emulation.folder.event(end_ns, EventKind.transport_gap, count=self.gaps)
         counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
         if sum(counts):
             figures = lateness_figures(counts)
@@ -383,7 +385,7 @@ class RealTime:
             }
             worst_s = self._late_in.most_common(WORST_SECONDS)
             figures["worst_s"] = {str(second): count for second, count in worst_s if count > 0}
-            self._emulation.folder.event(self._emulation.duration_ns, EventKind.late_deliveries, None, **figures)
+            self._emulation.folder.event(end_ns, EventKind.late_deliveries, None, **figures)
 
 
 def _late(counts: Sequence[int]) -> int:

@@ -241,7 +241,7 @@ TRACE = Table(
         "outcome": Column(NAME, "[what became of it](#outcomes)"),
         "cause": Column(TEXT, "the fault behind an outcome `fault`, a copy or changed bytes, as `loss-0`; else "
                               "empty"),
-        "arrival_ns": Column(INT, "when it arrived; null if it did not", True),
+        "arrival_ns": Column(INT, "when it arrived, or (`transport`) was due; null if it did not", True),
         "copy": Column(pa.int16(), "0; 1, 2, … for what a fault sends, or lets arrive, again"),
         "on_air_ns": Column(INT, "with `[radio.mac]` only: when its transmission began; null if it never did", True,
                             _with_mac),

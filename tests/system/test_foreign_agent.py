@@ -280,4 +280,4 @@ def test_a_foreign_agent_that_is_refused_ends_with_one_line(tmp_path: Path) -> N
         words = [*WRONG, "OfNoNode", *values]
         done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
-    assert done.stderr == "v01: refused: 'v99' is not a node of this run\n"
+    assert done.stderr == "v01: refused: a hello on the key of v01 names 'v99'\n"

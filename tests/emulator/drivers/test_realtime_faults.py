@@ -284,6 +284,14 @@ def test_messages_are_taken_at_the_instants_at_which_they_came_and_never_before_
     assert [realtime.taken_ns(came_ms * MS) // MS for came_ms in (12, 21)] == [20, 21]
 
 
+def test_an_interrupted_run_has_no_event_after_its_end() -> None:
+    realtime, emulation = started()
+    realtime.gaps = 1
+    emulation.finish(50 * MS)
+    realtime.finish()
+    assert [event.time_ns for event in emulation.folder.events if event.kind == "transport_gap"] == [50 * MS]
+
+
 def late_batch(realtime: RealTime, sent_ms: int, due_ms: int) -> tuple[wire.Batch, wire.Receipts]:
     """Have v01 send, take what is due at another instant, and return the batch of v02 with its receipts."""
     realtime.receive(sent_ms * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v01", b"x")])))
