@@ -37,6 +37,7 @@ from emulator.scenario.scenario import Scenario
 from vnet.errors import ProgramError, ScenarioError, VnetError, shown
 from vnet.runtime import running_node
 from vnet.runtime.environment import SAME_ARITHMETIC, has_same_arithmetic
+from vnet.runtime.own_packages import INSTALLED, OWN
 from vnet.runtime.programs import Program, path_without_programs
 from vnet.runtime.running_node import LONGEST_ID, LOOK_S, Patience, RunningNode
 
@@ -354,7 +355,7 @@ def rule_entry(rule: str | Callable[..., Any]) -> tuple[str, Path | None]:
         raise ScenarioError(
             f"rule = {shown(rule)}: must be a function of a module, so that the run can be reproduced: put it there"
         )
-    return f"{rule.__module__}:{rule.__name__}", _folder_of(rule)
+    return f"{rule.__module__}:{rule.__name__}", _folder_of(rule.__module__)
 
 
 def is_importable(function: Callable[..., Any]) -> bool:
@@ -369,23 +370,33 @@ def is_importable(function: Callable[..., Any]) -> bool:
 
 
 def with_folder_of(function: Program | None, scenario: Scenario) -> Scenario:
-    """Return the scenario with the folder in which the function's module is found, if nothing else finds it."""
-    folder = _folder_of(function) if function is not None and is_importable(function) else None
+    """Return the scenario with the folders in which this process finds its programs, where another would not.
+
+    They are the function, or the scenario's entries.
+    """
     program = scenario.program
-    if folder is None or folder in program.folders:
+    if function is None:
+        modules = [str(each.entry).partition(":")[0] for each in (program, *program.exceptions) if each.entry]
+        known = [Path.cwd()]
+    else:
+        modules, known = [function.__module__] if is_importable(function) else [], []
+    found = dict.fromkeys(filter(None, map(_folder_of, modules)))
+    if not (folders := [folder for folder in found if folder not in (*program.folders, *known)]):
         return scenario
-    program = program.model_copy(update={"folders": (*program.folders, folder)})
+    program = program.model_copy(update={"folders": (*program.folders, *folders)})
     return scenario.model_copy(update={"program": program})
 
 
-def _folder_of(function: Callable[..., Any]) -> Path | None:
-    """Return the folder in which a function's module is found; None if it is installed."""
-    top = sys.modules.get(function.__module__.partition(".")[0])
-    file = getattr(top, "__file__", None)
-    if file is None:
+def _folder_of(module: str) -> Path | None:
+    """Return the folder in which this process finds a module; None if it does not, or it is installed or vnet's."""
+    top = module.partition(".")[0]
+    try:
+        spec = None if top in OWN else importlib.util.find_spec(top)
+    except (ImportError, ValueError):
         return None
-    folder = Path(file).parents[1 if hasattr(top, "__path__") else 0]
-    return None if folder.name == "site-packages" else folder
+    places = [] if spec is None else spec.submodule_search_locations or [spec.origin or ""]
+    folder = Path(next(iter(places), "")).parent
+    return folder if folder.is_absolute() and folder.name not in INSTALLED else None
 
 
 def name_of(function: Program) -> str:

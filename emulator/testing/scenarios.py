@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from emulator.cells.worker import with_folder_of
 from emulator.scenario.loading import find_scenario, load_scenario, with_own_modules
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
@@ -48,7 +49,7 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
             table = table.setdefault(section, {})
         table[key] = _plain(value)
     changed = _validated(data)
-    return with_own_modules(changed, base)
+    return with_folder_of(None, with_own_modules(changed, base))
 
 
 def _loaded(source: Source, folders: Iterable[Path]) -> tuple[Scenario, Path | None]:

@@ -82,6 +82,36 @@ def test_a_run_finds_nothing_that_one_before_has_left_in_modules(
     assert first.tolist() == second.tolist() and first[-1, 0] > first[0, 0] == 3
 
 
+NUMBERS = """
+from itertools import count
+
+NUMBERS = count()
+
+async def main(node):
+    async for fix in node.gnss:
+        node.report(number=next(NUMBERS))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("fit")
+def test_programs_are_those_of_the_path_of_this_process_and_keep_nothing_if_they_are_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("site-packages", "src"):
+        package = tmp_path / name / f"fleet_{name[:3]}"
+        package.mkdir(parents=True)
+        (package / "car.py").write_text(NUMBERS)
+        monkeypatch.syspath_prepend(tmp_path / name)
+    one, other = (emulator.simulate(SMALL, program="fleet_sit.car:main") for _ in range(2))
+    assert one.reported("number").tolist() == other.reported("number").tolist()
+    assert other.scenario.program.folders == ()
+    live = emulator.run(SMALL, program="fleet_src.car:main")
+    assert live.scenario.program.folders == (tmp_path / "src",)
+    assert live.reported("number")[0].tolist() == [0, 0, 0]
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("fit")
 def test_simulate_gives_a_run_with_what_was_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,9 +71,9 @@ def users_file(name: str) -> Path | None:
     return None if INSTALLED.intersection(Path(file).parts) else Path(file).resolve()
 
 
-def is_compiled(file: Path | None) -> bool:
+def is_compiled(file: str | Path | None) -> bool:
     """Return whether a module's file is no Python source."""
-    return file is not None and file.name.endswith(tuple(EXTENSION_SUFFIXES))
+    return file is not None and str(file).endswith(tuple(EXTENSION_SUFFIXES))
 
 
 def another_file(module: ModuleType) -> Path | None:

@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 from vnet.errors import ProgramError, did_you_mean
 from vnet.extras import missed_by
 from vnet.runtime.error_text import error_line
-from vnet.runtime.own_packages import another_file, is_compiled, name_clash, users_file
+from vnet.runtime.own_packages import OWN, another_file, is_compiled, name_clash, names_of, users_file
 
 if TYPE_CHECKING:
     from vnet.node import Node
@@ -70,6 +70,7 @@ def load_program(entry: str) -> Program:
         own_asyncio.detach()
     if is_new:
         _contexts[module] = context
+        _entered.add(module_name.partition(".")[0])
     elif other := another_file(module):
         raise ProgramError(f"program.entry = {entry!r}: {module_name} is already {_origin(module)}: rename {other}")
     program = getattr(module, name, None)
@@ -88,6 +89,8 @@ def load_program(entry: str) -> Program:
 
 _imported: list[str] = []
 """Names of the modules that were imported on behalf of runs."""
+_entered: set[str] = set()
+"""Packages that programs are of, wherever these were found."""
 _searched: set[str] = set()
 """The folders in which programs have been looked for."""
 
@@ -119,7 +122,7 @@ def import_for_run(name: str) -> ModuleType:
 
 
 def forget_imports() -> None:
-    """Have the next run import the modules of its folders again, as in a process of its own: they keep nothing.
+    """Have the next run import its programs and the modules of its folders again, as in a process of its own.
 
     Packages of which somebody else has imported a module stay, as do those with compiled parts, which are imported
     once in a process.
@@ -129,7 +132,8 @@ def forget_imports() -> None:
     files = {name: users_file(name) for name in _imported}
     packages = {name: name.partition(".")[0] for name in [*sys.modules, *files]}
     found = {packages[name] for name, file in files.items() if file and any(map(file.is_relative_to, _searched))}
-    compiled = {packages[name] for name, file in files.items() if is_compiled(file)}
+    found |= _entered.difference(OWN)
+    compiled = {packages[name] for name in files if is_compiled(names_of(name).get("__file__"))}
     of_others = {package for name, package in packages.items() if name in sys.modules and name not in files}
     for name in files:
         if packages[name] in found - compiled - of_others:
