@@ -43,6 +43,7 @@ from emulator.world.maps.roads import (
     MIN_LANE_WIDTH_M,
     NAMES,
     NUMBER,
+    ONE_WAY_CLASSES,
     UNKNOWN,
     Ints,
     Roads,
@@ -182,7 +183,8 @@ def _own_street(where: str, properties: dict[str, Any]) -> Street:
     kind = NUMBER.get(name) if isinstance(name, str) else None
     if kind is None:
         raise ScenarioError(f"{where}: class = {shown(name)}: allowed are {', '.join(NAMES)}")
-    stated = properties.get("oneway") or "no"
+    usually = name in ONE_WAY_CLASSES and "lanes_backward" not in properties
+    stated = properties.get("oneway") or ("yes" if usually else "no")
     whole = int(stated) if isinstance(stated, float) and stated.is_integer() else stated
     if (direction := _DIRECTIONS.get(str(whole).lower())) is None:
         raise ScenarioError(f"{where}: oneway = {shown(stated)}: allowed are {', '.join(_DIRECTIONS)}")

@@ -31,7 +31,7 @@ MAX_LANE_WIDTH_M = 20.0
 """Greatest width of a lane in a map: some maps have one strip for all lanes of a road."""
 MAX_LANES = 16
 """Most lanes of a road in one direction."""
-_ONE_WAY_CLASSES = {"motorway", "motorway_link"}
+ONE_WAY_CLASSES = {"motorway", "motorway_link"}
 """Classes whose ways are one-way unless tagged otherwise."""
 _ROUND = {"roundabout", "circular"}
 """Values of `junction` whose ways are one-way unless tagged otherwise."""
@@ -127,7 +127,7 @@ def _closed_to_cars(tags: Mapping[str, str]) -> bool:
 
 def _lanes(tags: Mapping[str, str], name: str) -> tuple[tuple[int, int], bool]:
     """Return the lanes forward and backward, and true if forward is against the order of the way's points."""
-    is_one_way = name in _ONE_WAY_CLASSES or tags.get("junction") in _ROUND
+    is_one_way = name in ONE_WAY_CLASSES or tags.get("junction") in _ROUND
     one_way = tags.get("oneway", "yes" if is_one_way else "no")
     usual, total = CLASSES[name].lanes, _count(tags.get("lanes"))
     if one_way in ("yes", "true", "1", "-1", "reverse"):

@@ -162,12 +162,16 @@ def test_properties_of_lines_of_our_own(tmp_path: Path) -> None:
         maps.line([here, there], highway="primary", oneway=-1, lanes=2),
         maps.line([here, there], highway="footway"),
         maps.line([here, there], **{"class": "primary"}, oneway="Reverse", lanes_forward=2),
+        maps.line([here, there], **{"class": "motorway"}),
+        maps.line([here, there], **{"class": "motorway"}, lanes_backward=3),
     )
     roads = read_roads(write(tmp_path, "lines.geojson", text))
-    assert [NAMES[kind] for kind in roads.kind] == ["service", "road", "road", "road", "primary", "primary"]
-    assert roads.forward.tolist() == [2, 1, 1, 1, 2, 2] and roads.backward.tolist() == [0, 0, 1, 1, 0, 0]
+    kinds = ["service", *["road"] * 3, *["primary"] * 2, *["motorway"] * 2]
+    assert [NAMES[kind] for kind in roads.kind] == kinds
+    assert roads.forward.tolist() == [2, 1, 1, 1, 2, 2, 2, 2]
+    assert roads.backward.tolist() == [0, 0, 1, 1, 0, 0, 0, 3]
     assert roads.lane_width_m[:2].tolist() == [2.5, 3.5] and len(roads.node_m) == 2
-    assert roads.node[-4:].tolist() == [1, 0, 1, 0]
+    assert roads.node[-8:-4].tolist() == [1, 0, 1, 0]
     assert roads.notes == {"features that are not lines": 2, "ways not for cars": 1}
 
 
