@@ -6,7 +6,7 @@ import platform
 import shlex
 import signal
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
 from importlib.metadata import version
 from io import StringIO
@@ -183,7 +183,11 @@ def _own_findings(
     program = recorded.scenario.program
     if not program.checks and not declared_checks(program):
         return []
-    with redirect_stdout(StringIO()) as printed, signals_handled(signal.default_int_handler, signal.SIGINT):
+    with (
+        redirect_stdout(StringIO()) as printed,
+        redirect_stderr(printed),
+        signals_handled(signal.default_int_handler, signal.SIGINT),
+    ):
         findings = own_findings(program, Run(recorded, folder.path, write=write))
     if printed.getvalue():
         folder.keep("logs/checks.txt", lambda path: write_text(path, sendable(printed.getvalue())))

@@ -210,13 +210,16 @@ def _periods(recorded: RecordedRun) -> Iterator[Message]:
 
 
 def _state(row: dict[str, Any], names: Sequence[str], own: Sequence[str]) -> dict[str, Any]:
-    """Return the state of a vehicle: `names` are columns, `own` those of values by names of the program's own."""
-    columns = {name: _finite(row[name]) for name in names}
+    """Return the state of a vehicle: `names` are columns, `own` those of values by names of the program's own.
+
+    Columns that have no numbers are left out, as a fix in an outage.
+    """
+    columns = {name: row[name] for name in names if row[name] is not None and np.isfinite(row[name]).all()}
     values = {name: _finite(value) for name, value in row["values"] or ()}
     values |= {name: _finite(row[name]) for name in own if row[name] is not None}
     return {
         "node": row["node"],
-        **{name: value for name, value in columns.items() if value is not None},
+        **columns,
         "values": values,
     }
 

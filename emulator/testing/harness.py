@@ -39,7 +39,7 @@ from emulator.scenario.sections import DAY_S
 from vnet.errors import ScenarioError, VnetError
 from vnet.units import NS_PER_S
 
-CRASHES = "agents_alive", "no_exceptions"
+CRASHES = "agents_alive", "no_exceptions", "progress", "own_rules"
 """Checks that fail a test which has not asked how its run ended."""
 PATIENCE_S = 5.0
 """Time on the wall clock that programs have to yield once their test is over."""

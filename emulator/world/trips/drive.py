@@ -82,7 +82,7 @@ def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
         columns = choose_columns(path, names)
     types = {name: pa.string() if name == "id" else pa.float64() for name in columns}
     convert = pacsv.ConvertOptions(
-        column_types=types, include_columns=columns, null_values=[], strings_can_be_null=False
+        column_types=types, include_columns=columns, null_values=[""], strings_can_be_null=False
     )
     try:
         # With one thread pyarrow's errors name the row.

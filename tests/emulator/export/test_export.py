@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import shutil
 import struct
 from base64 import b64decode
@@ -16,7 +17,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from emulator.export.mcap_file import SCHEMAS, write_mcap
+from emulator.export.mcap_file import SCHEMAS, _state, write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import flat, measured_links, write_csv
 from emulator.radio.trace import payload_digest
@@ -204,6 +205,12 @@ def test_a_frame_of_c_v2x_has_an_ethernet_header(tmp_path: Path) -> None:
 
 
 # MCAP.
+
+
+def test_mcap_has_no_fix_in_an_outage() -> None:
+    row = {"node": "v01", "position_m": [1.0, 2.0], "fix_m": [math.nan] * 2, "estimate_m": None, "values": ()}
+    expected = {"node": "v01", "position_m": [1.0, 2.0], "values": {}}
+    assert _state(row, ["position_m", "fix_m", "estimate_m"], ()) == expected
 
 
 def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> None:

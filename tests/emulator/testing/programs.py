@@ -44,6 +44,14 @@ async def busy(node: Node) -> None:
                 pass
 
 
+async def spinning(node: Node) -> None:
+    """A beacon whose first vehicle never lets time advance from 0.5 s on."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        while fix.time_ns == 5 * PERIOD_NS and node.id == "v01":
+            await asyncio.sleep(0)
+
+
 async def faulty(node: Node) -> None:
     """A beacon whose first two vehicles address memory that is not there."""
     async for fix in node.gnss:

@@ -116,6 +116,25 @@ async def test_fails(vnet_emulation):
     )
 
 
+def test_a_program_that_is_ended_and_a_rule_that_fails_fail_their_test(run_tests: RunTests) -> None:
+    result = run_tests("""
+def raising(frame, state):
+    raise ZeroDivisionError
+
+async def test_spins(vnet_emulation):
+    spinning = "tests.emulator.testing.programs:spinning"
+    async with vnet_emulation(BEACON, vehicles=2, duration=2, settle=0.5, program=spinning) as emu:
+        await emu.run_until(2.0)
+
+async def test_raises(vnet_emulation):
+    async with vnet_emulation(BEACON, vehicles=2, duration=3, settle=0.5) as emu:
+        with emu.rule(raising):
+            await emu.run_for(1)
+""")
+    result.assert_outcomes(failed=2)
+    result.stdout.fnmatch_lines_random(["*progress is invalid: *v01*", "*own_rules is invalid: *ZeroDivision*"])
+
+
 WRONG_STEPS = {
     "await emu.__aenter__()": "*VnetError: an emulation can be entered once*",
     "emu.check('peer_cap')": "*peer_cap is unknown: not exercised: *",

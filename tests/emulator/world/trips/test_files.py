@@ -71,6 +71,17 @@ def test_a_csv_file_may_be_sorted_by_vehicle_or_by_time_and_have_other_columns(t
         assert trips["b"].position_m.tolist() == [[0, 50], [0, 90]]
 
 
+def test_speeds_and_headings_may_be_missing_here_and_there(tmp_path: Path) -> None:
+    header, *rows = TWO.split()
+    some = [f"{row},{'' if number else '10.0'}," for number, row in enumerate(rows)]
+    text = "\n".join([f"{header},speed_mps,heading_rad", *some]) + "\n"
+    trips, plain = read(write(tmp_path, "some.csv", text)), read(write(tmp_path, "t.csv", TWO))
+    for name in ("a", "b"):
+        assert np.array_equal(trips[name].position_m, plain[name].position_m)
+    hollow = text.replace(rows[0], ",".join([*rows[0].split(",")[:2], "", ""]))
+    assert "x_m" in refusal(write(tmp_path, "hollow.csv", hollow))
+
+
 def test_parquet_says_what_csv_says_and_ids_may_be_numbers(tmp_path: Path) -> None:
     path = tmp_path / "trips.parquet"
     columns = {"id": [7, 7, 8, 8], "time_s": [0, 2, 1, 3], "x_m": [0, 20, 0, 0], "y_m": [0.0, 0.0, 50.0, 90.0]}
