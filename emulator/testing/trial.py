@@ -18,6 +18,7 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -53,6 +54,8 @@ LOOK_S = 0.5
 STACKS_AT = 0.9
 """At this share of its time limit a trial writes down where it stands."""
 Schedule = tuple[Fault, ...]
+PARTS = 0.5, 0.75, 0.9
+"""Parts of a time that are tried, the least one first."""
 SHORTEST_S = 0.1
 MOST_STEPS = 50
 MOST_ORDER_STEPS = 150
@@ -336,11 +339,14 @@ def _with_its_draws(fault: Fault, number: int) -> Fault:
     return fault if fault.draws_of is not None else fault.model_copy(update={"draws_of": number})
 
 
-def _halves(items: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
+def _parts(items: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
+    """Yield both halves, then all items but each one."""
     if len(items) > 1:
         middle = len(items) // 2
         yield items[:middle]
         yield items[middle:]
+    for number in range(len(items) if len(items) > 2 else 0):
+        yield (*items[:number], *items[number + 1 :])
 
 
 def _fewer(fault: Fault) -> Iterator[Fault]:
@@ -348,17 +354,18 @@ def _fewer(fault: Fault) -> Iterator[Fault]:
     for name in type(fault).model_fields:
         value = getattr(fault, name)
         if isinstance(value, Selector):
-            for ids in _halves(value.ids or ()):
+            for ids in _parts(value.ids or ()):
                 yield fault.model_copy(update={name: Selector(ids=ids)})
     if isinstance(fault, Partition) and isinstance(fault.groups, tuple) and len(fault.groups) == 1:
-        for ids in _halves(fault.groups[0]):
+        for ids in _parts(fault.groups[0]):
             yield fault.model_copy(update={"groups": (ids,)})
 
 
 def _shorter(fault: Fault) -> Iterator[Fault]:
-    half_s = max(SHORTEST_S, round(fault.duration_s / 2, 1))
-    if half_s < fault.duration_s:
-        yield fault.model_copy(update={"duration_s": half_s})
+    shorter_s = [*(part * fault.duration_s for part in PARTS), fault.duration_s - SHORTEST_S]
+    for duration_s in dict.fromkeys(max(SHORTEST_S, round(each_s, 1)) for each_s in shorter_s):
+        if duration_s < fault.duration_s:
+            yield fault.model_copy(update={"duration_s": duration_s})
 
 
 def with_faults(scenario: Scenario, schedule: Schedule) -> Scenario:
@@ -433,12 +440,14 @@ def _with_and_without_parts(items: Sequence[T], parts: int) -> Iterator[Sequence
 
 
 def shrink_run(scenario: Scenario, still_fails: Fails, most: int) -> tuple[Scenario, int]:
-    """Return the run with half the vehicles and time, as often as that fails, and how many runs it took.
+    """Return the run with fewer vehicles and less time, as often as that fails, and how many runs it took.
 
     There are `most` of them at most.
     """
     steps = 0
-    for smaller in (_fewer_vehicles, _less_time):
+    ways: list[Callable[[Scenario], Scenario | None]] = [_fewer_vehicles]
+    ways += [partial(_less_time, part=part) for part in PARTS]
+    for smaller in ways:
         while steps < most and (candidate := smaller(scenario)) is not None:
             steps += 1
             if not still_fails(candidate):
@@ -455,12 +464,12 @@ def _fewer_vehicles(scenario: Scenario) -> Scenario | None:
     return _changed(scenario, "vehicles", (network.vehicles + 1) // 2 if network.vehicles > 2 else 1)
 
 
-def _less_time(scenario: Scenario) -> Scenario | None:
-    """Return the run of half the time; None if it would be too short, or end before a fault."""
-    half_s = round(scenario.run.duration_s / 2, 1)
-    if half_s < SHORTEST_RUN_S:
+def _less_time(scenario: Scenario, part: float) -> Scenario | None:
+    """Return the run of a part of its time; None if it would be too short, or end before a fault."""
+    less_s = round(part * scenario.run.duration_s, 1)
+    if not SHORTEST_RUN_S <= less_s < scenario.run.duration_s:
         return None
-    return _changed(scenario, "duration", half_s)
+    return _changed(scenario, "duration", less_s)
 
 
 def _changed(scenario: Scenario, name: str, value: float) -> Scenario | None:
