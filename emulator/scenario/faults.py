@@ -30,8 +30,9 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar, cast, g
 import numpy as np
 from pydantic import (
     Field,
+    PlainSerializer,
     PlainValidator,
-    SerializeAsAny,
+    SerializationInfo,
     TypeAdapter,
     ValidationError,
     field_validator,
@@ -774,11 +775,16 @@ def _adapter(kinds: tuple[type[Fault], ...]) -> TypeAdapter[Any]:
 def _validate(data: object) -> Fault:
     """Return the fault that plain data describe. Raises ValidationError."""
     fault: Fault = _adapter(tuple(KINDS.values())).validate_python(data)
-    type(fault).model_rebuild()  # pydantic before 2.14 cannot write one whose class is not complete
     return fault
 
 
-AnyFault = Annotated[SerializeAsAny[Fault], PlainValidator(_validate)]
+def _plain(fault: Fault, info: SerializationInfo) -> dict[str, Any]:
+    """Return a fault as plain data, as `SerializeAsAny` has it from pydantic 2.14 on for classes made late."""
+    excluded = {"exclude_none": info.exclude_none, "exclude_defaults": info.exclude_defaults}
+    return fault.model_dump(mode=info.mode, **excluded)
+
+
+AnyFault = Annotated[Fault, PlainValidator(_validate), PlainSerializer(_plain)]
 """A fault of any kind, as the type of a scenario's key."""
 
 

@@ -12,11 +12,11 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    ModelWrapValidatorHandler,
     TypeAdapter,
     ValidationError,
     model_validator,
 )
-from pydantic.functional_validators import ModelWrapValidatorHandler  # elsewhere only from 2.11 on
 from pydantic_core import ErrorDetails, InitErrorDetails
 
 from vnet.errors import did_you_mean, printable, shown
