@@ -780,8 +780,7 @@ def _validate(data: object) -> Fault:
 
 def _plain(fault: Fault, info: SerializationInfo) -> dict[str, Any]:
     """Return a fault as plain data, as `SerializeAsAny` has it from pydantic 2.14 on for classes made late."""
-    excluded = {"exclude_none": info.exclude_none, "exclude_defaults": info.exclude_defaults}
-    return fault.model_dump(mode=info.mode, **excluded)
+    return fault.model_dump(mode=info.mode, exclude_none=info.exclude_none, exclude_defaults=info.exclude_defaults)
 
 
 AnyFault = Annotated[Fault, PlainValidator(_validate), PlainSerializer(_plain)]
