@@ -44,7 +44,7 @@ from vnet.errors import ProgramError, VnetError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.environment import SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
-from vnet.runtime.programs import forget_imports, load_program, search_programs_in
+from vnet.runtime.programs import forget_imports, imports_kept, load_program, search_programs_in
 from vnet.transport.access import Access
 from vnet.transport.session import quiet_zenoh
 
@@ -169,9 +169,10 @@ class Session:
         if self.live is None:
             where = self._local
             earlier = where.apart, where.stalled
-            self.wall_s, self.interrupted = simulate(
-                self.emulation, no_horizon, stop, on_interrupt, where.debug, self._processes, *earlier
-            )
+            with imports_kept():
+                self.wall_s, self.interrupted = simulate(
+                    self.emulation, no_horizon, stop, on_interrupt, where.debug, self._processes, *earlier
+                )
         else:
             from emulator.drivers.live import run_live  # slow to import, and simulations do without
 
@@ -248,7 +249,8 @@ class Session:
     def _run_held(self) -> None:
         try:
             if self.live is None:
-                simulate(self.emulation, self._hold, self._stop)
+                with imports_kept():
+                    simulate(self.emulation, self._hold, self._stop)
             else:
                 asyncio.run(self._run_live())
         except BaseException as error:

@@ -248,7 +248,10 @@ def _packets(recorded: RecordedRun) -> Iterator[_Packet]:
     # A frame that a fault duplicates at a receiver was sent only once.
     sent = sent[~(recorded.caused_by("duplicate") & (recorded.copy > 0))[sent]]
     delivered = np.flatnonzero(recorded.outcome_is("delivered"))
-    left_ns = recorded.sent_ns[sent] if recorded.scenario.radio.mac is None else _on_air_ns(recorded, sent)
+    left_ns = recorded.sent_ns[sent]
+    if recorded.scenario.radio.mac is not None and (on_air_ns := recorded.column("on_air_ns")).max(initial=-1) >= 0:
+        sent = sent[on_air_ns[sent] >= 0]  # others never left their sender
+        left_ns = on_air_ns[sent]
     answered = np.flatnonzero(recorded.ack_on_air_ns >= 0)
     acked = answered[recorded.acked[answered]]
     acked_ns = recorded.ack_on_air_ns[acked] + _ack_airtimes_ns(recorded.bitrate_mbps[acked])
@@ -269,12 +272,6 @@ def _ack_airtimes_ns(bitrate_mbps: Array) -> IntArray:
     """Return the airtimes (n,) of the acknowledgements of frames at these bit rates."""
     rates, index = np.unique(bitrate_mbps, return_inverse=True)
     return np.array([ack_airtime_ns(rate) for rate in rates.tolist()], np.int64)[index]
-
-
-def _on_air_ns(recorded: RecordedRun, rows: NDArray[np.intp]) -> NDArray[np.int64]:
-    """Return the times (n,) at which frames went on air; for those that never did, the times they were enqueued."""
-    on_air_ns = recorded.column("on_air_ns")[rows]
-    return np.where(on_air_ns < 0, recorded.sent_ns[rows], on_air_ns)
 
 
 class _Comments:

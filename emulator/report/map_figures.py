@@ -54,7 +54,7 @@ def map_charts(source: Source) -> Drawers:
     drawers: Drawers = {"map": ("Map", partial(_network, source))}
     names = [name for name in source.drawn_names if not is_text(source.states.schema.field(name).type)]
     for number, name in enumerate(names[:MOST_COLOURED]):
-        drawers[f"map-{number}"] = (f"Map: {title_of(name)}", partial(_coloured, source, name))
+        drawers[f"map-of-{number}"] = (f"Map: {title_of(name)}", partial(_coloured, source, name))
     return drawers
 
 

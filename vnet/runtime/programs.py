@@ -93,6 +93,8 @@ _entered: set[str] = set()
 """Packages that programs are of, wherever these were found."""
 _searched: set[str] = set()
 """The folders in which programs have been looked for."""
+_runs_on: list[None] = []
+"""An item for each run of this process that is on."""
 
 
 @contextmanager
@@ -121,13 +123,25 @@ def import_for_run(name: str) -> ModuleType:
         return importlib.import_module(name)
 
 
+@contextmanager
+def imports_kept() -> Iterator[None]:
+    """Forget no module within the block, in which a run is on."""
+    _runs_on.append(None)
+    try:
+        yield
+    finally:
+        _runs_on.pop()
+
+
 def forget_imports() -> None:
     """Have the next run import its programs and the modules of its folders again, as in a process of its own.
+
+    A run that is made while another one is on shares that one's modules.
 
     Packages of which somebody else has imported a module stay, as do those with compiled parts, which are imported
     once in a process.
     """
-    if not _imported:
+    if not _imported or _runs_on:
         return
     files = {name: users_file(name) for name in _imported}
     packages = {name: name.partition(".")[0] for name in [*sys.modules, *files]}

@@ -189,6 +189,7 @@ def test_a_frame_to_one_vehicle_has_its_address_retries_and_acknowledgements(tmp
 
 def test_a_frame_of_c_v2x_has_an_ethernet_header(tmp_path: Path) -> None:
     radio = {"path_loss": {"kind": "winner_b1", "floor_dbm": -150.0}, "mac": {"kind": "lte-mode4"}}
+    radio["congestion"] = {"kind": "cr_limit", "busy": [0.0], "most": [0.001]}
     run = {"duration_s": 1.0, "settle_s": 0.1, "keep_payloads": True}
     scenario = {"run": run, "network": {"vehicles": 2, "layout": "dense"}, "radio": radio}
     program = {"entry": "agents.beacon:main"}
@@ -202,6 +203,8 @@ def test_a_frame_of_c_v2x_has_an_ethernet_header(tmp_path: Path) -> None:
         sender = recorded.node_ids.index(packet["comment"].split(" ")[0])
         header = b"\xff" * 6 + bytes([2, 0, 0, 0, 0, sender + 1]) + b"\x88\xb5"
         assert packet["bytes"].startswith(header) and packet["length"] == len(packet["bytes"]) > len(header)
+    assert "no_grant" in set(recorded.trace["outcome"].to_pylist())
+    assert not any("no_grant" in packet["comment"] for packet in found), "it was never on air"
 
 
 # MCAP.

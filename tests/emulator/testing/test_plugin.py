@@ -116,6 +116,31 @@ async def test_fails(vnet_emulation):
     )
 
 
+def test_a_run_that_is_made_within_another_leaves_it_its_modules(
+    pytester: pytest.Pytester, run_tests: RunTests
+) -> None:
+    program = """
+import lent
+
+async def main(node):
+    async for fix in node.gnss:
+        import lent as again
+        node.report(same=again is lent)
+"""
+    pytester.makepyfile(lent="", lends=program)
+    result = run_tests("""
+async def test_nested(vnet_emulation):
+    changes = dict(vehicles=2, duration=2, settle=0.5, program="lends.py")
+    async with vnet_emulation(BEACON, **changes) as emu:
+        await emu.run_until(0.5)
+        async with vnet_emulation(BEACON, **changes) as other:
+            await other.run_until(1.0)
+        await emu.run_until(2.0)
+        assert all(row["same"] for row in emu.states().to_pylist() if row["same"] is not None)
+""")
+    result.assert_outcomes(passed=1)
+
+
 def test_a_program_that_is_ended_and_a_rule_that_fails_fail_their_test(run_tests: RunTests) -> None:
     result = run_tests("""
 def raising(frame, state):

@@ -133,7 +133,7 @@ class FakeAttachment:
     def is_watched(self, stream: str) -> bool:
         return False
 
-    def open(self) -> None:
+    def open(self, again: bool = False) -> None:
         self.done.append("open")
 
     def close(self) -> None:
