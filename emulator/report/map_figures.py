@@ -27,8 +27,10 @@ LEAST_PX, MOST_PX = 150, 420
 """Bounds of its height."""
 MOST_CORNERS = 12_000
 """Corners of buildings that are drawn, those of the largest ones."""
-MOST_ROADS, MOST_LINKS, MOST_TRAJECTORIES = 8000, 3000, 400
+MOST_ROADS, MOST_LINKS, MOST_TRAJECTORIES = 10_000, 3000, 400
 """Road segments, links and trajectories that are drawn: more would make a page of many megabytes."""
+CELLS = 600, 300
+"""Cells of a map's width in which roads are one, if there are many: one pixel or two each."""
 MOST_NAMED = 30
 """Vehicles up to which each has its name beside it."""
 NAME_PX = (6.0, 12.0)
@@ -164,11 +166,25 @@ def _draw_roads(
     start = point_m - np.where(endless, reach_m, 0.0)[:, None] * along
     end = point_m + np.where(endless, reach_m, length_m)[:, None] * along
     near = ~((np.maximum(start, end) < centre - half) | (np.minimum(start, end) > centre + half)).any(axis=1)
-    chosen = np.flatnonzero(near)
-    if len(chosen) > MOST_ROADS:
-        chosen = np.sort(chosen[np.argsort(-length_m[chosen], kind="stable")[:MOST_ROADS]])
-    opacity = 0.55 if not endless.all() else float(np.clip(30 / max(len(chosen), 1), 0.25, 0.55))
-    _draw_lines(made, np.stack([start, end], axis=1)[chosen] * scale, GREY, opacity, 0.8)
+    lines_m = np.stack([start, end], axis=1)[near]
+    for cells in CELLS:
+        if len(lines_m) > MOST_ROADS:
+            lines_m = _distinct(lines_m, 2 * float(half.max()) / cells)
+    if len(lines_m) > MOST_ROADS:
+        longest = np.argsort(-np.linalg.norm(lines_m[:, 1] - lines_m[:, 0], axis=1), kind="stable")
+        lines_m = lines_m[np.sort(longest[:MOST_ROADS])]
+    opacity = 0.55 if not endless.all() else float(np.clip(30 / max(len(lines_m), 1), 0.25, 0.55))
+    _draw_lines(made, lines_m * scale, GREY, opacity, 0.8)
+
+
+def _distinct(lines_m: Array, cell_m: float) -> Array:
+    """Return lines (n, 2, 2) with their ends on a grid, each once: lanes of a road are one, curves stay whole."""
+    ends = np.rint(lines_m / cell_m)
+    east, north = (ends[:, 1] - ends[:, 0]).T
+    is_turned = (east < 0) | ((east == 0) & (north < 0))
+    ends[is_turned] = ends[is_turned][:, ::-1]
+    ends = np.unique(ends, axis=0)
+    return np.asarray(ends[(ends[:, 0] != ends[:, 1]).any(axis=1)] * cell_m)
 
 
 def _draw_buildings(made: Canvas, buildings: Buildings, scale: float) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import math
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,9 @@ MAX_COORDINATE_M = 2e7
 """Bound of coordinates: twice what projections use, and what 32 bits hold in cm."""
 LARGEST_EXTENT_DEG = 2.0
 """Extent of the largest region whose vehicles are taken for positions in degrees."""
+MOST_TURNED_RAD = 4 * np.pi
+"""Heading beyond which it is probably in degrees: whoever unwinds headings rarely counts more turns."""
+HEADINGS_NOTE = "heading_rad looks like degrees, and is taken for radians"
 DEGREES_NOTE = "x_m and y_m look like degrees, and are taken for metres; trips may be in lat_deg and lon_deg"
 _LONGEST_LINE = 10_000
 """Characters of a line of a network file."""
@@ -84,8 +88,9 @@ def load_network(path: Path) -> PlacedVehicles:
     if not vehicles:
         raise ScenarioError(f"{path}: no vehicles; at least one row is needed")
     numbers = np.array(list(vehicles.values()))
-    notes = (f"{path}: {DEGREES_NOTE}",) if _look_like_degrees(numbers[:, :2]) else ()
-    return PlacedVehicles(tuple(vehicles), numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi), notes)
+    are_degrees = _look_like_degrees(numbers[:, :2]), bool((np.abs(numbers[:, 2]) > MOST_TURNED_RAD).any())
+    notes = compress([f"{path}: {DEGREES_NOTE}", f"{path}: {HEADINGS_NOTE}"], are_degrees)
+    return PlacedVehicles(tuple(vehicles), numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi), tuple(notes))
 
 
 def _look_like_degrees(position_m: Array) -> bool:

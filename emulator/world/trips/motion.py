@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from emulator.scenario.network import node_id
 from emulator.scenario.sections import FAR_S
-from emulator.world.networks import MAX_COORDINATE_M
+from emulator.world.networks import HEADINGS_NOTE, MAX_COORDINATE_M, MOST_TURNED_RAD
 from emulator.world.projection import middle_deg, project
 from vnet.errors import ScenarioError, counted, first_names, shown
 from vnet.transport.keys import is_segment
@@ -43,8 +43,6 @@ DEGREES = ("lat_deg", "lon_deg")
 """Columns of positions in degrees."""
 OPTIONAL = ("heading_rad", "speed_mps")
 """Columns that a file may lack."""
-MOST_TURNED_RAD = 4 * np.pi
-"""Heading beyond which it is probably in degrees: whoever unwinds headings rarely counts more turns."""
 _BOUND = {
     "time_s": FAR_S,
     "x_m": MAX_COORDINATE_M,
@@ -220,7 +218,7 @@ class Samples:
         self._kept = []
         position_m = self._positions_m(columns, origin_deg)
         if (np.abs(columns.get("heading_rad", 0.0)) > MOST_TURNED_RAD).any():
-            self.notes.append("heading_rad looks like degrees, and is taken for radians")
+            self.notes.append(HEADINGS_NOTE)
         order = np.argsort(columns["code"], kind="stable")
         code = columns["code"][order].astype(np.int64)
         names = self._node_ids()

@@ -154,3 +154,5 @@ def test_coordinates_that_look_like_degrees_are_told(tmp_path: Path, rows: str, 
     path = tmp_path / "n.csv"
     said = f"{path}: x_m and y_m look like degrees, and are taken for metres; trips may be in lat_deg and lon_deg"
     assert notes == ((said,) if told else ())
+    (turned,) = load(tmp_path, HEADER + "a,0,0,1.5\nb,1,1,270\n").notes
+    assert turned == f"{path}: heading_rad looks like degrees, and is taken for radians"
