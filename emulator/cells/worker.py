@@ -26,6 +26,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.machinery import ModuleSpec, PathFinder
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
@@ -355,7 +356,7 @@ def rule_entry(rule: str | Callable[..., Any]) -> tuple[str, Path | None]:
         raise ScenarioError(
             f"rule = {shown(rule)}: must be a function of a module, so that the run can be reproduced: put it there"
         )
-    return f"{rule.__module__}:{rule.__name__}", _folder_of(rule.__module__)
+    return f"{rule.__module__}:{rule.__name__}", _folder_of(_spec_of(rule))
 
 
 def is_importable(function: Callable[..., Any]) -> bool:
@@ -372,28 +373,32 @@ def is_importable(function: Callable[..., Any]) -> bool:
 def with_folder_of(function: Program | None, scenario: Scenario) -> Scenario:
     """Return the scenario with the folders in which this process finds its programs, where another would not.
 
-    They are the function, or the scenario's entries.
+    They are the function, or the scenario's entries, of which no earlier run's folders count.
     """
     program = scenario.program
     if function is None:
-        modules = [str(each.entry).partition(":")[0] for each in (program, *program.exceptions) if each.entry]
-        known = [Path.cwd()]
+        tops = [str(each.entry).partition(":")[0].partition(".")[0] for each in (program, *program.exceptions)]
+        everybodys = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+        path = [each for each in path_without_programs() if each not in everybodys]
+        found = [_folder_of(PathFinder.find_spec(top, path)) for top in filter(None, tops) if top not in OWN]
+        found = [folder for folder in found if folder != Path.cwd()]
     else:
-        modules, known = [function.__module__] if is_importable(function) else [], []
-    found = dict.fromkeys(filter(None, map(_folder_of, modules)))
-    if not (folders := [folder for folder in found if folder not in (*program.folders, *known)]):
+        found = [_folder_of(_spec_of(function))] if is_importable(function) else []
+    folders = dict.fromkeys(folder for folder in found if folder is not None and folder not in program.folders)
+    if not folders:
         return scenario
     program = program.model_copy(update={"folders": (*program.folders, *folders)})
     return scenario.model_copy(update={"program": program})
 
 
-def _folder_of(module: str) -> Path | None:
-    """Return the folder in which this process finds a module; None if it does not, or it is installed or vnet's."""
-    top = module.partition(".")[0]
-    try:
-        spec = None if top in OWN else importlib.util.find_spec(top)
-    except (ImportError, ValueError):
-        return None
+def _spec_of(function: Callable[..., Any]) -> ModuleSpec | None:
+    """Return where the package of a function is found; None for one of vnet's own."""
+    top = function.__module__.partition(".")[0]
+    return None if top in OWN else importlib.util.find_spec(top)
+
+
+def _folder_of(spec: ModuleSpec | None) -> Path | None:
+    """Return the folder in which a module is found; None if it is not, or is installed."""
     places = [] if spec is None else spec.submodule_search_locations or [spec.origin or ""]
     folder = Path(next(iter(places), "")).parent
     return folder if folder.is_absolute() and folder.name not in INSTALLED else None

@@ -249,7 +249,8 @@ def _packets(recorded: RecordedRun) -> Iterator[_Packet]:
     sent = sent[~(recorded.caused_by("duplicate") & (recorded.copy > 0))[sent]]
     delivered = np.flatnonzero(recorded.outcome_is("delivered"))
     left_ns = recorded.sent_ns[sent]
-    if recorded.scenario.radio.mac is not None and (on_air_ns := recorded.column("on_air_ns")).max(initial=-1) >= 0:
+    if recorded.scenario.radio.mac is not None and "on_air_ns" in recorded.trace.column_names:
+        on_air_ns = recorded.column("on_air_ns")
         sent = sent[on_air_ns[sent] >= 0]  # others never left their sender
         left_ns = on_air_ns[sent]
     answered = np.flatnonzero(recorded.ack_on_air_ns >= 0)

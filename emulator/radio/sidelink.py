@@ -535,9 +535,7 @@ class Sidelink(Mac):
     def _count_use(self, booking: _Booking, slot: int) -> None:
         """Note for congestion control that a station occupies a slot."""
         if self._congestion is not None:
-            insort(
-                booking.station.used, (slot, booking.length)
-            )  # second transmissions are noted ahead of their time
+            insort(booking.station.used, (slot, booking.length))  # second ones are noted ahead
 
     def _transmit(self, slot: int, on_air: list[_Booking]) -> None:
         """Put frames on air in a slot."""

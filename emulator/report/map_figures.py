@@ -158,7 +158,7 @@ def _frame(source: Source, legend_rows: int) -> tuple[Canvas, float]:
 def _draw_roads(
     made: Canvas, point_m: Array, heading_rad: Array, length_m: Array, window_m: tuple[Array, Array], scale: float
 ) -> None:
-    """Draw the lanes that come near the window (centre and half extents), the longest ones if there are many."""
+    """Draw the lanes that come near the window (centre and half extents), of a road one if there are many."""
     centre, half = window_m
     reach_m = 2 * float(np.abs(half).sum()) + float(np.hypot(*(point_m - centre).T).max(initial=0.0))
     endless = np.isinf(length_m)

@@ -18,6 +18,7 @@ import os
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from datetime import date, time
 from functools import wraps
@@ -258,6 +259,9 @@ class _Modules:
             if split_file(word) is not None and not Path(word).is_absolute():
                 folder = self._holder("program.command", word)
                 self._holding.add(folder)
+            else:
+                with suppress(OSError, ValueError):  # no name of a folder
+                    self._holding.update(each for each in self._searched if (each / word / "__main__.py").is_file())
 
     def fault(self, fault: Fault) -> Fault:
         """Return a fault with its rule, if it has one, as `module:function`."""

@@ -29,6 +29,11 @@ def split_file(entry: str) -> tuple[str, str] | None:
     return None if found is None else (found[1], found[2] or "")
 
 
+def is_script(path: Path) -> bool:
+    """Return whether a path is of a file, or of a folder that Python runs."""
+    return path.is_file() or (path / "__main__.py").is_file()
+
+
 def from_here(entry: str) -> str:
     """Return an entry of a command line or a call; a file that is there is meant from the current folder."""
     name, function = split_file(entry) or ("", "")
@@ -253,7 +258,7 @@ class Program(OneProgram):
         return [self._located(words) for words in self.of(node).commands]
 
     def _located(self, words: Sequence[str]) -> list[str]:
-        files = [next((str(f / word) for f in self.folders if (f / word).is_file()), word) for word in words[:2]]
+        files = [next((str(f / word) for f in self.folders if is_script(f / word)), word) for word in words[:2]]
         return [*files, *words[2:]]
 
     def of(self, node: str) -> OneProgram:

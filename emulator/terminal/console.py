@@ -133,6 +133,14 @@ def _refuse_other_than_utf8(arguments: Sequence[str]) -> None:
         check_utf8(str(Path.cwd()))
 
 
+def _has_folder() -> bool:
+    """Return whether the current folder is there."""
+    try:
+        return Path.cwd().is_dir()
+    except FileNotFoundError:
+        return False
+
+
 def say_output_failed(error: OSError, arguments: Sequence[str]) -> int:
     """Say that standard output could not be written; returns the exit status."""
     _say(f"standard output: cannot be written: {error.strerror}", _asked_for(arguments))
@@ -147,7 +155,7 @@ def _say_unexpected(error: Exception, arguments: Sequence[str]) -> int:
             return interrupts.INTERRUPTED
         chain = chain.__cause__ or chain.__context__
     log_format = _asked_for(arguments)
-    if isinstance(error, FileNotFoundError) and error.filename is None:
+    if isinstance(error, FileNotFoundError) and not _has_folder():
         _say("the current folder is not there any more", log_format)
         return WRONG_USAGE
     if isinstance(error, OSError) and error.errno in REFUSED_BY_THE_SYSTEM:

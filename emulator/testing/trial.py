@@ -328,7 +328,7 @@ def _smaller(schedule: Schedule) -> Iterator[Schedule]:
             map(_with_its_draws, schedule[number + 1 :], range(number + 1, len(schedule)))
         )
     yield tuple(fault.model_copy(update={"draws_of": None}) for fault in schedule)
-    for simpler in (_fewer, _shorter):
+    for simpler in (partial(_fewer, parts=_halves), _shorter, partial(_fewer, parts=_without_one)):
         for number, fault in enumerate(schedule):
             for changed in simpler(fault):
                 yield (*schedule[:number], changed, *schedule[number + 1 :])
@@ -339,25 +339,27 @@ def _with_its_draws(fault: Fault, number: int) -> Fault:
     return fault if fault.draws_of is not None else fault.model_copy(update={"draws_of": number})
 
 
-def _parts(items: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
-    """Yield both halves, then all items but each one."""
+def _halves(items: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
     if len(items) > 1:
         middle = len(items) // 2
         yield items[:middle]
         yield items[middle:]
+
+
+def _without_one(items: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
     for number in range(len(items) if len(items) > 2 else 0):
         yield (*items[:number], *items[number + 1 :])
 
 
-def _fewer(fault: Fault) -> Iterator[Fault]:
+def _fewer(fault: Fault, parts: Callable[[tuple[Any, ...]], Iterator[tuple[Any, ...]]]) -> Iterator[Fault]:
     """Propose schedules with fewer vehicles."""
     for name in type(fault).model_fields:
         value = getattr(fault, name)
         if isinstance(value, Selector):
-            for ids in _parts(value.ids or ()):
+            for ids in parts(value.ids or ()):
                 yield fault.model_copy(update={name: Selector(ids=ids)})
     if isinstance(fault, Partition) and isinstance(fault.groups, tuple) and len(fault.groups) == 1:
-        for ids in _parts(fault.groups[0]):
+        for ids in parts(fault.groups[0]):
             yield fault.model_copy(update={"groups": (ids,)})
 
 

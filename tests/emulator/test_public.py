@@ -107,6 +107,13 @@ def test_programs_are_those_of_the_path_of_this_process_and_keep_nothing_if_they
     one, other = (emulator.simulate(SMALL, program="fleet_sit.car:main") for _ in range(2))
     assert one.reported("number").tolist() == other.reported("number").tolist()
     assert other.scenario.program.folders == ()
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "own_car.py").write_text(NUMBERS)
+    (elsewhere / "s.toml").write_text('[program]\nentry = "own_car:main"\n[network]\nvehicles = 1\n')
+    emulator.simulate(elsewhere / "s.toml", duration_s=1, set={"run.settle_s": 0})
+    with pytest.raises(VnetError, match="own_car"):
+        emulator.simulate(SMALL, program="own_car:main")  # of another run's folder
     live = emulator.run(SMALL, program="fleet_src.car:main")
     assert live.scenario.program.folders == (tmp_path / "src",)
     assert live.reported("number")[0].tolist() == [0, 0, 0]

@@ -121,7 +121,18 @@ def test_shrinking_leaves_what_is_needed(ids: tuple[str, ...], duration_s: float
 
     smallest, steps = shrink(CROWD, falls)
     assert smallest == (CROWD[1].model_copy(update={"senders": Selector(ids=ids), "duration_s": duration_s}),)
-    assert steps <= 30
+    assert steps <= 40
+
+
+def test_a_fault_of_many_vehicles_is_shortened_though_all_are_needed() -> None:
+    many = Selector(ids=tuple(f"v{number}" for number in range(60)))
+    schedule: Schedule = (Loss(kind="loss", at_s=0.5, duration_s=8.0, probability=0.5, senders=many),)
+
+    def falls(some: Schedule) -> bool:
+        return bool(some) and some[0].duration_s >= 0.5 and isinstance(some[0], Loss) and some[0].senders == many
+
+    (smallest,), _ = shrink(schedule, falls)
+    assert smallest.duration_s == 0.5
 
 
 def test_a_fault_that_is_left_keeps_its_random_draws_if_they_matter() -> None:

@@ -12,6 +12,7 @@ from zipapp import create_archive
 
 import pytest
 
+import emulator
 from emulator.checks.judge import check_run
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
@@ -926,6 +927,10 @@ def test_a_command_may_name_a_folder_and_no_archive(drive: Drive, tmp_path: Path
     run = drive(program={"command": ["python", str(folder), "{id}"]})
     assert log(run)[0] == f"{[str(folder), 'v01']} {folder / '__main__.py'} 3"
     create_archive(folder, archive)
+    beside = tmp_path / "beside.toml"
+    beside.write_text('network.vehicles = 1\nprogram = { kind = "zenoh", command = ["python", "car"] }\n')
+    found = emulator.simulate(beside, duration_s=1, set={"run.settle_s": 0}, out=tmp_path / "beside")
+    assert log(found)[0].endswith(" 3"), "it is looked for beside the scenario, as a script is"
     (crash,) = events(drive(program={"command": ["python", str(archive)]}), "crashed")
     assert "car.pyz': no script in Python" in crash["error"]
 

@@ -383,7 +383,7 @@ class ProgramModules:
         try:
             source = path.read_bytes()
         except OSError as error:
-            raise ProgramError(f"program.command: {shown(script)}: {error.strerror}") from None
+            raise ProgramError(f"program.command: {shown(str(path))}: {error.strerror}") from None
         if b"\0" in source:
             raise ProgramError(f"program.command: {shown(script)}: no script in Python")
         self.path[:] = [str(path.resolve().parent), *self._searched]

@@ -30,7 +30,9 @@ from vnet.gateway.emulated.strands import (
     Threads,
     Waiting,
     current_strand,
+    is_child,
     leave_hard,
+    look,
     sleep,
 )
 
@@ -42,6 +44,8 @@ PIDS = 1 << 30
 """Numbers of processes from there on."""
 INTERRUPTED = 130
 """Status of a program that an interrupt has ended."""
+_OF_PROCESSES = "getsid", "pidfd_open", "sched_getaffinity", "sched_getscheduler", "sched_setaffinity"
+"""Functions of `os` that ask the machine about a process by its number."""
 _IGNORED = (signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH)
 """Signals that do nothing to a program without a handler."""
 _TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
@@ -74,9 +78,14 @@ class OwnProcess:
             "_exit": self._exit,
             "abort": lambda: self._exit(-signal.SIGABRT),
             **{name: _refuse for name in vars(os) if name.startswith(("exec", "fork", "closerange"))},
+            **{name: self._of_the_machine(vars(os)[name]) for name in _OF_PROCESSES},
             "close": _close,
             "dup2": _dup2,
         }
+
+    def _of_the_machine(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of the number of a process that takes the program's for the machine's."""
+        return lambda pid, *args: function(os.getpid() if pid == self._pid else pid, *args)
 
     def signal_functions(self) -> dict[str, Any]:
         """Return what stands for functions of `signal`."""
@@ -235,32 +244,47 @@ class OwnProcess:
 class Semaphore(_multiprocessing.SemLock):  # type: ignore[misc]
     """A lock or semaphore of `multiprocessing`, for which a program waits on emulated time.
 
-    While it has child processes, which may hold it, it waits in the machine's time, as for these.
+    Where no thread holds it, and there are child processes, it waits in the machine's time, as for these.
     """
 
     _holder: Strand | None = None
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
         strand = current_strand()
-        if strand is None or multiprocessing.active_children() or multiprocessing.parent_process() is not None:
+        if strand is None or is_child():
             return bool(super().acquire(block, timeout))
+        look()
         loop = asyncio.get_running_loop()
         end_s = loop.time() + (inf if timeout is None else timeout)
         while not self._is_taken(strand):
             if not block or loop.time() >= end_s:
                 return False
+            if self._holder is None and multiprocessing.active_children():
+                return self._is_noted(strand, super().acquire(True, timeout))
             sleep(BUSY_WAIT_S)
         return True
 
     def _is_taken(self, strand: Strand) -> bool:
         """Take it, if it is free; to Python all strands are the one that holds it."""
         is_others = self.kind == RECURSIVE_MUTEX and self._is_mine() and self._holder is not strand
-        if is_others or not super().acquire(False):
-            return False
-        self._holder = strand
-        return True
+        return not is_others and self._is_noted(strand, super().acquire(False))
+
+    def _is_noted(self, strand: Strand, is_taken: bool) -> bool:
+        if is_taken:
+            self._holder = strand
+        return is_taken
+
+    def release(self) -> None:
+        if self.kind == RECURSIVE_MUTEX and self._holder not in (None, current_strand()):
+            raise AssertionError("attempt to release recursive lock not owned by thread")
+        super().release()
+        if self.kind != RECURSIVE_MUTEX or not self._count():
+            self._holder = None
 
     __enter__ = acquire
+
+    def __exit__(self, *args: object) -> None:
+        self.release()
 
 
 def _program_frame(frame: FrameType) -> FrameType | None:

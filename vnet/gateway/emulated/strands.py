@@ -216,6 +216,11 @@ def set_generator_hooks(*hooks: Any, **named: Any) -> None:
         strand.generator_hooks = sys.get_asyncgen_hooks()
 
 
+def is_child() -> bool:
+    """Return whether this is a process that a program has forked."""
+    return _is_child
+
+
 def go_no_further_if_ended() -> None:
     """Raise GreenletExit whenever the present strand goes on, if it is ended, so that no loop of it is endless.
 
