@@ -136,10 +136,8 @@ def imports_kept() -> Iterator[None]:
 def forget_imports() -> None:
     """Have the next run import its programs and the modules of its folders again, as in a process of its own.
 
-    A run that is made while another one is on shares that one's modules.
-
-    Packages of which somebody else has imported a module stay, as do those with compiled parts, which are imported
-    once in a process.
+    A run that is made while another one is on shares that one's modules. Packages of which somebody else has
+    imported a module stay, as do those with compiled parts, which are imported once in a process.
     """
     if not _imported or _runs_on:
         return
