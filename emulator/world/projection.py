@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MAX_FROM_ORIGIN_M = 200_000.0
 """Greatest distance from the origin at which points in degrees are projected."""
-_PROJ = re.compile(r"(\+[a-z_0-9]+(=[A-Za-z0-9_.+-]*)?\s*)+")
+_PROJ = re.compile(r"(\+[a-z_0-9]+(=[A-Za-z0-9_.+-]*)?\s*)+|EPSG:\d{4,6}")
 _LONGEST_PROJ = 1000
 """Characters of a projection's definition."""
 

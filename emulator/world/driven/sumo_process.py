@@ -6,12 +6,15 @@ never imports it. The process ends when its standard input does; with `--tied` a
 
 from __future__ import annotations
 
+import gzip
 import math
 import os
 import signal
 import sys
 from array import array
+from pathlib import Path
 from typing import Any, BinaryIO
+from xml.etree import ElementTree
 
 import msgspec
 
@@ -76,7 +79,7 @@ class Watch(msgspec.Struct, tag=True):
 
 
 class Command(msgspec.Struct, array_like=True):
-    """Command for the vehicle of this number: a speed in m/s, to drive by itself again, or a change of lanes."""
+    """Command for the vehicle of this number: a speed in m/s, to drive by itself again, or lanes to its left."""
 
     number: int
     speed: float | None = None
@@ -171,6 +174,7 @@ class Simulation:
         self._driven: set[str] = set()  # with the modes of a vehicle that is told its speed
         self._min_gap_m: dict[str, float] = {}
         self._is_on = False
+        self._to_left = 1  # SUMO counts lanes, and places in them, from the side on which a network drives
 
     def answer(self, request: Request) -> Answer:
         """Do what is asked for."""
@@ -199,6 +203,7 @@ class Simulation:
         sumo = self._sumo
         _, version = sumo.start(["sumo", *request.options])[:2]
         self._is_on = True
+        self._to_left = -1 if _drives_on_left(sumo.simulation.getOption("net-file")) else 1
         junctions_m = [tuple(sumo.junction.getPosition(each)) for each in sumo.junction.getIDList()]
         low, high = sumo.simulation.getNetBoundary()
         return Begun(str(version), (tuple(low), tuple(high)), junctions_m)
@@ -235,7 +240,7 @@ class Simulation:
             vehicle.setSpeed(name, command.speed)
         if not command.lane:
             return True
-        lane = vehicle.getLaneIndex(name) + command.lane
+        lane = vehicle.getLaneIndex(name) + self._to_left * command.lane
         if not 0 <= lane < self._sumo.edge.getLaneNumber(vehicle.getRoadID(name)):
             return False
         vehicle.changeLane(name, lane, LANE_S)
@@ -282,7 +287,7 @@ class Simulation:
             speed,
             vehicle.getAcceleration(name),
             vehicle.getDistance(name),
-            vehicle.getLateralLanePosition(name),
+            self._to_left * vehicle.getLateralLanePosition(name),
             gap_m,
             gap_rate,
         ]
@@ -296,6 +301,13 @@ class Simulation:
         if gap_m > self._gap_m:
             return math.nan, math.nan
         return gap_m, self._sumo.vehicle.getSpeed(found[0]) - speed
+
+
+def _drives_on_left(network: str) -> bool:
+    """Tell whether vehicles of this network drive on the left, which its root element says."""
+    with gzip.open(network) if network.endswith(".gz") else Path(network).open("rb") as file:
+        _, root = next(ElementTree.iterparse(file, events=("start",)))
+    return root.get("lefthand") == "true"
 
 
 def main() -> None:

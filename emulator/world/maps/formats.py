@@ -612,7 +612,7 @@ class _Reader:
 
     def _location(self, attributes: dict[str, str]) -> None:
         proj = attributes.get("projParameter", "!")
-        if proj.startswith("+"):
+        if proj.startswith(("+", "EPSG:")):
             points = self._points(attributes.get("netOffset", "0,0"), "netOffset")
             if len(points) != 1:
                 raise self.wrong("netOffset: one x,y in metres is needed")

@@ -230,6 +230,13 @@ class _Reader:
         self._ids, self._rows = [], []
 
 
+_READABLE = {"fcd-output.geo": "false", "fcd-output.attributes": "x,y,angle,speed", "human-readable-time": "false"}
+_READABLE |= {"precision": "6", "output-prefix": "", "no-step-log": "true"}
+"""Options with which SUMO's floating car data can be read, whatever its configuration says."""
+_READABLE_IF_NAMED = {"fcd-output.utm": "false", "output.format": "xml"}
+"""Likewise, but only of a configuration that names them: SUMO before 1.24 has none."""
+
+
 def drive_sumo(path: Path, seed: int, end_s: float | None) -> Samples:
     """Run SUMO on a configuration from its beginning, at most until `end_s`, and return the samples.
 
@@ -238,7 +245,9 @@ def drive_sumo(path: Path, seed: int, end_s: float | None) -> Samples:
     with TemporaryDirectory(prefix="vnet-sumo-") as folder:
         output = Path(folder) / "fcd.xml"
         command = [_sumo(path), "-c", str(path), "--seed", str(seed), "--fcd-output", str(output)]
-        command += ["--fcd-output.geo", "false", "--no-step-log", "--precision", "6"]
+        named = path.read_text(errors="replace")
+        options = _READABLE | {name: value for name, value in _READABLE_IF_NAMED.items() if f"<{name} " in named}
+        command += [part for name, value in options.items() for part in (f"--{name}", value)]
         command += [] if end_s is None else ["--end", str(end_s)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)

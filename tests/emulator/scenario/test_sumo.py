@@ -78,6 +78,18 @@ def test_vehicles_are_where_sumo_drove_them(tmp_path: Path, sumo: Path) -> None:
     assert world.moves and not world.present(12)[0] and world.present(12)[1]
 
 
+@pytest.mark.slow
+def test_what_sumo_writes_can_be_read_whatever_the_configuration_says(tmp_path: Path, sumo: Path) -> None:
+    """Options that are in the configuration alone are set back: old versions of SUMO do not have them."""
+    build_world(load(tmp_path))
+    assert asked(sumo, "--fcd-output.attributes") == "x,y,angle,speed" and asked(sumo, "--output-prefix") == ""
+    with pytest.raises(ValueError, match=r"fcd-output\.utm"):
+        asked(sumo, "--fcd-output.utm")
+    named = CONFIGURATION.replace("<time>", '<fcd-output.utm value="true"/><time>')
+    build_world(load_scenario(write(tmp_path, named)))
+    assert asked(sumo, "--fcd-output.utm") == "false"
+
+
 @pytest.mark.parametrize(
     ("text", "begin_s"), [("25200", 25200.0), ("07:00:00", 25200.0), ("1:00:00:30", 86430.0), ("12.5", 12.5)]
 )

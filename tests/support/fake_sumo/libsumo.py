@@ -27,6 +27,7 @@ def start(command: list[str]) -> tuple[int, str]:
     named = re.search(r'route-files value="([^"]+)"', path.read_text())
     assert named is not None
     _plan = json.loads((path.parent / named[1]).read_text())
+    _plan["network"] = str(path.parent / "a.net.xml")
     _plan["seed"] = int(options["--seed"])
     _step_ms = round(float(options["--step-length"]) * 1000)
     return 22, "SUMO fake"
@@ -90,6 +91,10 @@ class simulation:
     @staticmethod
     def getTime() -> float:
         return _now_ms / 1000
+
+    @staticmethod
+    def getOption(name: str) -> str:
+        return {"net-file": str(_plan["network"])}[name]
 
     @staticmethod
     def getNetBoundary() -> tuple[tuple[float, float], tuple[float, float]]:
@@ -191,7 +196,7 @@ class vehicle:
 
     @staticmethod
     def getLateralLanePosition(name: str) -> float:
-        return 0.0
+        return 0.25
 
     @staticmethod
     def getLeader(name: str, range_m: float) -> tuple[str, float] | None:

@@ -109,6 +109,23 @@ def test_programs_drive_their_vehicles_and_the_others_react(tmp_path: Path) -> N
     assert (tmp_path / "closed").read_text() == "closed", "SUMO may write its files"
 
 
+@pytest.mark.parametrize(("lefthand", "to_left"), [("false", 1), ("true", -1)])
+def test_left_is_left_wherever_vehicles_drive(tmp_path: Path, lefthand: str, to_left: int) -> None:
+    """SUMO counts its two lanes, and places in them, from the left of a network that drives on the left."""
+
+    async def main(node: Node) -> None:
+        async for fix in node.gnss:
+            if fix.time_ns in (500_000_000, 1_000_000_000):
+                node.drive(0.0, lane=1)
+
+    data = write_scenario(tmp_path, network={"sumo": {"nodes": ["lead#1"]}})
+    (tmp_path / "a.net.xml").write_text(f'<net lefthand="{lefthand}"><location/></net>')
+    run = simulated(tmp_path, data, main)
+    limited_ns = [event.time_ns for event in run.events if event.kind == "drive_limited"]
+    assert limited_ns == ([1_000_000_000] if to_left > 0 else [500_000_000, 1_000_000_000])
+    assert_allclose(by_node(run, "left_m")["lead-23-1"], 0.25 * to_left)
+
+
 def test_sumo_writes_its_files_in_a_run_in_several_processes(tmp_path: Path) -> None:
     """It ends when its pipe does, of which forked processes must keep no copy."""
     plan, program = {"closes": str(tmp_path / "closed")}, {"entry": BRAKES}

@@ -200,8 +200,9 @@ def test_lanes_of_sumo_keep_their_place(tmp_path: Path) -> None:
 LOCATION = '<location netOffset="-270000.00,-4684000.00" projParameter="{}"/>'
 
 
-def test_a_network_of_sumo_says_where_it_is(tmp_path: Path) -> None:
-    path = write(tmp_path, "town.net.xml", maps.sumo_net(LOCATION.format(maps.UTM)))
+@pytest.mark.parametrize("projection", [maps.UTM, "EPSG:32617"])
+def test_a_network_of_sumo_says_where_it_is(tmp_path: Path, projection: str) -> None:
+    path = write(tmp_path, "town.net.xml", maps.sumo_net(LOCATION.format(projection)))
     roads = read_roads(path)
     assert roads.node_m[0].tolist() == [196, -1.6] and roads.frame is not None
     lat, lon = roads.frame.to_wgs84(roads.node_m)
