@@ -27,7 +27,6 @@ from vnet.gateway.frames import (
     decode_fragment,
 )
 from vnet.gateway.ros2 import parse_token, parse_topic
-from vnet.types import IntArray
 
 DELIVERED = Outcome.delivered.name
 SENDS: dict[str, str] = {"MP": "put", "SC": "query", "SS": "reply"}
@@ -151,14 +150,19 @@ def _outcomes(recorded: OpenedRun, rows: Sequence[dict[str, object]]) -> Iterato
         for number, row in enumerate(rows)
         for offset in range(int(str(row["frames"])))
     }
-    first = np.flatnonzero(recorded.copy == 0)
-    first = first[np.lexsort((recorded.seq[first], recorded.receiver[first], recorded.sender[first]))]
-    pairs = zip(recorded.sender[first].tolist(), recorded.seq[first].tolist(), strict=True)
-    sample: IntArray = np.array([sample_of.get(pair, -1) for pair in pairs], dtype=np.int64)
-    outcome = recorded.trace["outcome"].cast(pa.string()).take(pa.array(first)).to_pylist()
+    # Of a frame to one vehicle any attempt may arrive.
+    kept = np.flatnonzero((recorded.copy == 0) | (recorded.attempt > 0))
+    by = (recorded.sender, recorded.receiver, recorded.seq)
+    kept = kept[np.lexsort([each[kept] for each in (recorded.copy, *reversed(by))])]
+    outcomes = recorded.trace["outcome"].cast(pa.string()).take(pa.array(kept)).to_pylist()
+    fates: dict[tuple[int, int, int], str] = {}
+    for frame, outcome in zip(zip(*(each[kept].tolist() for each in by), strict=True), outcomes, strict=True):
+        if fates.get(frame) != DELIVERED:
+            fates[frame] = outcome
     worst: dict[tuple[int, int], str] = {}
-    for number, receiver, each in zip(sample.tolist(), recorded.receiver[first].tolist(), outcome, strict=True):
-        if number >= 0 and worst.get((number, receiver), DELIVERED) == DELIVERED:
-            worst[number, receiver] = each
-    for (number, _), each in worst.items():
-        yield number, each
+    for (sender, receiver, seq), outcome in fates.items():
+        sample = sample_of.get((sender, seq))
+        if sample is not None and worst.get((sample, receiver), DELIVERED) == DELIVERED:
+            worst[sample, receiver] = outcome
+    for (number, _), outcome in worst.items():
+        yield number, outcome

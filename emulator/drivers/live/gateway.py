@@ -44,8 +44,8 @@ MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
 MOST_TOKENS = 2**16
 """Tokens that are read at once: Zenoh gives them within the call, which would wait for itself."""
-ANY_HOST = ("0.0.0.0", "::")
-"""Hosts of endpoints that listen at each address: the system says at which one commands connect."""
+ANY_HOST = "0.0.0.0"
+"""Host of endpoints that listen at each address: the system says at which one commands connect."""
 OTHER_HOST = (62, 64)
 """OpenSSL's codes (X509_V_ERR_…_MISMATCH) of a certificate for other hosts, by name and by address."""
 REMOTE = zenoh.Locality.REMOTE
@@ -365,8 +365,13 @@ def check_trust(settings: ZenohSessions) -> None:
     if settings.certificate is None or settings.private_key is None:
         return
     router, command = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    host = settings.listen.partition("/")[2].rpartition(":")[0].strip("[]")
-    command.check_hostname, command.hostname_checks_common_name = host not in ANY_HOST, False
+    host = settings.listen.partition("/")[2].rpartition(":")[0]
+    if host.startswith("["):
+        raise ProgramError(
+            f"program.zenoh.listen = {shown(settings.listen)}: Zenoh connects to no IPv6 address with a "
+            "certificate, only to a host's name or an IPv4 address"
+        )
+    command.check_hostname, command.hostname_checks_common_name = host != ANY_HOST, False
     command.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # as Zenoh, which takes any certificate for an authority
     try:
         router.load_cert_chain(settings.certificate, settings.private_key, password="")

@@ -42,3 +42,28 @@ def test_every_message_has_a_row_and_one_fate_at_each_receiver(tmp_path: Path) -
     outcomes = recorded.trace["outcome"].to_pylist()
     lost = sum(sum(each.lost.values()) for each in figures.values())
     assert 0 < lost <= outcomes.count("lost")
+
+
+def test_a_reply_that_the_mac_has_repeated_arrives_with_any_attempt(tmp_path: Path) -> None:
+    (tmp_path / "zenoh_asks.py").write_text(
+        "import sys, time, zenoh\n"
+        "session = zenoh.open(zenoh.Config())\n"
+        "if sys.argv[1] == 'v02':\n"
+        "    session.declare_queryable('service', lambda query: query.reply('service', b'yes'))\n"
+        "    time.sleep(10)\n"
+        "time.sleep(0.5)\n"
+        "while True:\n"
+        "    print(sum(reply.ok is not None for reply in session.get('service', timeout=0.2)), flush=True)\n"
+        "    time.sleep(0.1)\n"
+    )
+    scenario = {
+        "run": {"duration_s": 6.0, "settle_s": 0.0},
+        "network": {"vehicles": 2},
+        "radio": {"loss": 0.4, "range_m": 1e6, "mac": {"kind": "80211p"}},
+        "program": {"kind": "zenoh", "command": ["python", str(tmp_path / "zenoh_asks.py"), "{id}"]},
+    }
+    run = emulator.simulate(scenario, out=tmp_path / "run")
+    (reply,) = (each for each in key_figures(RecordedRun.open(run.folder)) if each.kind == "reply")
+    answers = (run.folder / "logs" / "v01.log").read_text().split().count("1")
+    assert reply.messages > 10 and reply.arrived == answers
+    assert reply.arrived + sum(reply.lost.values()) == reply.messages

@@ -588,9 +588,13 @@ def test_a_certificate_that_zenoh_does_not_take_for_an_endpoint_is_named(
         check_trust(settings)
 
 
-@pytest.mark.parametrize(
-    "listen", ["tls/127.0.0.1:0", "quic/[::1]:7450", "tls/localhost:0", "tls/[::]:0", "tls/.:0"]
-)
+@pytest.mark.parametrize("listen", ["tls/[::1]:0", "quic/[::1]:7450", "tls/[::]:0"])
+def test_an_ipv6_address_with_a_certificate_is_refused(tmp_path: Path, listen: str) -> None:
+    with pytest.raises(ProgramError, match=r"connects to no IPv6 address"):
+        check_trust(self_signed(tmp_path, [*LOOPBACK, LOCALHOST], False, listen))
+
+
+@pytest.mark.parametrize("listen", ["tls/127.0.0.1:0", "quic/localhost:7450", "tls/0.0.0.0:0", "tls/.:0"])
 def test_a_certificate_that_names_its_host_is_trusted(tmp_path: Path, listen: str) -> None:
     """At which address of all commands connect is not known yet, and a host that is none is Zenoh's to tell."""
     check_trust(self_signed(tmp_path, [*LOOPBACK, LOCALHOST], False, listen))
