@@ -307,7 +307,7 @@ def _drives_on_left(network: str) -> bool:
     """Tell whether vehicles of this network drive on the left, which its root element says."""
     with gzip.open(network) if network.endswith(".gz") else Path(network).open("rb") as file:
         _, root = next(ElementTree.iterparse(file, events=("start",)))
-    return root.get("lefthand") == "true"
+    return bool(root.get("lefthand") == "true")
 
 
 def main() -> None:
