@@ -103,7 +103,7 @@ def write_mcap(
     require("MCAP", "mcap")
     from mcap.writer import Writer
 
-    store = _typestore(definitions)
+    stores = _typestores(definitions)
     writer = Writer(file)
     writer.start(profile="", library="vnet")
     channels: dict[Channel, int] = {}
@@ -115,7 +115,7 @@ def write_mcap(
     for time_ns, channel, message in heapq.merge(*_streams(recorded), key=lambda one: one[0]):
         if isinstance(channel, tuple) and channel not in channels:
             vehicle, sent = channel
-            text = _definition(store, sent.type, sent.type_hash)
+            text = _definition(stores, sent.type, sent.type_hash)
             if text is None:
                 tell(f"{sent.type} of {vehicle}{sent.topic} has no definition with its hash, and so no schema")
             schema_id = 0 if text is None else writer.register_schema(sent.type, "ros2msg", text)
@@ -154,38 +154,45 @@ def _ros2(recorded: RecordedRun) -> Iterator[Message]:
                 yield row["time_ns"], (row["sender"], topic), message.payload
 
 
-def _typestore(definitions: Path | None) -> Any:
-    """Return the types that rosbags has, and those of a folder; None without rosbags."""
+def _typestores(definitions: Path | None) -> list[Any]:
+    """Return the types of Humble and of each later ROS 2 that rosbags has, all with those of a folder.
+
+    Without rosbags there are none.
+    """
     if not is_installed("rosbags"):
         if definitions is not None:
             require("definitions of ROS 2", "rosbags")
-        return None
+        return []
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.LATEST)
+    later = list(Stores)[list(Stores).index(Stores.ROS2_HUMBLE) :]
+    stores = [get_typestore(each) for each in later]
     files = [] if definitions is None else sorted(definitions.glob("**/msg/*.msg"))
     if definitions is not None and not files:
         raise VnetError(f"{definitions}: has no PACKAGE/msg/TYPE.msg")
     for path in files:
         name = f"{path.absolute().parts[-3]}/msg/{path.stem}"
         try:
-            store.register(get_types_from_msg(path.read_text(), name))
+            types = get_types_from_msg(path.read_text(), name)
+            for store in stores:
+                store.register(types)
         except (OSError, UnicodeDecodeError, TypesysError) as error:
             raise VnetError(f"{path}: is no definition of {name}: {' '.join(str(error).split())}") from None
-    return store
+    return stores
 
 
-def _definition(store: Any, ros_type: str, type_hash: str) -> bytes | None:
-    """Return the definition of a type, with those it uses; None unless there is one with this hash."""
-    has_hash = type_hash.startswith("RIHS01_")
-    if store is None or ros_type not in store.fielddefs:
-        return None
-    try:
-        if has_hash and store.hash_rihs01(ros_type) != type_hash:
-            return None
-        return bytes(store.generate_msgdef(ros_type, ros_version=2)[0].encode())
-    except KeyError:  # of a type that it uses, and that is not there
-        return None
+def _definition(stores: Sequence[Any], ros_type: str, type_hash: str) -> bytes | None:
+    """Return the definition of a type, with those it uses; None unless there is one with this hash.
+
+    Of a type without a hash, as Humble sends them, it is the oldest.
+    """
+    for store in (each for each in stores if ros_type in each.fielddefs):
+        try:
+            if not type_hash.startswith("RIHS01_") or store.hash_rihs01(ros_type) == type_hash:
+                return bytes(store.generate_msgdef(ros_type, ros_version=2)[0].encode())
+        except KeyError:  # of a type that it uses, and that is not there
+            continue
+    return None
 
 
 def _periods(recorded: RecordedRun) -> Iterator[Message]:

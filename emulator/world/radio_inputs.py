@@ -29,6 +29,8 @@ _LONGEST_LINE = 1000
 """Characters of a line."""
 _LONGEST_MATRIX_LINE = 10 * MAX_ROWS
 """Characters of a line: an entry may be written as `1.000000,`."""
+SAME_ORIGIN_M = 1.0
+"""Distance within which two origins are taken for the same: degrees may be rounded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,11 +240,18 @@ def load_buildings(scenario: Scenario, frame: CoordinateFrame | None, area_m: Ar
     assert path is not None
 
     def of_degrees() -> CoordinateFrame:
-        if section.origin_deg is not None:
-            return CoordinateFrame.around(*section.origin_deg)
+        origin = section.origin_deg
         if frame is None:
+            if origin is None:
+                raise ScenarioError(
+                    f"{path}: in degrees, but nothing says where x = y = 0 m is: set radio.buildings.origin_deg"
+                )
+            return CoordinateFrame.around(*origin)
+        off_m = 0.0 if origin is None else float(np.hypot(*frame.to_local(*origin)))
+        if not off_m <= SAME_ORIGIN_M:
             raise ScenarioError(
-                f"{path}: in degrees, but nothing says where x = y = 0 m is: set radio.buildings.origin_deg"
+                f"radio.buildings.origin_deg = {list(origin or ())}: {off_m:,.0f} m from where x = y = 0 m is on "
+                "the map, or of the trips; leave it out"
             )
         return frame
 

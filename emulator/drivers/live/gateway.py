@@ -99,7 +99,7 @@ class Gateway(RadioSide[zenoh.Query]):
         self._session = session
         endpoint = router_endpoint(session)
         for number, key in enumerate(self._keys):
-            session.declare_subscriber(key, self._telling(self._put), allowed_origin=REMOTE)
+            session.declare_subscriber(key, self._telling(partial(self._put, number)), allowed_origin=REMOTE)
             # Clients of ROS 2's services ask none but complete queryables.
             is_complete, asked = self._ros2 is not None, self._telling(partial(self._asked, number))
             session.declare_queryable(key, asked, complete=is_complete, allowed_origin=REMOTE)
@@ -141,17 +141,20 @@ class Gateway(RadioSide[zenoh.Query]):
 
         return told
 
-    def _put(self, sample: zenoh.Sample) -> None:
-        if self.crosses(str(sample.key_expr)) and self._session is not None:
+    def _is_first(self, number: int, key: zenoh.KeyExpr) -> bool:
+        """Tell whether no expression before that of this number matches a key: Zenoh asks each."""
+        return not any(each.intersects(key) for each in self._expressions[:number])
+
+    def _put(self, number: int, sample: zenoh.Sample) -> None:
+        key = sample.key_expr
+        if self._is_first(number, key) and self.crosses(str(key)) and self._session is not None:
             # A delete has none, and the routers of receivers would give it theirs.
             stamp = sample.timestamp or self._session.new_timestamp()
             _keep_publisher(sample)
             self._tell("message", crossing_sample(sample, stamp))
 
     def _asked(self, number: int, query: zenoh.Query) -> None:
-        """Take a query that the expression of this number matches; Zenoh asks each, and the first takes it."""
-        is_first = not any(each.intersects(query.key_expr) for each in self._expressions[:number])
-        if is_first and self.crosses(str(query.key_expr)):
+        if self._is_first(number, query.key_expr) and self.crosses(str(query.key_expr)):
             self._tell("query", query)
         else:
             query.drop()  # type: ignore[no-untyped-call]

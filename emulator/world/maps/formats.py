@@ -680,12 +680,15 @@ class _Polygons(_Reader):
         self._depth += 1
         if self._depth == 1 and name not in ("additional", "shapes"):
             raise self.wrong(f"<{printable(name)}>: a file of SUMO's polygons starts with <additional>")
-        if name != "poly" or not attributes.get("type", "").startswith("building"):
+        kind = attributes.get("type", "")
+        if name != "poly" or not kind.startswith("building") or kind == "building.no":
             return
         where = f"poly {printable(attributes.get('id', ''))}"
         if attributes.get("geo", "0") in ("1", "true", "yes"):
             raise self.wrong(f"{where}: geo = {attributes['geo']}: polygons in metres are needed")
         points = self._points(attributes.get("shape", ""), f"{where}: shape")
+        if attributes.get("fill") in ("0", "false") and points[0] != points[-1]:
+            return  # polyconvert writes an outline of several ways in pieces
         if len(set(points)) < LEAST_CORNERS:
             raise self.wrong(f"{where}: shape: three corners or more are needed")
         self.buildings.append(points[:-1] if points[0] == points[-1] else points)

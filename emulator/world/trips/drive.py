@@ -64,7 +64,7 @@ BATCH_ROWS = 1 << 16
 """Rows that are read at once."""
 _CHUNK_BYTES = 1 << 20
 """Bytes that are parsed at once."""
-_GEO = re.compile(r'<fcd-output\.geo\s+value="(?:true|1|t)"')
+_GEO = re.compile(r'<fcd-output\.geo\s+value="(?i:true|1|t|yes|on|x)"')
 _EXPLAIN_LINES = 3
 """Lines of SUMO's errors that are shown."""
 _LARGEST_BYTES = 8 * MOST_SAMPLES + (1 << 20)
@@ -206,7 +206,8 @@ class _Reader:
             raise self._problem("a vehicle outside every timestep")
         if "id" not in attributes:
             raise self._problem("a vehicle without id")
-        numbers = [self._number(attributes, name) for name in ("x", "y", "angle", "speed")]
+        told = {"angle": "nan", "speed": "nan"} | attributes
+        numbers = [self._number(told, name) for name in ("x", "y", "angle", "speed")]
         self._ids.append(attributes["id"])
         self._rows.append((self._parser.CurrentLineNumber, self._time_s, *numbers))  # type: ignore[arg-type]
         if len(self._rows) >= BATCH_ROWS:

@@ -1,5 +1,6 @@
 """Runs among buildings: they count in the radio and its checks, and the run's folder is enough to judge them."""
 
+import json
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -13,14 +14,16 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.recorded_world import RecordedWorld
 from emulator.report.map_figures import map_charts
 from emulator.report.source import Source
+from emulator.scenario.radio import Buildings as BuildingsSection
 from emulator.scenario.scenario import Scenario
 from emulator.stream import scene_message, unpack
 from emulator.world.buildings import Buildings
-from emulator.world.radio_inputs import RadioInputs
+from emulator.world.projection import CoordinateFrame
+from emulator.world.radio_inputs import RadioInputs, load_buildings
 from emulator.world.world import build_world
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips
-from vnet.errors import VnetError
+from vnet.errors import ScenarioError, VnetError
 
 HOUSE = "house,10,5\nhouse,60,5\nhouse,60,45\nhouse,10,45\n"
 FAR_AWAY = "barn,9000,0\nbarn,9010,0\nbarn,9010,10\n"
@@ -125,3 +128,23 @@ def test_the_largest_buildings_are_drawn_where_there_are_many() -> None:
 def test_buildings_far_from_all_vehicles_are_told(tmp_path: Path) -> None:
     world = build_world(among_buildings(tmp_path, FAR_AWAY))
     assert world.notes == ("radio.buildings: none is between vehicles; check the coordinates of its corners",)
+
+
+def test_an_origin_of_buildings_beside_that_of_a_map_is_the_same_or_refused(tmp_path: Path) -> None:
+    corners = [[9.18, 48.77], [9.181, 48.77], [9.181, 48.771]]
+    path = tmp_path / "houses.geojson"
+    house = {"type": "Polygon", "coordinates": [corners]}
+    feature = {"type": "Feature", "properties": {"building": "yes"}, "geometry": house}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    scenario, frame = among_buildings(tmp_path), CoordinateFrame.around(48.77, 9.18)
+    area_m = np.array([[-100.0, -100.0], [100.0, 100.0]])
+
+    def loaded(origin_deg: tuple[float, float] | None, frame: CoordinateFrame | None) -> Buildings | None:
+        section = BuildingsSection(path=path, origin_deg=origin_deg)
+        radio = scenario.radio.model_copy(update={"buildings": section})
+        return load_buildings(scenario.model_copy(update={"radio": radio}), frame, area_m)
+
+    found = [loaded((48.77, 9.18), None), loaded(None, frame), loaded((48.770001, 9.180001), frame)]
+    assert all(each is not None and each.corner_m[0] == pytest.approx([0.0, 0.0], abs=1e-6) for each in found)
+    with pytest.raises(ScenarioError, match=r"origin_deg = \[48.78, 9.18\]: 1,112 m from where x = y = 0 m is"):
+        loaded((48.78, 9.18), frame)

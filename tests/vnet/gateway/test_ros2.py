@@ -18,7 +18,7 @@ from zenoh_ros2_sdk import entity as sdk_entity
 from zenoh_ros2_sdk import keyexpr as sdk_keys
 
 import emulator
-from emulator.export.mcap_file import write_mcap
+from emulator.export.mcap_file import _definition, _typestores, write_mcap
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.samples import key_figures
 from tests.support.paths import ROOT
@@ -296,6 +296,17 @@ def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(d
             schemas[channel.topic] = schema and (schema.name, schema.encoding, schema.data.decode())
     known = ("std_msgs/msg/String", "ros2msg", "string data\n")
     assert schemas == {"/v01/chatter": known, "/v01/old": known, "/v01/odd": None}
+
+
+@pytest.mark.parametrize("named", ["HUMBLE", "JAZZY", "LATEST"])
+def test_a_type_has_the_definition_of_its_own_distribution(named: str) -> None:
+    """Humble tells no hashes, and its Range has no variance."""
+    store = get_typestore(Stores.LATEST if named == "LATEST" else Stores[f"ROS2_{named}"])
+    name = "sensor_msgs/msg/Range"
+    type_hash = "TypeHashNotSupported" if named == "HUMBLE" else store.hash_rihs01(name)
+    found = _definition(_typestores(None), name, type_hash)
+    assert found == store.generate_msgdef(name, ros_version=2)[0].encode()
+    assert (b"variance" in found) == (named != "HUMBLE")
 
 
 def test_mcap_has_schemas_of_own_types_whose_definitions_are_given(drive: Drive, tmp_path: Path) -> None:

@@ -202,6 +202,18 @@ async def test_only_radio_keys_cross_and_none_of_vnet(
     assert len(vehicles[0].frames) == 1
 
 
+@two_vehicles(keys=("car/*/pose", "car/*/size"))
+async def test_what_several_radio_keys_match_crosses_once(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    """Those of different keys in any order: each has a thread of Zenoh's."""
+    heard, keys = listen(sessions[1], "**"), ["car/**", "car/1/size", "car/*/pose"]
+    for key in keys:
+        sessions[0].put(key, b"x")
+    assert sorted([str((await heard.get()).key_expr) for _ in keys]) == sorted(keys)
+    assert len(vehicles[0].frames) == len(keys)
+
+
 @two_vehicles()
 async def test_an_advanced_subscriber_finds_exactly_the_samples_that_the_radio_has_lost(
     vehicles: list[Vehicle], sessions: list[zenoh.Session]

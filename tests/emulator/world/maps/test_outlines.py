@@ -96,7 +96,9 @@ def test_sumo_has_polygons_in_metres(tmp_path: Path) -> None:
     path = tmp_path / "town.poly.xml"
     house = '<poly id="1" type="building.school" color="1,0,0" shape="20,10 50.0,10 50,40,3.5 20,40 20,10"/>'
     lawn = '<poly id="2" type="landuse" shape="0,0 1,1 2,0"/>'
-    path.write_text(f'<?xml version="1.0"?>\n<additional>\n{house}\n{lawn}\n</additional>\n')
+    ruin = '<poly id="3" type="building.no" fill="1" shape="0,0 1,1 2,0 0,0"/>'
+    half = '<poly id="4" type="building" fill="0" shape="0,0 1,1 2,0"/>'  # of an outline of two ways
+    path.write_text(f'<?xml version="1.0"?>\n<additional>\n{house}\n{lawn}\n{ruin}\n{half}\n</additional>\n')
     found = read_buildings(path, lambda: pytest.fail("no degrees"))
     assert rings(found) == [[list(p) for p in HOUSE]] and len(found.corner_m) == 4
 
