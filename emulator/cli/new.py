@@ -39,6 +39,8 @@ def docs(
             pages = list_pages()
             width = max(map(len, pages))
             print("\n".join(f"{name:{width}}  {_title(file)}" for name, file in pages.items()))
+            if not Path("docs/examples").exists():
+                print('for commands that name files of docs/: ln -s "$(vnet docs --path)" docs')
 
 
 def list_pages() -> dict[str, Path]:
