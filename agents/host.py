@@ -24,6 +24,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+from itertools import chain
 from time import monotonic, monotonic_ns  # by name: a program may put emulated time in their place
 from typing import TYPE_CHECKING, NoReturn
 
@@ -68,6 +69,8 @@ LEASE_MS = 60_000
 UNSEEN_NS = 1_000_000_000
 """Nanoseconds after which a message of the backbone that has not come is asked for again: each key has a thread of
 Zenoh's, so it may come a little later than the batch that refers to it."""
+MOST_KEPT = 10_000
+"""Messages of a process that are kept in part, to be said again should they be lost."""
 
 
 class RunOverError(Exception):
@@ -518,6 +521,10 @@ class _RealTimeAgent:
         self._receipts = wire.Receipts()
         self._sends: dict[tuple[str, int], int] = {}
         """Frames to single vehicles without a result, by node and number, and the `seq` with which they went."""
+        self._said: dict[int, wire.Traffic] = {}
+        """Notes, exceptions and ends of programs in the latest `Frames`, by their `seq`."""
+        self._said_again: list[wire.Traffic] = []
+        """That of `Frames` which have never come, for the next ones."""
         self._unseen: dict[MessageRef, int] = {}
         """Messages of the backbone that have not come, and when (monotonic ns) a batch has referred to them."""
         self._orphan_timer: asyncio.TimerHandle | None = None
@@ -616,6 +623,9 @@ class _RealTimeAgent:
         self._receipts.take(batch, now_ns)
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
         self._take_results(batch)
+        if lost := [seq for first, last in batch.lost for seq in range(first, last + 1) if self._said.get(seq)]:
+            self._said_again += map(self._said.pop, lost)
+            self._schedule_flush()
         if batch.messages:
             self._unseen.update(dict.fromkeys(batch.messages, arrived_ns))
             self._deliver_messages()
@@ -654,8 +664,13 @@ class _RealTimeAgent:
 
     def _flush(self, final: bool = False) -> None:
         self._flush_pending = False
-        traffic = self._host.take_traffic()
+        traffic, again, self._said_again = self._host.take_traffic(), self._said_again, []
+        for name in ("notes", "unhandled", "endings") if again else ():
+            parts = [getattr(each, name) for each in (*again, traffic)]
+            traffic = replace(traffic, **{name: list(chain.from_iterable(parts))})
         seq = self._receipts.seq
+        self._said[seq] = wire.Traffic(notes=traffic.notes, unhandled=traffic.unhandled, endings=traffic.endings)
+        self._said.pop(seq - MOST_KEPT, None)
         self._sends.update(((each.node, each.number), seq) for each in traffic.frames if each.to is not None)
         self._attachment.say(self._receipts.frames(self._attachment.nonce, traffic, final, self._take_overdue()))
         self._attachment.frames_seq = self._receipts.seq

@@ -747,8 +747,8 @@ class CustomSender(OwnRule, SenderFault):
 class EmulatorRestart(Infrastructure):
     """The emulator's router and sessions close and come back; agents are told first.
 
-    In lockstep no emulated time passes meanwhile. In real time what is due meanwhile comes late, and what agents
-    send is lost; neither counts against the machine.
+    In lockstep no emulated time passes meanwhile. In real time what is due meanwhile comes late, and frames,
+    reports and requests of agents are lost; neither counts against the machine.
     """
 
     kind: Literal["emulator_restart"]

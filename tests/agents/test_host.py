@@ -94,6 +94,32 @@ def test_in_real_time_a_result_wakes_the_program_that_awaits_it() -> None:
     asyncio.run(awaits_a_result())
 
 
+def test_in_real_time_the_end_of_a_program_is_said_again_if_its_message_is_lost() -> None:
+    """And what it has told and left unhandled; its frames are lost with the message."""
+    welcome = emulation_of(scenario_of((), "agents.beacon:main")).welcome("v01", b"n")
+    said: list[Any] = []
+    attached: Any = SimpleNamespace(nonce=b"n", say=said.append, publish=said.append, units=None)
+
+    async def crashes() -> None:
+        agent = _RealTimeAgent(attached, [welcome], {}, None)
+        agent._loop = asyncio.get_running_loop()  # type: ignore[assignment]
+        node = agent._host.nodes["v01"]
+        await node.radio.broadcast(b"x")
+        node.event("seen")
+        agent._flush()
+        agent._host.end("v01", "crashed", "ValueError: boom")
+        agent._flush()
+        for number in range(3):
+            agent._take(wire.Batch([], number, [], lost=[(0, min(number, 1))]), 0)
+            agent._flush()
+
+    asyncio.run(crashes())
+    parts = [each.traffic for each in said if isinstance(each, wire.Frames) and each.traffic]
+    told = [(len(each.frames), len(each.notes), [ending.error for ending in each.endings]) for each in parts]
+    end = (0, 0, ["ValueError: boom"])
+    assert told == [(1, 1, []), end, (0, 1, []), end]
+
+
 def test_in_real_time_an_agent_speaks_as_soon_as_the_emulator_is_back_and_says_how_much_it_has_sent() -> None:
     """It may have been paused: the emulator waits for it."""
     welcome = emulation_of(scenario_of((), "agents.beacon:main")).welcome("v01", b"n")

@@ -20,6 +20,7 @@ from vnet.gateway.frames import (
     CrossingTokens,
     Reassembly,
     crossing_query,
+    decode_fragment,
 )
 from vnet.gateway.keys import FIX_KEY, OWN_KEYS, RADIO_KEYS, fix_content
 from vnet.gateway.ros2 import MOST_KEYS, ROS2_KEYS, Ros2
@@ -60,8 +61,8 @@ class RadioSide(ABC, Generic[Q]):
         # Replies to queries of the last incarnation may still come, and answer none of this one.
         self._query_numbers = count(incarnation * MOST_MESSAGES)
         self._tokens_ns = round(TOKEN_PERIODS * liveliness_s * NS_PER_S)
-        self._told: dict[str, tuple[int, tuple[str, ...]]] = {}
-        """Instant of the last frame with tokens, and their keys, by vehicle."""
+        self._told: dict[str, tuple[int, tuple[str, ...], int]] = {}
+        """Instant of the last message with tokens, their keys, and its number, by vehicle."""
         self.crosses = lru_cache(MOST_KEYS)(self._crosses)
         """Return whether what has this key is sent by the radio."""
 
@@ -113,7 +114,7 @@ class RadioSide(ABC, Generic[Q]):
         try:
             match self._reassembly.take(sender, payload):
                 case CrossingTokens() as tokens:
-                    self.hear_tokens(sender, tokens, time_ns)
+                    self.hear_tokens(sender, tokens, time_ns, decode_fragment(payload).number)
                 case CrossingSample() as sample:
                     self._show(sample)
                 case CrossingQuery() as query:
@@ -124,11 +125,15 @@ class RadioSide(ABC, Generic[Q]):
         except (msgspec.MsgspecError, zenoh.ZError, LookupError, OverflowError) as error:
             raise ValueError(str(error)) from None
 
-    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int) -> None:
-        """Take word of another vehicle's tokens. Raises ZError for what is no key."""
+    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int, number: int = 0) -> None:
+        """Take word of another vehicle's tokens, unless a later one has overtaken the message of this number.
+
+        Raises ZError for what is no key.
+        """
         for key in tokens.keys:
             zenoh.KeyExpr(key)
-        self._retell({**self._told, sender: (time_ns, tokens.keys)})
+        if sender not in self._told or number >= self._told[sender][2]:
+            self._retell({**self._told, sender: (time_ns, tokens.keys, number)})
 
     def forget_tokens(self, time_ns: int) -> None:
         """Forget the tokens of vehicles that have not told of any lately."""
@@ -136,14 +141,14 @@ class RadioSide(ABC, Generic[Q]):
 
     def wait_anew(self, time_ns: int) -> None:
         """Count the time without word of tokens from now on, as after a pause, in which nothing arrives."""
-        self._told = {one: (time_ns, keys) for one, (_, keys) in self._told.items()}
+        self._told = {one: (time_ns, keys, number) for one, (_, keys, number) in self._told.items()}
 
     @property
     def heard_tokens(self) -> dict[str, None]:
         """The tokens of other vehicles, in the order in which their vehicles were first heard."""
-        return dict.fromkeys(key for _, keys in self._told.values() for key in keys)
+        return dict.fromkeys(key for _, keys, _ in self._told.values() for key in keys)
 
-    def _retell(self, told: dict[str, tuple[int, tuple[str, ...]]]) -> None:
+    def _retell(self, told: dict[str, tuple[int, tuple[str, ...], int]]) -> None:
         before, self._told = self.heard_tokens, told
         after = self.heard_tokens
         for key in [*before, *after]:

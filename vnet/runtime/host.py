@@ -639,10 +639,10 @@ class Host:
             if self._debugger is not None:
                 self._debugger.begin(node.id, program)
             await program(node)
-        except (GeneratorExit, KeyboardInterrupt, ProcessEndedError):
+        except (KeyboardInterrupt, ProcessEndedError):
             raise
-        except asyncio.CancelledError as error:  # of a task that the program awaits, unless vnet has cancelled it
-            if self._closing or not self._runs(node):
+        except (asyncio.CancelledError, GeneratorExit) as error:  # of what the program awaits, unless vnet ends it
+            if self._discards or self._closing or not self._runs(node):
                 raise
             self._exited(node, error)
         except BaseException as error:

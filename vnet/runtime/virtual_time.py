@@ -615,6 +615,12 @@ class _YieldingSelector(selectors.DefaultSelector):
         self._wait = wait
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        try:
+            task = asyncio.current_task()
+        except RuntimeError:  # no loop runs in a fork
+            task = None
+        if task is not None:
+            raise RuntimeError(f"the event loop runs already, and {task.get_name()} runs it again: await instead")
         return self._wait(timeout, super().select)
 
 

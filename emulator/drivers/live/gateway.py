@@ -240,10 +240,10 @@ class Gateway(RadioSide[zenoh.Query]):
         if self._session is not None:
             super().hear(sender, payload, time_ns)
 
-    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int) -> None:
+    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int, number: int = 0) -> None:
         """As `RadioSide.hear_tokens`, while the router is open."""
         if self._session is not None:
-            super().hear_tokens(sender, tokens, time_ns)
+            super().hear_tokens(sender, tokens, time_ns, number)
 
     def _publish(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
         if self._session is not None:

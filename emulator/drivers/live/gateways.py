@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import shutil
 import signal
@@ -126,6 +127,9 @@ class Gateways:
         self._numbers = count(1)
         self._closing: dict[str, asyncio.Task[None]] = {}
         """Gateways that are being closed, whose endpoints the next of their vehicles needs."""
+        self._down: dict[str, _Vehicle] = {}
+        """Vehicles whose routers a fault has closed, until `_down_until_s` on the loop's clock."""
+        self._down_until_s = 0.0
         self._tasks: set[asyncio.Task[None]] = set()
         self.on_state: Callable[[str], None] = lambda text: None
         """Told which endpoints wait for programs."""
@@ -319,10 +323,15 @@ class Gateways:
         self._spawn(self._restart_endpoints(down_s))
 
     async def _restart_endpoints(self, down_s: float) -> None:
-        vehicles = list(self._vehicles.values())
-        await asyncio.gather(*(vehicle.gateway.close() for vehicle in vehicles))
-        await asyncio.sleep(down_s)
-        await asyncio.gather(*(self._open_again(vehicle) for vehicle in vehicles))
+        until_s = self._loop.time() + down_s
+        self._down_until_s = max(self._down_until_s, until_s)
+        there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
+        self._down |= there  # but those whose programs are starting: they do not wait for a router
+        await asyncio.gather(*(vehicle.gateway.close() for vehicle in there.values()))
+        await asyncio.sleep(until_s - self._loop.time())
+        if until_s == self._down_until_s:  # else another restart opens them
+            down, self._down = self._down, {}
+            await asyncio.gather(*(self._open_again(vehicle) for vehicle in down.values()))
         self._emulation.folder.event(self._now_ns(), EventKind.router_restarted, None, down_s=down_s)
 
     async def _open_again(self, vehicle: _Vehicle) -> None:
@@ -425,9 +434,13 @@ class Gateways:
 
     def _repeat(self, vehicle: _Vehicle, period_s: float, act: Callable[[_Vehicle], None]) -> None:
         """Do something now and once a period, while a vehicle is there."""
+        self._repeat_at(self._loop.time(), vehicle, period_s, act)
+
+    def _repeat_at(self, due_s: float, vehicle: _Vehicle, period_s: float, act: Callable[[_Vehicle], None]) -> None:
         if self._is_there(vehicle):
             act(vehicle)
-            self._loop.call_later(period_s, self._repeat, vehicle, period_s, act)
+            due_s += period_s * max(math.ceil((self._loop.time() - due_s) / period_s), 1)  # who is late catches up
+            self._loop.call_at(due_s, self._repeat_at, due_s, vehicle, period_s, act)
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:
         vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end

@@ -114,6 +114,17 @@ def test_a_frame_meets_the_faults_of_its_time_on_a_machine_that_is_late(network:
     assert emulation.engine.counts[Outcome.fault] == 1, "of v02, and of the second frame alone"
 
 
+def test_what_came_before_a_program_ended_has_arrived_on_a_machine_that_is_late() -> None:
+    """While messages wait to be taken, `due` is not called."""
+    realtime, emulation = started(radio={"loss": 0.0, "range_m": 1e6})
+    said = [("v01", 10, [SentFrame("v01", b"x")], []), ("v02", 100, [], [wire.Ending("v02", "finished")])]
+    for node, time_ms, frames, endings in said:
+        traffic = wire.Traffic(frames, endings=endings)
+        realtime.receive(time_ms * MS, node, wire.Frames(b"n", 0, 1, [], traffic))
+    realtime.due(200 * MS)
+    assert emulation.engine.counts[Outcome.delivered] == 3 and not emulation.engine.counts[Outcome.receiver_down]
+
+
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:
     return [(c.offset_ns, c.rate) for c in batches[node].clocks] if node in batches else []
 

@@ -428,6 +428,11 @@ async def awaits_what_it_cancelled(node: Node) -> None:
     await task
 
 
+async def leaves_as_a_generator(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    raise GeneratorExit
+
+
 async def exits_in_a_callback(node: Node) -> None:
     asyncio.get_running_loop().call_later(0.5, sys.exit, 3)
     await sends(node)
@@ -447,7 +452,7 @@ async def exits_at_the_end(node: Node) -> None:
 @pytest.mark.parametrize(
     ("program", "run"),
     [
-        *product([awaits_what_it_cancelled, exits_in_a_callback], [run_together, run_apart]),
+        *product([awaits_what_it_cancelled, leaves_as_a_generator, exits_in_a_callback], [run_together, run_apart]),
         (interrupts, run_together),
     ],
 )

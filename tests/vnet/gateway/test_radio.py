@@ -334,6 +334,26 @@ def test_tokens_come_by_the_radio_and_go_with_a_vehicle_that_is_killed(drive: Dr
     ]
 
 
+def test_tokens_are_those_of_the_latest_word_whatever_overtakes_it(drive: Drive) -> None:
+    text = """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        tell = lambda s: print(s.key_expr, str(s.kind))
+        watch = session.liveliness().declare_subscriber("alive/*", tell)
+        time.sleep(0.5)
+        if sys.argv[1] == "v01":
+            tokens = [session.liveliness().declare_token(f"alive/{number}") for number in range(6)]
+            time.sleep(1.0)
+            for token in tokens:
+                token.undeclare()
+        time.sleep(5)
+        """
+    lines = log(drive(text, vehicles=2, duration_s=2.5, radio={"jitter_ms": 20.0}), "v02")
+    there = [line for line in lines if line.endswith("PUT")]
+    gone = [line for line in lines if line.endswith("DELETE")]
+    assert lines == [*there, *gone] and len(set(there)) == len(set(gone)) == len(there) == len(gone) == 6
+
+
 def test_large_sample_crosses_in_fragments(drive: Drive) -> None:
     text = """
         import sys, time, zenoh

@@ -234,6 +234,17 @@ def test_a_program_runs_a_loop_of_its_own_in_a_thread_alone() -> None:
     assert names == [{"main", "made", "created"}]
 
 
+def test_a_loop_that_a_library_runs_within_itself_says_so() -> None:
+    """As nest_asyncio does: vehicles of one process would wait for each other."""
+
+    async def program(node: Node) -> None:
+        loop: Any = asyncio.get_running_loop()
+        with pytest.raises(RuntimeError, match="runs already, and v1 main runs it again"):
+            loop._run_once()
+
+    World("v1").run(program)
+
+
 def test_names_that_a_programs_module_has_imported_are_replaced_too() -> None:
     module: dict[str, Any] = {"Future": OWN[0], "waits": OWN[3], "other": asyncio.sleep}
     exec("async def main(node): pass", module)

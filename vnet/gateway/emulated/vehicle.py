@@ -296,9 +296,9 @@ class Vehicle(RadioSide[Asking]):
         keys = {str(each.key) for each in self._entities["token"]}
         self._send(CrossingTokens(tuple(sorted(key for key in keys if self.crosses(key)))))
 
-    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int) -> None:
+    def hear_tokens(self, sender: str, tokens: CrossingTokens, time_ns: int, number: int = 0) -> None:
         """Take word of another vehicle's tokens, and forget them in time."""
-        super().hear_tokens(sender, tokens, time_ns)
+        super().hear_tokens(sender, tokens, time_ns, number)
         self._has_tokens.set()
 
     def _show_token(self, key: str, is_there: bool) -> None:

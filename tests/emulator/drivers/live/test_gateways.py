@@ -176,3 +176,35 @@ async def test_tokens_are_not_forgotten_by_a_pause(monkeypatch: pytest.MonkeyPat
     rig.gateways._renew_tokens(vehicle)
     assert told == [True, False]
     await rig.gateways.close()
+
+
+@on_a_loop
+async def test_routers_are_there_again_once_all_restarts_that_overlap_are_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A vehicle whose program is just starting keeps its router: who connects for the first time does not wait."""
+    rig, sleeps = Rig(monkeypatch, 2, {}), list[asyncio.Future[None]]()
+    opened, closed = list[str](), list[str]()
+    await rig.welcome("v01", "v02")
+    rig.gateways._vehicles["v01"].is_ready = True
+
+    async def close(gateway: Gateway) -> None:
+        closed.append(gateway.node_id)
+
+    def sleep(seconds: float) -> asyncio.Future[None]:
+        sleeps.append(asyncio.get_running_loop().create_future())
+        return sleeps[-1]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Gateway, "close", close)
+        patched.setattr(Gateway, "open", lambda gateway, listen: opened.append(gateway.node_id))
+        patched.setattr("emulator.drivers.live.gateways.asyncio.sleep", sleep)
+        tasks = [asyncio.ensure_future(rig.gateways._restart_endpoints(down_s)) for down_s in (1000.0, 10.0)]
+        while len(sleeps) < 2:
+            await asyncio.wait(tasks, timeout=0)
+        for number, expected in ((1, []), (0, ["v01"])):
+            sleeps[number].set_result(None)
+            await tasks[number]
+            assert opened == expected
+        assert set(closed) == {"v01"}
+    await rig.gateways.close()
