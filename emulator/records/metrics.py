@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cached_property
 from keyword import iskeyword
@@ -33,6 +34,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
 from vnet.errors import VnetError
 from vnet.reports import Report, Value
+from vnet.runtime.error_text import error_line, own_line
 from vnet.runtime.programs import search_programs_in
 from vnet.types import Array
 
@@ -267,12 +269,49 @@ class Reference(Protocol):
         """
 
 
-def reference_of(scenario: Scenario) -> type[Reference]:
-    """Return the reference that a scenario's programs declare. Raises VnetError if they declare none."""
-    entries = declared(scenario.program, "REFERENCE")
-    if not entries:
-        raise VnetError("the program declares no reference")
-    return load_entry(entries[0])  # type: ignore[no-any-return]
+class ReferenceFailedError(VnetError):
+    """The reference of a program fails, or says what is no figure."""
+
+
+class DeclaredReference:
+    """The reference that a scenario's program declares. Raises VnetError if it declares none.
+
+    Whatever of it fails, or has another type, is a ReferenceFailedError that names it.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        entries = declared(scenario.program, "REFERENCE")
+        if not entries:
+            raise VnetError("the program declares no reference")
+        self._kind, self._entry = load_entry(entries[0]), entries[0]
+        with told_of(f"REFERENCE {self._entry}"):
+            self.name, self.text, self.columns = self._kind.NAME, self._kind.TEXT, tuple(self._kind.COLUMNS)
+
+    def begin(self, setting: Setting) -> Callable[[int, Mapping[str, Array]], dict[str, float | list[float]]]:
+        """Return `Reference.step` of one that is made for this setting."""
+        with told_of(f"REFERENCE {self._entry}"):
+            made: Reference = self._kind(setting)
+
+        def step(time_ns: int, states: Mapping[str, Array]) -> dict[str, float | list[float]]:
+            with told_of(f"REFERENCE {self._entry}"):
+                found = made.step(time_ns, states).items()
+                return {
+                    name: [float(one) for one in each] if isinstance(each, list) else float(each)
+                    for name, each in found
+                }
+
+        return step
+
+
+@contextmanager
+def told_of(what: str) -> Iterator[None]:
+    """Raise ReferenceFailedError, which names `what` and its line, for an exception of a program's code."""
+    try:
+        yield
+    except VnetError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ReferenceFailedError(f"{what}: {error_line(error)} ({own_line(error)})") from error
 
 
 def reference_series(recorded: RecordedRun) -> dict[str, Array]:
@@ -282,20 +321,21 @@ def reference_series(recorded: RecordedRun) -> dict[str, Array]:
     no reference.
     """
     scenario, world = recorded.scenario, recorded.world
-    made = reference_of(scenario)
+    reference = DeclaredReference(scenario)
     if world is None:
         raise VnetError("the lanes of the run were not recorded")
     links = component_links(scenario, world.radio_inputs, world.position_m)
     component = components(world.position_m, links)
     setting = Setting(scenario, component, world.lane_point_m, world.lane_heading_rad, recorded.periods)
-    reference = made(setting)
-    columns = {name: recorded.by_period(name) for name in made.COLUMNS}
+    step = reference.begin(setting)
+    columns = {name: recorded.by_period(name) for name in reference.columns}
     rows = [
-        reference.step(k * scenario.period_ns, {name: column[k] for name, column in columns.items()})
+        step(k * scenario.period_ns, {name: column[k] for name, column in columns.items()})
         for k in range(recorded.periods)
     ]
     some = next(filter(None, rows), None)
     if some is None:
-        raise VnetError(f"no program reported what the {made.NAME} is compared with")
+        raise VnetError(f"no program reported what the {reference.name} is compared with")
     missing = {name: np.full_like(value, np.nan, dtype=float) for name, value in some.items()}
-    return {name: np.array([row.get(name, missing[name]) for row in rows], dtype=float) for name in some}
+    with told_of(f"the figures of the {reference.name}"):  # lists of different lengths
+        return {name: np.array([row.get(name, missing[name]) for row in rows], dtype=float) for name in some}

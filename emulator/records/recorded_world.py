@@ -126,7 +126,7 @@ class RecordedWorld:
         outlines = [arrays.pop(name) for name in BUILDINGS if name in arrays]
         radio_inputs = RadioInputs(
             links=LinkTable(*over_time) if over_time else links,
-            buildings=Buildings(*outlines) if outlines else None,
+            buildings=Buildings(outlines[0], outlines[1], outlines[2]) if outlines else None,
         )
         return cls(node_ids=node_ids, radio_inputs=radio_inputs, **arrays)
 

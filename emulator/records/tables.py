@@ -27,7 +27,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.driven.stepped import Background
 from emulator.world.driven.vehicles import Log
 from vnet.bounded import open_regular
-from vnet.errors import VnetError
+from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array, IntArray
 
 BYTES_A_VALUE = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "BYTE_ARRAY": 4}
@@ -125,14 +125,18 @@ def schema_of(columns: Mapping[str, Column]) -> pa.Schema:
 
 
 def columns_of(table: Table, declared: ProgramFigures) -> Mapping[str, Column]:
-    """Return the columns of a table in a run whose program declares these figures."""
+    """Return the columns of a table in a run whose program declares these figures.
+
+    Raises ScenarioError if a column is there twice.
+    """
     if table is METRICS:
         return _figures(declared.row)
-    own = declared.columns.values() if table is STATES else ()
-    return {
-        **table.columns,
-        **{each.name: Column(pa.list_(FLOAT, each.size or -1), each.text, True) for each in own},
-    }
+    columns = dict(table.columns)
+    for each in declared.columns.values() if table is STATES else ():
+        if each.name in columns:
+            raise ScenarioError(f"{declared.entry}: COLUMNS: {each.name} is a column of vnet's, or is there twice")
+        columns[each.name] = Column(pa.list_(FLOAT, each.size or -1), each.text, True)
+    return columns
 
 
 def _figures(row: type) -> dict[str, Column]:

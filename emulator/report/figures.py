@@ -27,7 +27,7 @@ from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.radio.topology import component_links
 from emulator.records.distributions import binomial_interval
 from emulator.records.events import EventKind
-from emulator.records.metrics import anees_band
+from emulator.records.metrics import ReferenceFailedError, anees_band
 from emulator.records.period_figures import DeclaredChart
 from emulator.records.radio_metrics import BIN_M, rows_of_pairs
 from emulator.records.reported import named_numbers
@@ -36,7 +36,7 @@ from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, f
 from emulator.report.map_figures import map_charts
 from emulator.report.program_figures import Drawers, program_charts
 from emulator.report.radio_figures import ages, busy, latency, outcomes, totals
-from emulator.report.source import NothingToShow, Source, maybe
+from emulator.report.source import NothingToShow, Source
 from emulator.world.radio_inputs import LinkTable
 from emulator.world.world import components
 from vnet.errors import VnetError, printable
@@ -269,15 +269,20 @@ def _add_reference(source: Source, name: str, lines: list[Line]) -> str:
 
     It compares the means after the first fifth of the run with those of the first line.
     """
-    series = maybe(lambda: source.reference_series) or {}
+    try:
+        series = source.reference_series
+    except ReferenceFailedError as error:
+        return f" No reference: {error}."
+    except VnetError:
+        return ""
     if name not in series:
         return ""
-    label, value = source.reference.NAME, series[name][: len(source.time_s)]
+    label, value = source.reference.name, series[name][: len(source.time_s)]
     settled = slice(len(value) // 5, len(value))
     mean_m, least_m = (float(np.sqrt(np.nanmean(each[settled] ** 2))) for each in (lines[0].value, value))
     ratio = f": {mean_m / least_m:.2f} times the {label} after the first fifth of the run" if least_m > 0 else ""
     lines.append(Line(label, source.time_s, value, GREEN, DASHES[2]))
-    return f" {label.capitalize()}: {source.reference.TEXT}{ratio}."
+    return f" {label.capitalize()}: {source.reference.text}{ratio}."
 
 
 def position(source: Source) -> Drawing:

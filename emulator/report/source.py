@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from emulator.pages.canvas import FaultSpan
 from emulator.records.events import CUTS_RUN, Event, EventKind
-from emulator.records.metrics import Reference, reference_of, reference_series
+from emulator.records.metrics import DeclaredReference, reference_series
 from emulator.records.period_figures import SAME, Views
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -50,15 +50,15 @@ class Source(OpenedRun):
         """The radio in figures, without the channel busy ratio where its table cannot be read."""
         return radio_metrics(self, has_busy=maybe(lambda: self.busy_ratio) is not None)
 
-    @property
-    def reference(self) -> type[Reference]:
+    @cached_property
+    def reference(self) -> DeclaredReference:
         """The reference that the program declares. Raises VnetError if it declares none."""
-        return reference_of(self.scenario)
+        return DeclaredReference(self.scenario)
 
     @cached_property
     def reference_series(self) -> dict[str, Array]:
         """The figures of the reference, (periods,) by name. Raises VnetError if the run has none."""
-        columns = ("period", "node", *self.reference.COLUMNS)
+        columns = ("period", "node", *self.reference.columns)
         return reference_series(RecordedRun.open(self.folder, {STATES: columns}))
 
     # What programs report by names of their own.

@@ -28,6 +28,13 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_.]|^[_.]")
 """Characters of an id that are escaped where one of them cannot be part of a key."""
 Speed = Annotated[float, Field(ge=0, le=100)]
 Place = Annotated[float, Field(ge=0, le=100_000)]
+_SYNONYMS = {
+    **dict.fromkeys(("n", "net"), "net-file"),
+    **dict.fromkeys(("r", "route", "routes"), "route-files"),
+    **dict.fromkeys(("a", "additional"), "additional-files"),
+    "b": "begin",
+}
+"""Other names of options in SUMO's configurations, and those that its manual uses."""
 OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 """Keys of `[network]` for vehicles that move."""
 NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
@@ -95,7 +102,7 @@ def _values(path: Path) -> dict[str, str]:
                 f"{path}: line {parser.CurrentLineNumber}: element {name!r} is no configuration of SUMO"
             )
         if "output" not in sections:
-            values[name] = attributes.get("value", attributes.get("v", ""))
+            values[_SYNONYMS.get(name, name)] = attributes.get("value", attributes.get("v", ""))
         sections.append(name)
 
     def doctype(*_: object) -> NoReturn:

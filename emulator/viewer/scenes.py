@@ -9,6 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import WARNING, EventKind, level_of
-from emulator.records.metrics import Setting, reference_of
+from emulator.records.metrics import DeclaredReference, ReferenceFailedError, Setting, told_of
 from emulator.records.period_figures import Views, figures_if_here
 from emulator.records.run_folder import SCENARIO_FILE
 from emulator.records.tables import STATES, columns_of
@@ -627,7 +628,10 @@ class OverviewScene:
                     canvas.points(f"{each.name}/cloud", np.concatenate([clouds[node] for node in sorted(clouds)]))
 
     def _figures(self, period: PeriodArrays) -> None:
-        found = {} if self._reference is None else self._reference.step(period.message)
+        found: Mapping[str, float] = {}
+        if self._reference is not None:
+            with suppress(ReferenceFailedError):  # the report says why
+                found = self._reference.step(period.message)
         for chart in self._views.charts:
             names = list(chart.lines.values())[: len(CURVES)]
             values = [period.figure(name) for name in names]
@@ -757,8 +761,8 @@ class DrawnReference:
 
     def __init__(self, scene: Mapping[str, Any]) -> None:
         scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
-        kind = reference_of(scenario)
-        self.label, self._columns, self._count = f"{kind.NAME}: {kind.TEXT}", kind.COLUMNS, len(scene["node_ids"])
+        reference, self._count = DeclaredReference(scenario), len(scene["node_ids"])
+        self.label, self._columns = f"{reference.name}: {reference.text}", reference.columns
         point_m = unpack(scene["lane_point_m"], 2).astype(float)
         heading_rad = unpack(scene["lane_heading_rad"])[:, 0].astype(float)
         component = np.frombuffer(scene["component"], dtype="<i2")
@@ -768,15 +772,18 @@ class DrawnReference:
         }
         if unknown := [name for name in self._columns if name not in self._sizes]:
             raise VnetError(f"its column {unknown[0]!r} is neither vnet's nor declared")
-        self._reference = kind(Setting(scenario, component, point_m, heading_rad))
+        self._step = reference.begin(Setting(scenario, component, point_m, heading_rad))
 
     def step(self, period: Mapping[str, Any]) -> dict[str, float]:
-        """Take a period; returns its figures of the whole network by name. Periods may be left out."""
+        """Take a period; returns its figures of the whole network by name. Periods may be left out.
+
+        Raises ReferenceFailedError.
+        """
         told = {**period["columns"], **period}
         states = {name: self._column(name, told[name]) for name in self._columns}
         up = np.frombuffer(period["up"], dtype=np.uint8).astype(bool)
         states["fix_m"] = np.where(up[:, None], states["fix_m"], np.nan)
-        figures = self._reference.step(int(period["time_ns"]), states)
+        figures = self._step(int(period["time_ns"]), states)
         return {name: figure for name, figure in figures.items() if not isinstance(figure, list)}
 
     def _column(self, name: str, data: bytes) -> Array:
@@ -793,7 +800,9 @@ def published(scene: Mapping[str, Any]) -> dict[str, tuple[str, float]]:
     try:
         scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
         for entry in declared(scenario.program, "PUBLISHED"):
-            found |= load_entry(entry)(scene)
+            with told_of(f"PUBLISHED {entry}"):
+                values = load_entry(entry)(scene).items()
+                found |= {name: (str(label), float(value)) for name, (label, value) in values}
     except VnetError:  # a run is drawn all the same
         return {}
     return found

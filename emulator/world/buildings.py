@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,14 @@ class Buildings:
 
     Ring r has the corners `corner_m[first[r]:first[r + 1]]` (at least three) and an edge from the last to the
     first; it is part of the building numbered `building[r]`, 0 … B-1. A point is inside a building if it is inside
-    an odd number of its rings, so that a court is a ring of its own.
+    an odd number of its rings, so that a court is a ring of its own. `clipped` buildings are left out, as their
+    file lacks nodes of their outlines.
     """
 
     corner_m: Array
     first: NDArray[np.intp]
     building: NDArray[np.intp]
+    clipped: int = 0
 
     @classmethod
     def of(cls, buildings: Sequence[Sequence[Array]]) -> Buildings:
@@ -81,4 +83,4 @@ class Buildings:
 
     def moved(self, by_m: Sequence[float]) -> Buildings:
         """Return the buildings moved by metres east and north."""
-        return Buildings(self.corner_m + np.asarray(by_m), self.first, self.building) if any(by_m) else self
+        return replace(self, corner_m=self.corner_m + np.asarray(by_m)) if any(by_m) else self

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -258,4 +258,4 @@ def load_buildings(scenario: Scenario, frame: CoordinateFrame | None, area_m: Ar
     buildings = read_buildings(path, of_degrees)
     if roads is not None and path == roads.path:
         buildings = buildings.moved(roads.datum_m)
-    return buildings.touching(*area_m)
+    return replace(buildings.touching(*area_m), clipped=buildings.clipped)

@@ -313,6 +313,9 @@ class World:
         self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings, scenario.roadside)
         if buildings is not None and not len(buildings):
             self.notes = (*self.notes, f"radio.buildings: none is between vehicles; check {_place_of(scenario)}")
+        elif buildings is not None and buildings.clipped:
+            clipped = f"buildings left out, as the file lacks their nodes: {buildings.clipped}"
+            self.notes = (*self.notes, f"radio.buildings: {clipped}")
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((present[1:] != present[:-1]).any(axis=1)) + 1  # periods
         _check_exceptions(scenario, motion.node_ids)

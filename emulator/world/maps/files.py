@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 CLIPPED = "ways clipped where the file lacks their nodes"
 """Count in `Roads.notes` of ways that leave the part of a map that was cut out."""
+NODES_FIRST = "nodes come before ways, with ids above 0"
+"""What OpenStreetMap's files must keep to, so that they can be read in one pass."""
 _UNDEFINED_DEG = 200.0
 """Nodes that a file lacks have a longitude beyond it."""
 _LONGEST_LINE = 1 << 16
@@ -90,9 +92,7 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
                 else:
                     _add_way(path, builder, way)
     if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
-        raise ScenarioError(
-            f"{path}: it lacks the nodes of its {clipped} ways; nodes come before ways, with ids above 0"
-        )
+        raise ScenarioError(f"{path}: it lacks the nodes of its {clipped} ways; {NODES_FIRST}")
     return builder.build_from_degrees(origin_deg)
 
 
@@ -211,18 +211,21 @@ def read_buildings(path: Path, frame: Callable[[], CoordinateFrame]) -> Building
         return Buildings.of(_some(path, _read_csv(path)))
     if path.name.lower().endswith(".poly.xml"):
         return Buildings.of(_some(path, [[np.array(corners)] for corners in read_sumo_polygons(path)]))
+    clipped = 0
     if ending in OSM_ENDINGS:
-        found = _read_osm(path)
+        found, clipped = _read_osm(path)
     elif ending in (".geojson", ".json"):
         found = _read_geojson(path)
     else:
         raise ScenarioError(
             f"{path}: no buildings are read from it; allowed are *.csv, *.osm, *.pbf, *.geojson, *.poly.xml"
         )
-    return _projected(path, Buildings.of(_some(path, found)), frame())
+    return replace(_projected(path, Buildings.of(_some(path, found, clipped)), frame()), clipped=clipped)
 
 
-def _some(path: Path, buildings: list[Rings]) -> list[Rings]:
+def _some(path: Path, buildings: list[Rings], clipped: int = 0) -> list[Rings]:
+    if not buildings and clipped:
+        raise ScenarioError(f"{path}: it lacks the nodes of its {clipped} buildings; {NODES_FIRST}")
     if not buildings:
         raise ScenarioError(f"{path}: no buildings in it")
     return buildings
@@ -280,15 +283,21 @@ def _open_ring(where: str, corners: Array) -> Array:
 # Degrees.
 
 
-def _read_osm(path: Path) -> list[Rings]:
+def _read_osm(path: Path) -> tuple[list[Rings], int]:
+    """Return the buildings, and how many ways of others lack nodes."""
     buildings: list[Rings] = []
-    corners = 0
+    corners = clipped = 0
     with osm_errors(path):
         import osmium
 
         tagged = osmium.filter.KeyFilter("building")
         for entity in osmium.FileProcessor(path).with_areas(tagged).with_filter(tagged):
-            if not isinstance(entity, osmium.osm.Area) or entity.deleted or entity.tags["building"] == "no":
+            if not isinstance(entity, osmium.osm.Way | osmium.osm.Area):
+                continue
+            if entity.deleted or entity.tags["building"] == "no":
+                continue
+            if isinstance(entity, osmium.osm.Way):
+                clipped += not all(node.location.valid() for node in entity.nodes)
                 continue
             rings = [
                 np.array([(node.lon, node.lat) for node in ring][:-1])
@@ -299,7 +308,7 @@ def _read_osm(path: Path) -> list[Rings]:
                 buildings.append(rings)
                 corners += sum(map(len, rings))
                 _bounded(path, corners)
-    return buildings
+    return buildings, clipped
 
 
 def _read_geojson(path: Path) -> list[Rings]:

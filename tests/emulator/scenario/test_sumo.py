@@ -109,6 +109,13 @@ def test_what_sumo_reads_belongs_to_the_run(tmp_path: Path, sumo: Path) -> None:
     load(tmp_path)
     names = [path.name for path in input_files(tmp_path / "town.sumocfg")]
     assert names == ["a.net.xml", "a.rou.xml", "b.rou.xml"], "what it writes, or is not there, does not"
+    short = {"net-file": "n", "route-files": "routes", 'begin value="0"': 'b value="3"'}
+    configuration = CONFIGURATION
+    for name, other in short.items():
+        configuration = configuration.replace(name, other)
+    write(tmp_path, configuration)
+    assert [path.name for path in input_files(tmp_path / "town.sumocfg")] == names
+    assert read_begin_s(tmp_path / "town.sumocfg") == 3.0
     path = write(tmp_path)
     inputs = '[inputs]\n"{}" = "another"\n'.format(tmp_path / "b.rou.xml")
     path.write_text(path.read_text() + inputs)

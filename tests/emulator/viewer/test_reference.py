@@ -1,14 +1,19 @@
 """The reference of a run that is drawn, that of the cooperative program: a filter that hears every fix."""
 
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from emulator.records.metrics import ReferenceFailedError, Setting
+from emulator.report.source import Source
 from emulator.viewer.scenes import DrawnReference
 from tests.emulator.test_playback import watch
 from vnet.node import Node
+from vnet.types import Array
 
 pytestmark = pytest.mark.slow
 
@@ -61,3 +66,50 @@ def test_each_component_has_a_filter_of_its_own(told: list[dict[str, Any]]) -> N
     together, separate = steps(told), steps([apart, *told[1:]])
     assert together != separate
     assert late(separate) < 2.0
+
+
+class Reference:
+    """Of a program that declares it with an error."""
+
+    NAME, TEXT, COLUMNS = "oracle", "what is known", ("fix_m",)
+
+    def __init__(self, setting: Setting) -> None:
+        self.figure: Any = 1.0
+
+    def step(self, time_ns: int, states: Mapping[str, Array]) -> Mapping[str, Any]:
+        return {"position_rmse_m": self.figure}
+
+
+class Raising(Reference):
+    def step(self, time_ns: int, states: Mapping[str, Array]) -> Mapping[str, Any]:
+        return {"position_rmse_m": 1 / 0}
+
+
+class Leaving(Reference):
+    def __init__(self, setting: Setting) -> None:
+        sys.exit(0)
+
+
+class Wordy(Reference):
+    def step(self, time_ns: int, states: Mapping[str, Array]) -> Mapping[str, Any]:
+        return {"position_rmse_m": "small"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        (Raising, "ZeroDivisionError: division"),
+        (Leaving, "SystemExit: 0"),
+        (Wordy, "ValueError: could not"),
+    ],
+)
+def test_a_reference_that_fails_is_named_and_the_run_is_drawn_and_reported(
+    kind: type[Reference], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    declares = {"REFERENCE": [f"{__name__}:{kind.__name__}"]}
+    monkeypatch.setattr("emulator.records.metrics.declared", lambda program, name: declares.get(name, []))
+    messages = tell(tmp_path / "run", f"{__name__}:say_nothing", run={"duration_s": 0.5})
+    with pytest.raises(ReferenceFailedError, match=rf"REFERENCE .*{kind.__name__}: {says}"):
+        DrawnReference(messages[0]).step(messages[1])
+    with pytest.raises(ReferenceFailedError):
+        Source(tmp_path / "run").reference_series  # noqa: B018

@@ -1,5 +1,6 @@
 """Outlines of buildings in files, and what is wrong with them."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +66,20 @@ def test_openstreetmap_has_closed_ways_and_multipolygons(tmp_path: Path) -> None
     found = read_buildings(write_osm(tmp_path / "town.osm"), lambda: FRAME)
     hut = [[60.0, 10.0], [70.0, 10.0], [70.0, 20.0]]
     by_building = dict(zip(found.building.tolist(), rings(found), strict=False))
-    assert len(found) == 2 and hut in by_building.values()
+    assert len(found) == 2 and hut in by_building.values() and found.moved((1.0, 0.0)).clipped == 1
     all_rings: list[list[list[float]]] = [[list(p) for p in HOUSE], [list(p) for p in COURT], hut]
     assert sorted(rings(found)) == sorted(all_rings)
     assert sorted(np.bincount(found.building)) == [1, 2], "the court belongs to the block"
+
+
+def test_buildings_whose_nodes_come_late_are_counted_and_told(tmp_path: Path) -> None:
+    path = write_osm(tmp_path / "town.osm", roads=False)
+    nodes = re.findall("<node .*/>", text := path.read_text())
+    for node in nodes:
+        text = text.replace(node, "")
+    path.write_text(text.replace("</osm>", "\n".join(nodes) + "</osm>"))
+    with pytest.raises(ScenarioError, match="lacks the nodes of its 3 buildings; nodes come before ways"):
+        read_buildings(path, lambda: FRAME)
 
 
 def test_geojson_has_polygons_that_are_buildings(tmp_path: Path) -> None:
