@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,12 +16,14 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.fault_plan import PlannedFault
+from emulator.radio.topology import Connectivity, connectivity_of
 from emulator.records.events import Event
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.tables import BACKBONE, BACKGROUND, DRIVEN
 from emulator.records.verdicts import CheckResult, NotExercised, Record, Verdict
 from emulator.scenario.faults import GnssFault
+from emulator.scenario.radio import Receiver
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import components_of_links
 from vnet.errors import VnetError, did_you_mean, first_names, shown
@@ -257,12 +260,32 @@ class Run:
                 misled |= when[:, None] & ever
         return misled
 
+    @cached_property
+    def _audible(self) -> Connectivity | None:
+        """Connectivity by which frames may arrive, where that is less than being in range.
+
+        Without fading 802.11p detects no frame whose mean power is below `radio.receiver.min_rssi_dbm`.
+        """
+        radio = self.scenario.radio
+        if radio.path_loss is None or radio.fading is not None or radio.sidelink is not None:
+            return None
+        least_dbm = max(radio.path_loss.floor_dbm, (radio.receiver or Receiver()).min_rssi_dbm)
+        path_loss = radio.path_loss.model_copy(update={"floor_dbm": least_dbm})
+        radio = radio.model_copy(update={"path_loss": path_loss})
+        return connectivity_of(radio, self.scenario.run.seed, self._recorded.radio_inputs)
+
     def components(self, time_s: float, among: Mask) -> IntArray:
         """Return the label (N,) of each vehicle's component at `time_s`.
 
-        A component is connected by links in both directions under the peer cap, `among` these vehicles (N,).
+        A component is connected by links in both directions under the peer cap, `among` these vehicles (N,), over
+        which frames may arrive.
         """
-        pairs = self._recorded.admitted(among, round(time_s * NS_PER_S))
+        time_ns = round(time_s * NS_PER_S)
+        pairs = self._recorded.admitted(among, time_ns)
+        if self._audible is not None:
+            places = self._recorded.places
+            audible = self._audible.links(places.position_m(int(places.index(np.array(time_ns)))))
+            pairs = pairs.of(audible.contain(pairs.sender, pairs.receiver))
         both = pairs.contain(pairs.receiver, pairs.sender)
         return components_of_links(pairs.sender[both], pairs.receiver[both], pairs.count)
 

@@ -325,6 +325,9 @@ LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else, if the latest follow each other."""
 LOST_FIXES = 3
 """Least number of consecutive outliers, where fixes are rare."""
+TURNING_FIXES = 2
+"""Consecutive outliers after which a vehicle has turned faster than the model allows for, if each is where the fix
+before leads by speed and heading. A receiver that jumps is not."""
 SAME_LANE_M = 0.5
 SAME_LANE_RAD = 0.1
 """Distance (m) and angle (rad) within which two segments are taken for one lane: a road may be cut anywhere."""
@@ -352,6 +355,7 @@ class OwnVehicleOnMap:
         self._is_placed = False
         self._anchor_m = np.full(2, np.nan)
         self._outliers_s = 0.0
+        self._turning = 0.0  # fixes in a row that were not taken, each of which follows the one before
         self._taken: Observation | None = None  # the fix that was taken last
         self._latest: Observation | None = None
         self._untaken_s = self._since_s = 0.0  # the times since these
@@ -432,13 +436,15 @@ class OwnVehicleOnMap:
             self._place(fix, noise_m2)
         elif self._is_outlier(fix) or not self._follows(fix, self._taken, self._untaken_s):
             self._outliers_s += dt_s
-            is_lost = self._outliers_s >= max(LOST_S, LOST_FIXES * since_s)
-            if not (is_lost and self._follows(fix, before, since_s)):
+            follows = self._follows(fix, before, since_s)
+            self._turning = self._turning + 1 if follows and fix.tells_velocity else -math.inf
+            is_lost = follows and self._outliers_s >= max(LOST_S, LOST_FIXES * since_s)
+            if self._turning < TURNING_FIXES and not is_lost:
                 return NOTHING
             self._place(fix, noise_m2)
         else:
             self._hypotheses.update(fix.position_m, noise_m2)
-        self._outliers_s = 0.0
+        self._outliers_s = self._turning = 0.0
         self._taken, self._untaken_s = fix, 0.0
         if more_m2:  # 1 / R − 1 / (R + more) is left
             self._rest = fix.position_m, exact_m2 + exact_m2 @ exact_m2 / more_m2

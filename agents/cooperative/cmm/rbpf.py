@@ -129,6 +129,11 @@ class Observation:
             return self.covariance_m2
         return self.covariance_m2 + LEAST_NOISE_M2 * np.eye(2)
 
+    @property
+    def tells_velocity(self) -> bool:
+        """True if speed and heading are known."""
+        return self.speed_m_s is not None and self.heading_rad is not None
+
     def follows(self, before: Observation, gap_s: float, acceleration_m2_s4: float) -> bool:
         """Tell whether this fix is where another, `gap_s` before, leads by what both tell of speed and heading.
 

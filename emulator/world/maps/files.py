@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 CLIPPED = "ways clipped where the file lacks their nodes"
 """Count in `Roads.notes` of ways that leave the part of a map that was cut out."""
 NODES_FIRST = "nodes come before ways, with ids above 0"
-"""What OpenStreetMap's files must keep to, so that they can be read in one pass."""
+"""Order of OpenStreetMap's files, so that they can be read in one pass."""
 _UNDEFINED_DEG = 200.0
 """Nodes that a file lacks have a longitude beyond it."""
 _LONGEST_LINE = 1 << 16

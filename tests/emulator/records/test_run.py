@@ -99,3 +99,24 @@ def test_other_names_are_not_public() -> None:
     assert "Run" in dir(emulator)
     with pytest.raises(AttributeError, match="no attribute 'Runs'"):
         emulator.Runs  # noqa: B018
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("radio", "labels"), [({}, [0, 0, 1]), ({"fading": {}}, [0, 0, 0])], ids=["steady", "fading"]
+)
+def test_vehicles_that_never_hear_each_other_are_in_different_components(
+    tmp_path: Path, radio: dict[str, Any], labels: list[int]
+) -> None:
+    """Without fading no frame below `min_rssi_dbm` is detected, which is more than `floor_dbm`."""
+    path = tmp_path / "places.csv"
+    path.write_text("id,x_m,y_m,heading_rad\na,0,0,0\nb,150,0,0\nc,75,415,0\n")
+    run = emulator.simulate(
+        {
+            "run": {"duration_s": 1.0, "settle_s": 0.0},
+            "network": {"kind": "file", "path": str(path)},
+            "radio": {"path_loss": {"kind": "dual_slope"}, **radio},
+        },
+        program="agents.beacon:main",
+    )
+    assert run.components(0.5, np.ones(3, dtype=bool)).tolist() == labels

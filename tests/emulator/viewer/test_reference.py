@@ -69,7 +69,7 @@ def test_each_component_has_a_filter_of_its_own(told: list[dict[str, Any]]) -> N
 
 
 class Reference:
-    """Of a program that declares it with an error."""
+    """A reference without errors."""
 
     NAME, TEXT, COLUMNS = "oracle", "what is known", ("fix_m",)
 

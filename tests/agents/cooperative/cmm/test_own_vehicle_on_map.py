@@ -68,6 +68,21 @@ def test_outliers_along_the_road_are_none_of_its_places_where_fixes_tell_a_speed
         assert abs(position[0][0] + vehicle.estimate_m[0] - COMMON_M[0] - true_m) < 8
 
 
+def test_who_turns_at_full_speed_is_found_again_at_once_and_a_receiver_that_jumps_is_not() -> None:
+    """It drives north from a crossing with 20 m/s, having come from the west; fixes are of 5 Hz."""
+    rng, vehicle = np.random.default_rng(4), vehicle_on(roads((0, 0, EAST), (600, 0, NORTH)))
+    off_m: list[float] = []
+    for period in range(300):
+        way_m, jump_m = 4.0 * period, 40.0 if 260 <= period < 268 else 0.0
+        true_m = np.array([min(way_m, 600.0), max(way_m - 600.0, 0.0)])
+        seen_m = true_m + COMMON_M + (jump_m, jump_m) + rng.normal(0, 1.0, 2)
+        heading_rad = NORTH if way_m > 600 else EAST
+        vehicle.step(0.2, Observation(seen_m, np.eye(2), heading_rad, speed_m_s=20.0))
+        if (position := vehicle.position_m()) is not None:
+            off_m.append(float(np.hypot(*(position[0] + vehicle.estimate_m - COMMON_M - true_m))))
+    assert max(off_m[50:156]) < 15 and max(off_m[156:]) < 6
+
+
 @pytest.mark.slow
 def test_a_lane_counts_once_for_a_vehicle_that_stands() -> None:
     """However long it stands, it knows of c across the lane what one lane with its deviation says."""
