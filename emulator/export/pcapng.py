@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 import numpy as np
@@ -60,6 +60,7 @@ class Station:
 
     Attributes:
         kind: station type, as a CAM has it.
+        is_accurate: whether the position is that of now.
     """
 
     latitude: int
@@ -67,6 +68,7 @@ class Station:
     speed: int = 0
     heading: int = 0
     kind: int = _CAR
+    is_accurate: bool = True
 
 
 class Router:
@@ -81,6 +83,9 @@ class Router:
         if read is None:
             return None
         kind = message[1]
+        if read.latitude == _UNAVAILABLE[0] or read.longitude == _UNAVAILABLE[1]:
+            last = self._last.get(sender, Station(0, 0))  # GeoNetworking has no value for it
+            read = replace(read, latitude=last.latitude, longitude=last.longitude, is_accurate=False)
         if kind == CAM:
             self._last[sender] = read
         station = self._last.get(sender, read)
@@ -159,7 +164,8 @@ def _long_position(sender: int, time_ns: int, station: Station) -> bytes:
     address = struct.pack(">BB", kind << 2, 0) + _address(sender)
     milliseconds = time_ns // 1_000_000 % 2**32
     place = struct.pack(">Iii", milliseconds, station.latitude, station.longitude)
-    return address + place + struct.pack(">HH", 0x8000 | min(station.speed, 0x3FFF), station.heading)
+    accuracy = 0x8000 if station.is_accurate else 0
+    return address + place + struct.pack(">HH", accuracy | min(station.speed, 0x3FFF), station.heading)
 
 
 LINKTYPE_ETHERNET, LINKTYPE_RADIOTAP = 1, 127

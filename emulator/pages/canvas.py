@@ -48,6 +48,8 @@ _LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 54, 12, 8, 42
 _LEGEND_ROW_PX, _LANE_PX = 18, 15
 _MOST_LANES = 6
 LEGEND_COLUMNS = 3
+_HANDLE_PX, _LEGEND_LETTER_PX = 38, 6.0
+"""Widths in a legend: of a line with the space around it, and of a letter on average."""
 _LETTER_PX = 5.6
 """The width of a letter of a fault's label, on average."""
 MOST_POINTS = 2 * (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
@@ -178,6 +180,16 @@ def _draw_lanes(strip: Axes, lanes: Sequence[Sequence[FaultSpan]], end_s: float)
                 [span.start_s, span.end_s], [row + 0.86] * 2, color=PURPLE, linewidth=2.5, solid_capstyle="butt"
             )
             strip.text(_reach(span, end_s)[0], row + 0.68, span.label, fontsize=10, color=QUIET, va="baseline")
+
+
+def legend_columns(labels: Sequence[str]) -> int:
+    """Return in how many columns, at most `LEGEND_COLUMNS`, a legend of these labels fits a figure."""
+    room_px = WIDTH_PX - _LEFT_PX - _RIGHT_PX
+    for columns in range(LEGEND_COLUMNS, 1, -1):
+        parts = np.array_split(list(map(len, labels)), columns)  # as matplotlib fills columns
+        if sum(_HANDLE_PX + _LEGEND_LETTER_PX * part.max(initial=0) for part in parts) <= room_px:
+            return columns
+    return 1
 
 
 def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = LEGEND_COLUMNS) -> None:

@@ -11,12 +11,12 @@ import numpy as np
 from markupsafe import Markup
 
 from emulator.pages.canvas import (
-    LEGEND_COLUMNS,
     Canvas,
     FaultSpan,
     canvas,
     from_zero,
     legend,
+    legend_columns,
     logarithmic,
     styled,
     thin,
@@ -68,7 +68,8 @@ def time_figure(
     everything = np.concatenate([line.value[np.isfinite(line.value)] for line in lines])
     positive = everything[everything > 0]
     is_log = not linear and len(positive) > 0 and positive.max() > WIDE_RANGE * positive.min()
-    rows = math.ceil(len(lines) / LEGEND_COLUMNS) if len(lines) > 1 else 0
+    columns = legend_columns([line.label for line in lines])
+    rows = math.ceil(len(lines) / columns) if len(lines) > 1 else 0
     made = canvas(TIME, y_label, rows, spans, end_s)
     for line in lines:
         marker = "o" if np.isfinite(line.value).sum() < 3 else None
@@ -85,7 +86,7 @@ def time_figure(
     else:
         from_zero(made.axes)
     if rows:
-        legend(made)
+        legend(made, columns=columns)
     return made
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 
-from emulator.pages.canvas import BLUE, CURVES, GREY, RED, canvas, legend
+from emulator.pages.canvas import BLUE, CURVES, GREY, RED, canvas, legend, legend_columns
 from emulator.records.reported import is_text
 from emulator.report.drawing import DASHES, TIME, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source
@@ -97,12 +98,14 @@ def _texts(source: Source, name: str) -> Drawing:
     if not texts:
         raise NothingToShow("nothing was reported")
     time_s = source.times_s
-    rows = (len(texts[:MOST_TEXTS]) + 2) // 3
+    drawn = texts[:MOST_TEXTS]
+    columns = legend_columns(drawn)
+    rows = math.ceil(len(drawn) / columns)
     made = canvas(TIME, f"{title_of(name)} (% of vehicles)", rows, source.spans, source.end_s)
-    for index, text in enumerate(texts[:MOST_TEXTS]):
+    for index, text in enumerate(drawn):
         made.axes.plot(time_s, 100 * shares[:, index], color=CURVES[index], label=text)
     made.axes.set_ylim(0, 105)
-    legend(made)
+    legend(made, columns=columns)
     more = f" {len(texts) - MOST_TEXTS} rarer ones are not shown." if len(texts) > MOST_TEXTS else ""
     return Drawing(made, f"Share of the vehicles that report each text.{more}{faults_note(made, source)}")
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.pages.canvas import CURVES, GREY, NAVY, Canvas, canvas, legend
+from emulator.pages.canvas import CURVES, GREY, NAVY, Canvas, canvas, legend, legend_columns
 from emulator.pages.page import render, table
 from emulator.records.distributions import student_quantile
 from emulator.records.period_figures import KeyFigure, estimates_differ, figures_if_here
@@ -23,6 +23,7 @@ from emulator.report.drawing import DASHES, Drawing, draw_charts
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Run
 from vnet.errors import counted
+from vnet.runtime.programs import search_programs_in
 from vnet.units import label_of
 
 CONFIDENCE = 0.95
@@ -86,9 +87,14 @@ def too_few(seeds: int) -> str:
     return f"{counted(seeds, 'seed')}: too few for a confidence interval; {FEWEST_SEEDS} or more are needed"
 
 
+def _key_of(program: Program) -> Sequence[KeyFigure]:
+    search_programs_in(program.folders)
+    return figures_if_here(program).key
+
+
 def sweep_page(run: Run, programs: Sequence[Program], rows: Rows, varied: Sequence[str]) -> str:
     """Return the page of the rows of a sweep of these programs over the keys `varied`."""
-    key = tuple(each for program in programs for each in figures_if_here(program).key)
+    key = tuple(each for program in programs for each in _key_of(program))
     names = figures_of(rows, varied, key)
     shown = _changing(rows, names)
     titles = {name: heading(name, key) for name in (shown[:MOST_CHARTS] if varied else names)}
@@ -213,17 +219,19 @@ def _draw(rows: Rows, varied: Sequence[str], name: str, title: str) -> Drawing:
     others = [other for other in varied if other != key]
     curves = _groups(rows, others)
     shown = curves[: len(COLOURS)]
-    made = canvas(key, title, -(-len(shown) // 3) if others else 0)
+    names = [
+        ", ".join(f"{other.rpartition('.')[2]} {value}" for other, value in zip(others, values, strict=True))
+        for values, _ in shown
+    ]
+    columns = legend_columns(names)
+    made = canvas(key, title, -(-len(shown) // columns) if others else 0)
     ticks = None if _all_numbers(rows, key) else list(dict.fromkeys(str(row[key]) for row in rows))
-    for number, ((values, curve), colour) in enumerate(zip(shown, COLOURS, strict=False)):
-        label = ", ".join(
-            f"{other.rpartition('.')[2]} {value}" for other, value in zip(others, values, strict=True)
-        )
+    for number, ((_, curve), label, colour) in enumerate(zip(shown, names, COLOURS, strict=False)):
         _draw_curve(made, curve, key, name, colour, label, ticks, number - (len(shown) - 1) / 2)
     if ticks is not None:
         made.axes.set_xticks(range(len(ticks)), ticks)
     if others:
-        legend(made)
+        legend(made, columns=columns)
     left = f" {len(curves) - len(shown)} more curves are not drawn." if len(curves) > len(shown) else ""
     return Drawing(made, f"Mean over seeds; bars: 95 % confidence interval of the mean.{left}")
 

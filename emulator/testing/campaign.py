@@ -57,6 +57,7 @@ from emulator.testing.trial import (
     HUNG,
     MOST_ORDER_STEPS,
     MOST_STEPS,
+    REFUSED,
     REPLAY,
     UNKNOWN,
     Schedule,
@@ -315,7 +316,7 @@ def _checks(row: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 def _judging(results: Sequence[Mapping[str, Any]], check: str) -> list[Mapping[str, Any]]:
     """Return the runs of `campaign.json` in which a check was judged: all for those that only a failure has."""
-    if check in (HUNG, EMULATOR):
+    if check in (HUNG, EMULATOR, REFUSED):
         return list(results)
     judged = (Verdict.VALID, Verdict.INVALID)
     return [row for row in results if any(column_of(n)[0] == check and v in judged for n, v in _checks(row))]

@@ -42,11 +42,11 @@ from emulator.records.tape import TapeEntry, described, parse_tape, tape_lines
 from emulator.scenario.faults import Fault, Partition, Selector
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
-from vnet.errors import VnetError
+from vnet.errors import ScenarioError, VnetError
 
 GREATEST = 1e6
 """No number that a vehicle reports exceeds true coordinates by more: metres, and their squares, in one town."""
-HUNG, EMULATOR, GROWTH, REPLAY = "hung", "emulator", "growth", "replay"
+HUNG, EMULATOR, REFUSED, GROWTH, REPLAY = "hung", "emulator", "refused", "growth", "replay"
 STDOUT = 1
 """Descriptor of standard output."""
 LOOK_S = 0.5
@@ -291,6 +291,8 @@ def _run(
             return run_trial(scenario, run_folder, twice, tries == MOST_TRIES)
         except DiskError:
             raise
+        except ScenarioError as error:  # a smaller one that cannot be does not fail as that which is shrunk
+            return Trial.failure(REFUSED, str(error))
         except BaseException as error:
             traceback.print_exc(file=stacks)
             return Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")

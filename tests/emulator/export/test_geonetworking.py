@@ -97,6 +97,25 @@ def test_headers_are_as_the_standard_has_them() -> None:
 
 
 @pytest.mark.slow
+def test_a_place_that_is_not_available_is_the_last_one_and_said_to_be_inaccurate() -> None:
+    """As of a station whose receiver has an outage; the header has no value for it."""
+    known, router = encode_cam(Message(7, (0.0, 0.0), 0.0, 20.0), 0), Router()
+    cam = CAM_PDU_Descriptions.CAM
+    cam.from_uper(known)
+    value = cam.get_val()
+    place = value["cam"]["camParameters"]["basicContainer"]["referencePosition"]
+    place |= {"latitude": 900_000_001, "longitude": 1_800_000_001}
+    cam.set_val(value)
+    places = []
+    for message in (nowhere := cam.to_uper(), known, nowhere):
+        packet = router.packet(2, 5, 0, message)
+        assert packet is not None
+        places.append((*struct.unpack(">ii", packet[24:32]), packet[32] >> 7))
+    origin = [round(1e7 * each) for each in ORIGIN_DEG]
+    assert places == [(0, 0, 0), (*origin, 1), (*origin, 0)]
+
+
+@pytest.mark.slow
 @given(st.integers(0, 255), st.booleans())
 def test_a_cam_has_the_headers_of_its_station_type_also_with_the_least_that_it_may_say(
     kind: int, is_vehicle: bool

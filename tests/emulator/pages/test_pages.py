@@ -15,7 +15,7 @@ import pytest
 from jinja2 import UndefinedError
 from markupsafe import Markup
 
-from emulator.pages.canvas import canvas, styled, to_svg
+from emulator.pages.canvas import canvas, legend_columns, styled, to_svg
 from emulator.pages.page import render, table
 from emulator.pages.text import LONGEST_TEXT, as_text, cell
 from emulator.records.verdicts import Verdict
@@ -163,3 +163,8 @@ def test_every_file_of_the_packages_is_shipped() -> None:
     assert others and others <= shipped
     marked = {folder for folder, pattern in patterns if pattern == "py.typed" and (folder / pattern).is_file()}
     assert marked == {ROOT / name for name in ("vnet", "agents", "emulator")}, "all of them have types"
+
+
+@pytest.mark.parametrize(("labels", "columns"), [("abc", 3), (["fifteen letters"] * 4, 2), (["x" * 30] * 4, 1)])
+def test_a_legend_has_as_many_columns_as_fit(labels: list[str], columns: int) -> None:
+    assert legend_columns(labels) == columns

@@ -9,7 +9,7 @@ from emulator.records.run_folder import SCENARIO_FILE, RunFolder
 from emulator.records.tables import TRACE
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
-from emulator.testing.trial import run_trial
+from emulator.testing.trial import REFUSED, TrialPool, run_trial
 from tests.emulator.testing import programs
 
 CHECKS = "tests.emulator.testing.own_checks"
@@ -67,3 +67,17 @@ def test_only_estimates_and_covariances_grow(tmp_path: Path, monkeypatch: pytest
         Scenario.model_validate(scenario | {"run": run | {"duration_s": 2.0}}), RunFolder.scratch(tmp_path)
     )
     assert trial.texts["growth"].startswith("estimate_m of v")
+
+
+@pytest.mark.slow
+def test_a_scenario_that_cannot_be_does_not_fail_as_the_emulator_does(tmp_path: Path) -> None:
+    """Else a failure of the emulator would be shrunk to one without the vehicles that the scenario names."""
+    scenario = scenario_with("reads_tables")
+    exception = {"nodes": ["v03"], "entry": "agents.beacon:main"}
+    program = type(scenario.program).model_validate({"entry": "agents.beacon:main", "exceptions": [exception]})
+    pool = TrialPool(300.0, scenario)
+    try:
+        trial = pool.run(scenario.model_copy(update={"program": program}), tmp_path / "run")
+    finally:
+        pool.close()
+    assert trial.failed == [REFUSED]
