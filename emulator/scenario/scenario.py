@@ -215,8 +215,8 @@ class Run(Section):
     keep_payloads: Switch = False
     """Keep the payloads of all frames in `payloads.parquet`; until the end of the run they are in memory."""
     control_hz: float = Field(10.0, ge=10, le=100)
-    """Control instants a second of vehicles that programs drive: a whole multiple of `world.gnss.rate_hz`, at intervals
-    of whole nanoseconds, as 20, 25, 40, 50 or 100 with 10."""
+    """Control instants a second of vehicles that programs drive: a whole multiple of `world.gnss.rate_hz`, at
+    intervals of whole nanoseconds, as 20, 25, 40, 50 or 100 with 10."""
 
     @model_validator(mode="after")
     def _orders_are_of_lockstep(self) -> Run:
