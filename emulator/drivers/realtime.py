@@ -162,8 +162,8 @@ class RealTime:
             self._awaited.discard(process_id)
         if now_ns < self._emulation.duration_ns:
             self._change_by(now_ns)
-            if message.traffic.endings and now_ns > self._collected_ns:  # what came before the end has arrived
-                self._collect(now_ns - 1)
+            if message.traffic.endings and now_ns > self._collected_ns and self._emulation.ended_ns is None:
+                self._collect(now_ns - 1)  # what came before the end has arrived
             self._emulation.take(now_ns, [message.traffic])
         else:
             self._emulation.take_final(self._emulation.duration_ns, [message.traffic])

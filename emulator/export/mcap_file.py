@@ -155,7 +155,7 @@ def _ros2(recorded: RecordedRun) -> Iterator[Message]:
 
 
 def _typestores(definitions: Path | None) -> list[Any]:
-    """Return the types of Humble and of each later ROS 2 that rosbags has, all with those of a folder.
+    """Return the types of a folder, and those of Humble and of each later ROS 2 of rosbags, with the folder's.
 
     Without rosbags there are none.
     """
@@ -166,7 +166,7 @@ def _typestores(definitions: Path | None) -> list[Any]:
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
     later = list(Stores)[list(Stores).index(Stores.ROS2_HUMBLE) :]
-    stores = [get_typestore(each) for each in later]
+    stores = [get_typestore(each) for each in (Stores.EMPTY, *later)]
     files = [] if definitions is None else sorted(definitions.glob("**/msg/*.msg"))
     if definitions is not None and not files:
         raise VnetError(f"{definitions}: has no PACKAGE/msg/TYPE.msg")
@@ -175,7 +175,7 @@ def _typestores(definitions: Path | None) -> list[Any]:
         try:
             types = get_types_from_msg(path.read_text(), name)
             for store in stores:
-                store.register(types)
+                store.register({name: each for name, each in types.items() if name not in store.fielddefs})
         except (OSError, UnicodeDecodeError, TypesysError) as error:
             raise VnetError(f"{path}: is no definition of {name}: {' '.join(str(error).split())}") from None
     return stores

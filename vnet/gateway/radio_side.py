@@ -61,6 +61,8 @@ class RadioSide(ABC, Generic[Q]):
         # Replies to queries of the last incarnation may still come, and answer none of this one.
         self._query_numbers = count(incarnation * MOST_MESSAGES)
         self._tokens_ns = round(TOKEN_PERIODS * liveliness_s * NS_PER_S)
+        self._overtaken_ns = round(liveliness_s * NS_PER_S / 2)
+        """Time after which no earlier word of tokens is awaited: a number may be one that a fault has changed."""
         self._told: dict[str, tuple[int, tuple[str, ...], int]] = {}
         """Instant of the last message with tokens, their keys, and its number, by vehicle."""
         self.crosses = lru_cache(MOST_KEYS)(self._crosses)
@@ -132,7 +134,8 @@ class RadioSide(ABC, Generic[Q]):
         """
         for key in tokens.keys:
             zenoh.KeyExpr(key)
-        if sender not in self._told or number >= self._told[sender][2]:
+        last_ns, _, last = self._told.get(sender, (-self._tokens_ns, (), 0))
+        if number >= last or time_ns - last_ns >= self._overtaken_ns:
             self._retell({**self._told, sender: (time_ns, tokens.keys, number)})
 
     def forget_tokens(self, time_ns: int) -> None:

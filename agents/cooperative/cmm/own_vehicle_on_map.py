@@ -437,7 +437,8 @@ class OwnVehicleOnMap:
         elif self._is_outlier(fix) or not self._follows(fix, self._taken, self._untaken_s):
             self._outliers_s += dt_s
             follows = self._follows(fix, before, since_s)
-            self._turning = self._turning + 1 if follows and fix.tells_velocity else -math.inf
+            tell = fix.tells_velocity and before is not None and before.tells_velocity
+            self._turning = self._turning + 1 if follows and tell else -math.inf
             is_lost = follows and self._outliers_s >= max(LOST_S, LOST_FIXES * since_s)
             if self._turning < TURNING_FIXES and not is_lost:
                 return NOTHING

@@ -129,7 +129,7 @@ class Gateways:
         """Gateways that are being closed, whose endpoints the next of their vehicles needs."""
         self._down: dict[str, _Vehicle] = {}
         """Vehicles whose routers a fault has closed, until `_down_until_s` on the loop's clock."""
-        self._down_until_s = 0.0
+        self._down_until_s, self._restarting = 0.0, asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self.on_state: Callable[[str], None] = lambda text: None
         """Told which endpoints wait for programs."""
@@ -323,13 +323,14 @@ class Gateways:
         self._spawn(self._restart_endpoints(down_s))
 
     async def _restart_endpoints(self, down_s: float) -> None:
-        until_s = self._loop.time() + down_s
-        self._down_until_s = max(self._down_until_s, until_s)
-        there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
-        self._down |= there  # but those whose programs are starting: they do not wait for a router
-        await asyncio.gather(*(vehicle.gateway.close() for vehicle in there.values()))
-        await asyncio.sleep(until_s - self._loop.time())
-        if until_s == self._down_until_s:  # else another restart opens them
+        self._down_until_s = max(self._down_until_s, self._loop.time() + down_s)
+        async with self._restarting:  # a router that is being opened cannot be closed
+            there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
+            self._down |= there  # but those whose programs are starting: they do not wait for a router
+            await asyncio.gather(*(vehicle.gateway.close() for vehicle in there.values()))
+        while (left_s := self._down_until_s - self._loop.time()) > 0:  # another restart may last longer
+            await asyncio.sleep(left_s)
+        async with self._restarting:
             down, self._down = self._down, {}
             await asyncio.gather(*(self._open_again(vehicle) for vehicle in down.values()))
         self._emulation.folder.event(self._now_ns(), EventKind.router_restarted, None, down_s=down_s)

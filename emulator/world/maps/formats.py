@@ -687,7 +687,7 @@ class _Polygons(_Reader):
         if attributes.get("geo", "0") in ("1", "true", "yes"):
             raise self.wrong(f"{where}: geo = {attributes['geo']}: polygons in metres are needed")
         points = self._points(attributes.get("shape", ""), f"{where}: shape")
-        if attributes.get("fill") in ("0", "false") and points[0] != points[-1]:
+        if attributes.get("fill") in ("0", "false") and points[:1] != points[-1:]:
             return  # polyconvert writes an outline of several ways in pieces
         if len(set(points)) < LEAST_CORNERS:
             raise self.wrong(f"{where}: shape: three corners or more are needed")

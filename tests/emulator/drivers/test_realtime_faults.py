@@ -123,6 +123,11 @@ def test_what_came_before_a_program_ended_has_arrived_on_a_machine_that_is_late(
         realtime.receive(time_ms * MS, node, wire.Frames(b"n", 0, 1, [], traffic))
     realtime.due(200 * MS)
     assert emulation.engine.counts[Outcome.delivered] == 3 and not emulation.engine.counts[Outcome.receiver_down]
+    emulation.finish(200 * MS)
+    periods = len(emulation.metrics.metrics_table())
+    end = wire.Traffic(endings=[wire.Ending("v03", "finished")])
+    realtime.receive(900 * MS, "v03", wire.Frames(b"n", 0, 1, [], end))  # of a run that was interrupted
+    assert len(emulation.metrics.metrics_table()) == periods
 
 
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:

@@ -298,6 +298,17 @@ def test_mcap_has_messages_with_schemas_of_ros_2_where_the_definition_is_known(d
     assert schemas == {"/v01/chatter": known, "/v01/old": known, "/v01/odd": None}
 
 
+def test_given_definitions_come_first_where_a_message_has_no_hash(tmp_path: Path) -> None:
+    """A folder may have all types of a distribution, other definitions of which rosbags has."""
+    (tmp_path / "sensor_msgs/msg").mkdir(parents=True)
+    (tmp_path / "sensor_msgs/msg/Range.msg").write_text("float32 range")
+    stores = _typestores(tmp_path)
+    assert _definition(stores, "sensor_msgs/msg/Range", "TypeHashNotSupported") == b"float32 range\n"
+    newest = get_typestore(Stores.LATEST)
+    expected = newest.generate_msgdef("sensor_msgs/msg/Range", ros_version=2)[0].encode()
+    assert _definition(stores, "sensor_msgs/msg/Range", newest.hash_rihs01("sensor_msgs/msg/Range")) == expected
+
+
 @pytest.mark.parametrize("named", ["HUMBLE", "JAZZY", "LATEST"])
 def test_a_type_has_the_definition_of_its_own_distribution(named: str) -> None:
     """Humble tells no hashes, and its Range has no variance."""

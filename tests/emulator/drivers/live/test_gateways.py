@@ -2,6 +2,7 @@
 
 import asyncio
 import signal
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -179,12 +180,26 @@ async def test_tokens_are_not_forgotten_by_a_pause(monkeypatch: pytest.MonkeyPat
 
 
 @on_a_loop
+async def test_a_number_that_a_fault_has_changed_hides_no_later_word_of_tokens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, told = Rig(monkeypatch, 2, {}), list[tuple[str, bool]]()
+    await rig.welcome("v01")
+    gateway = rig.routers["v01"]
+    monkeypatch.setattr(gateway, "_show_token", lambda key, is_there: told.append((key, is_there)))
+    for time_s, number, keys in ((0, 2**40, ("a",)), (0.1, 5, ("b",)), (1.0, 6, ("c",))):
+        RadioSide.hear_tokens(gateway, "v02", CrossingTokens(keys), round(time_s * NS_PER_S), number)
+    assert told == [("a", True), ("a", False), ("c", True)]
+    await rig.gateways.close()
+
+
+@on_a_loop
 async def test_routers_are_there_again_once_all_restarts_that_overlap_are_over(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A vehicle whose program is just starting keeps its router: who connects for the first time does not wait."""
     rig, sleeps = Rig(monkeypatch, 2, {}), list[asyncio.Future[None]]()
-    opened, closed = list[str](), list[str]()
+    opened, closed, now_s = list[str](), list[str](), [0.0]
     await rig.welcome("v01", "v02")
     rig.gateways._vehicles["v01"].is_ready = True
 
@@ -199,12 +214,18 @@ async def test_routers_are_there_again_once_all_restarts_that_overlap_are_over(
         patched.setattr(Gateway, "close", close)
         patched.setattr(Gateway, "open", lambda gateway, listen: opened.append(gateway.node_id))
         patched.setattr("emulator.drivers.live.gateways.asyncio.sleep", sleep)
+        patched.setattr(rig.gateways, "_loop", SimpleNamespace(time=lambda: now_s[0]))
         tasks = [asyncio.ensure_future(rig.gateways._restart_endpoints(down_s)) for down_s in (1000.0, 10.0)]
         while len(sleeps) < 2:
             await asyncio.wait(tasks, timeout=0)
-        for number, expected in ((1, []), (0, ["v01"])):
-            sleeps[number].set_result(None)
-            await tasks[number]
-            assert opened == expected
-        assert set(closed) == {"v01"}
+        now_s[0] = 10.0
+        sleeps[1].set_result(None)
+        while len(sleeps) < 3:
+            await asyncio.wait(tasks, timeout=0)
+        assert opened == [] and closed == ["v01", "v01"]
+        now_s[0] = 1000.0
+        for each in (sleeps[0], sleeps[2]):
+            each.set_result(None)
+        await asyncio.gather(*tasks)
+        assert opened == ["v01"]
     await rig.gateways.close()

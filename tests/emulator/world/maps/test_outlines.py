@@ -112,6 +112,9 @@ def test_sumo_has_polygons_in_metres(tmp_path: Path) -> None:
     path.write_text(f'<?xml version="1.0"?>\n<additional>\n{house}\n{lawn}\n{ruin}\n{half}\n</additional>\n')
     found = read_buildings(path, lambda: pytest.fail("no degrees"))
     assert rings(found) == [[list(p) for p in HOUSE]] and len(found.corner_m) == 4
+    path.write_text('<additional>\n<poly id="5" type="building" fill="0" shape=""/>\n</additional>')
+    with pytest.raises(ScenarioError, match="line 2: poly 5: shape: three corners or more are needed"):
+        read_buildings(path, lambda: pytest.fail("no degrees"))
 
 
 def test_a_table_has_corners_in_metres(tmp_path: Path) -> None:
