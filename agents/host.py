@@ -565,6 +565,8 @@ class _RealTimeAgent:
             self._loop.call_soon_threadsafe(self._drain)
 
     def _awaits(self, packets_only: bool) -> bool:
+        if not packets_only and any(each.endings for each in self._said.values()):  # a batch may say they are lost
+            return True
         return any(
             node.radio.inbox.awaited
             or node.radio.is_sending
@@ -623,7 +625,7 @@ class _RealTimeAgent:
         self._receipts.take(batch, now_ns)
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
         self._take_results(batch)
-        if lost := [seq for first, last in batch.lost for seq in range(first, last + 1) if self._said.get(seq)]:
+        if lost := [seq for seq in self._said if any(first <= seq <= last for first, last in batch.lost)]:
             self._said_again += map(self._said.pop, lost)
             self._schedule_flush()
         if batch.messages:
@@ -669,8 +671,10 @@ class _RealTimeAgent:
             parts = [getattr(each, name) for each in (*again, traffic)]
             traffic = replace(traffic, **{name: list(chain.from_iterable(parts))})
         seq = self._receipts.seq
-        self._said[seq] = wire.Traffic(notes=traffic.notes, unhandled=traffic.unhandled, endings=traffic.endings)
-        self._said.pop(seq - MOST_KEPT, None)
+        if kept := wire.Traffic(notes=traffic.notes, unhandled=traffic.unhandled, endings=traffic.endings):
+            self._said[seq] = kept
+            if len(self._said) > MOST_KEPT:
+                del self._said[next(iter(self._said))]
         self._sends.update(((each.node, each.number), seq) for each in traffic.frames if each.to is not None)
         self._attachment.say(self._receipts.frames(self._attachment.nonce, traffic, final, self._take_overdue()))
         self._attachment.frames_seq = self._receipts.seq

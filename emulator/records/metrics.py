@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 
 from emulator.radio.topology import component_links
 from emulator.records.distributions import chi2_quantile
-from emulator.records.period_figures import NUMBER, Period, ProgramFigures, figures_of, program_figures, vectors
+from emulator.records.period_figures import (
+    NUMBER,
+    Period,
+    ProgramFigures,
+    figures_if_here,
+    figures_of,
+    program_figures,
+    vectors,
+)
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import ValueColumns, figures_among
 from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, by_instant, columns_of, schema_of
@@ -32,7 +40,7 @@ from emulator.scenario.own_functions import declared, load_entry
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
-from vnet.errors import VnetError
+from vnet.errors import VnetError, shown
 from vnet.reports import Report, Value
 from vnet.runtime.error_text import error_line, own_line
 from vnet.runtime.programs import search_programs_in
@@ -285,7 +293,11 @@ class DeclaredReference:
             raise VnetError("the program declares no reference")
         self._kind, self._entry = load_entry(entries[0]), entries[0]
         with told_of(f"REFERENCE {self._entry}"):
-            self.name, self.text, self.columns = self._kind.NAME, self._kind.TEXT, tuple(self._kind.COLUMNS)
+            self.name, self.text = str(self._kind.NAME), str(self._kind.TEXT)
+            self.columns = tuple(map(str, self._kind.COLUMNS))
+        known = columns_of(STATES, figures_if_here(scenario.program))
+        if unknown := [name for name in self.columns if name not in known]:
+            raise ReferenceFailedError(f"REFERENCE {entries[0]}: {shown(unknown[0])} is no column of the states")
 
     def begin(self, setting: Setting) -> Callable[[int, Mapping[str, Array]], dict[str, float | list[float]]]:
         """Return `Reference.step` of one that is made for this setting."""

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.fault_plan import PlannedFault
+from emulator.radio.reception import Threshold
 from emulator.radio.topology import Connectivity, connectivity_of
 from emulator.records.events import Event
 from emulator.records.radio_metrics import radio_metrics
@@ -264,12 +265,13 @@ class Run:
     def _audible(self) -> Connectivity | None:
         """Connectivity by which frames may arrive, where that is less than being in range.
 
-        Without fading 802.11p detects no frame whose mean power is below `radio.receiver.min_rssi_dbm`.
+        Without fading 802.11p detects no frame whose mean power is below what `[radio.receiver]` needs.
         """
         radio = self.scenario.radio
         if radio.path_loss is None or radio.fading is not None or radio.sidelink is not None:
             return None
-        least_dbm = max(radio.path_loss.floor_dbm, (radio.receiver or Receiver()).min_rssi_dbm)
+        needed_dbm = 10 * math.log10(Threshold(radio.receiver or Receiver()).alone_mw)
+        least_dbm = max(radio.path_loss.floor_dbm, needed_dbm)
         path_loss = radio.path_loss.model_copy(update={"floor_dbm": least_dbm})
         radio = radio.model_copy(update={"path_loss": path_loss})
         return connectivity_of(radio, self.scenario.run.seed, self._recorded.radio_inputs)

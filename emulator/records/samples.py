@@ -157,12 +157,11 @@ def _outcomes(recorded: OpenedRun, rows: Sequence[dict[str, object]]) -> Iterato
     outcomes = recorded.trace["outcome"].cast(pa.string()).take(pa.array(kept)).to_pylist()
     fates: dict[tuple[int, int, int], str] = {}
     for frame, outcome in zip(zip(*(each[kept].tolist() for each in by), strict=True), outcomes, strict=True):
-        if fates.get(frame) != DELIVERED:
+        if frame[::2] in sample_of and fates.get(frame) != DELIVERED:
             fates[frame] = outcome
     worst: dict[tuple[int, int], str] = {}
     for (sender, receiver, seq), outcome in fates.items():
-        sample = sample_of.get((sender, seq))
-        if sample is not None and worst.get((sample, receiver), DELIVERED) == DELIVERED:
-            worst[sample, receiver] = outcome
+        if worst.get(pair := (sample_of[sender, seq], receiver), DELIVERED) == DELIVERED:
+            worst[pair] = outcome
     for (number, _), outcome in worst.items():
         yield number, outcome

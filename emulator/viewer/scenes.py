@@ -770,8 +770,6 @@ class DrawnReference:
             name: each.type.list_size if pa.types.is_fixed_size_list(each.type) else 1
             for name, each in columns_of(STATES, figures_if_here(scenario.program)).items()
         }
-        if unknown := [name for name in self._columns if name not in self._sizes]:
-            raise VnetError(f"its column {unknown[0]!r} is neither vnet's nor declared")
         self._step = reference.begin(Setting(scenario, component, point_m, heading_rad))
 
     def step(self, period: Mapping[str, Any]) -> dict[str, float]:

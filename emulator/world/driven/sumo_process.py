@@ -35,6 +35,8 @@ ROUTE_LANE_CHANGES = 1537
 """Mode in which it changes lanes only where the route needs it, and when it is told to, without a collision."""
 LANE_S = 5.0
 """Time for which SUMO tries to change to a lane, and stays there."""
+_GZIP = b"\x1f\x8b"
+"""The first bytes of what gzip has compressed (RFC 1952)."""
 ABSENT = [math.nan] * len(COLUMNS)
 
 
@@ -305,9 +307,11 @@ class Simulation:
 
 def _drives_on_left(network: str) -> bool:
     """Tell whether vehicles of this network drive on the left, which its root element says."""
-    with gzip.open(network) if network.endswith(".gz") else Path(network).open("rb") as file:
+    with Path(network).open("rb") as file:
+        is_compressed = file.read(len(_GZIP)) == _GZIP  # whatever its name
+    with gzip.open(network) if is_compressed else Path(network).open("rb") as file:
         _, root = next(ElementTree.iterparse(file, events=("start",)))
-    return bool(root.get("lefthand") == "true")
+    return root.get("lefthand") in ("true", "1")
 
 
 def main() -> None:
