@@ -278,7 +278,7 @@ class Reference(Protocol):
 
 
 class ReferenceFailedError(VnetError):
-    """The reference of a program fails, or says what is no figure."""
+    """The reference of a program fails, or returns what is not a figure."""
 
 
 class DeclaredReference:

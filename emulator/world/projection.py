@@ -49,8 +49,8 @@ class CoordinateFrame:
         """Return the frame that a file states. Raise ScenarioError unless PROJ knows it, and it is in metres."""
         frame = cls(proj, offset_m)
         target = frame._transformer.target_crs
-        if target is None or any(axis.unit_name != "metre" for axis in target.axis_info):
-            raise ScenarioError(f"projection {printable(proj)}: not in metres")
+        if target is None or [axis.unit_name for axis in target.axis_info] != ["metre"] * 2:
+            raise ScenarioError(f"projection {printable(proj)}: not of two axes in metres")
         return frame
 
     @cached_property

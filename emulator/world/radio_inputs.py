@@ -250,8 +250,8 @@ def load_buildings(scenario: Scenario, frame: CoordinateFrame | None, area_m: Ar
         off_m = 0.0 if origin is None else float(np.hypot(*frame.to_local(*origin)))
         if not off_m <= SAME_ORIGIN_M:
             raise ScenarioError(
-                f"radio.buildings.origin_deg = {list(origin or ())}: {off_m:,.0f} m from where x = y = 0 m is on "
-                "the map, or of the trips; leave it out"
+                f"radio.buildings.origin_deg = {list(origin or ())}: {off_m:,.0f} m from the x = y = 0 m of the "
+                "map or the trips; leave it out"
             )
         return frame
 

@@ -326,7 +326,7 @@ class Gateways:
         self._down_until_s = max(self._down_until_s, self._loop.time() + down_s)
         async with self._restarting:  # a router that is being opened cannot be closed
             there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
-            self._down |= there  # but those whose programs are starting: they do not wait for a router
+            self._down |= there  # not those whose programs are starting: these do not wait for one
             await asyncio.gather(*(vehicle.gateway.close() for vehicle in there.values()))
         while (left_s := self._down_until_s - self._loop.time()) > 0:  # another restart may last longer
             await asyncio.sleep(left_s)
@@ -440,7 +440,9 @@ class Gateways:
     def _repeat_at(self, due_s: float, vehicle: _Vehicle, period_s: float, act: Callable[[_Vehicle], None]) -> None:
         if self._is_there(vehicle):
             act(vehicle)
-            due_s += period_s * max(math.ceil((self._loop.time() - due_s) / period_s), 1)  # who is late catches up
+            due_s += period_s * max(
+                math.ceil((self._loop.time() - due_s) / period_s), 1
+            )  # periods that are past are left out
             self._loop.call_at(due_s, self._repeat_at, due_s, vehicle, period_s, act)
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:

@@ -146,5 +146,7 @@ def test_an_origin_of_buildings_beside_that_of_a_map_is_the_same_or_refused(tmp_
 
     found = [loaded((48.77, 9.18), None), loaded(None, frame), loaded((48.770001, 9.180001), frame)]
     assert all(each is not None and each.corner_m[0] == pytest.approx([0.0, 0.0], abs=1e-6) for each in found)
-    with pytest.raises(ScenarioError, match=r"origin_deg = \[48.78, 9.18\]: 1,112 m from where x = y = 0 m is"):
+    with pytest.raises(
+        ScenarioError, match=r"origin_deg = \[48.78, 9.18\]: 1,112 m from the x = y = 0 m of the map"
+    ):
         loaded((48.78, 9.18), frame)
