@@ -40,7 +40,7 @@ def docs(
             width = max(map(len, pages))
             print("\n".join(f"{name:{width}}  {_title(file)}" for name, file in pages.items()))
             if not Path("docs/examples").exists():
-                print('for commands that name files of docs/: ln -s "$(vnet docs --path)" docs')
+                print('for commands that name files of docs/: ln -s "$(vnet docs --path)" docs', file=sys.stderr)
 
 
 def list_pages() -> dict[str, Path]:
