@@ -525,6 +525,7 @@ class _RealTimeAgent:
         """Notes, exceptions and ends of programs in the latest `Frames`, by their `seq`."""
         self._said_again: list[wire.Traffic] = []
         """That of `Frames` which have never come, for the next ones."""
+        self._has_told_an_end = False
         self._unseen: dict[MessageRef, int] = {}
         """Messages of the backbone that have not come, and when (monotonic ns) a batch has referred to them."""
         self._orphan_timer: asyncio.TimerHandle | None = None
@@ -565,7 +566,7 @@ class _RealTimeAgent:
             self._loop.call_soon_threadsafe(self._drain)
 
     def _awaits(self, packets_only: bool) -> bool:
-        if not packets_only and any(each.endings for each in self._said.values()):  # a batch may say they are lost
+        if self._has_told_an_end and not packets_only:  # a batch may say that it is lost
             return True
         return any(
             node.radio.inbox.awaited
@@ -625,7 +626,8 @@ class _RealTimeAgent:
         self._receipts.take(batch, now_ns)
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
         self._take_results(batch)
-        if lost := [seq for seq in self._said if any(first <= seq <= last for first, last in batch.lost)]:
+        if batch.lost:
+            lost = [seq for seq in self._said if any(first <= seq <= last for first, last in batch.lost)]
             self._said_again += map(self._said.pop, lost)
             self._schedule_flush()
         if batch.messages:
@@ -672,7 +674,7 @@ class _RealTimeAgent:
             traffic = replace(traffic, **{name: list(chain.from_iterable(parts))})
         seq = self._receipts.seq
         if kept := wire.Traffic(notes=traffic.notes, unhandled=traffic.unhandled, endings=traffic.endings):
-            self._said[seq] = kept
+            self._said[seq], self._has_told_an_end = kept, self._has_told_an_end or bool(kept.endings)
             if len(self._said) > MOST_KEPT:
                 del self._said[next(iter(self._said))]
         self._sends.update(((each.node, each.number), seq) for each in traffic.frames if each.to is not None)

@@ -184,7 +184,7 @@ def _typestores(definitions: Path | None) -> list[Any]:
 def _definition(stores: Sequence[Any], ros_type: str, type_hash: str) -> bytes | None:
     """Return the definition of a type, with those it uses; None unless there is one with this hash.
 
-    Of a type without a hash, as Humble sends them, it is the oldest.
+    Of a type without a hash, as Humble sends them, it is the first: of a folder, or the oldest.
     """
     for store in (each for each in stores if ros_type in each.fielddefs):
         try:

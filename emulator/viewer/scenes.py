@@ -780,7 +780,8 @@ class DrawnReference:
         told = {**period["columns"], **period}
         states = {name: self._column(name, told[name]) for name in self._columns}
         up = np.frombuffer(period["up"], dtype=np.uint8).astype(bool)
-        states["fix_m"] = np.where(up[:, None], states["fix_m"], np.nan)
+        if "fix_m" in states:
+            states["fix_m"] = np.where(up[:, None], states["fix_m"], np.nan)
         figures = self._step(int(period["time_ns"]), states)
         return {name: figure for name, figure in figures.items() if not isinstance(figure, list)}
 

@@ -440,9 +440,8 @@ class Gateways:
     def _repeat_at(self, due_s: float, vehicle: _Vehicle, period_s: float, act: Callable[[_Vehicle], None]) -> None:
         if self._is_there(vehicle):
             act(vehicle)
-            due_s += period_s * max(
-                math.ceil((self._loop.time() - due_s) / period_s), 1
-            )  # periods that are past are left out
+            passed = math.ceil((self._loop.time() - due_s) / period_s)
+            due_s += period_s * max(passed, 1)  # who is late leaves periods out
             self._loop.call_at(due_s, self._repeat_at, due_s, vehicle, period_s, act)
 
     def _tell_clock(self, vehicle: _Vehicle) -> None:
