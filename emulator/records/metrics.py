@@ -36,13 +36,12 @@ from emulator.records.period_figures import (
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import ValueColumns, figures_among
 from emulator.records.tables import ARROW, METRICS, STATES, TRUTH, by_instant, columns_of, schema_of
-from emulator.scenario.own_functions import declared, load_entry
+from emulator.scenario.own_functions import declared, load_entry, told
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
 from vnet.errors import VnetError, shown
 from vnet.reports import Report, Value
-from vnet.runtime.error_text import error_line, own_line
 from vnet.runtime.programs import search_programs_in
 from vnet.types import Array
 
@@ -291,21 +290,22 @@ class DeclaredReference:
         entries = declared(scenario.program, "REFERENCE")
         if not entries:
             raise VnetError("the program declares no reference")
-        self._kind, self._entry = load_entry(entries[0]), entries[0]
-        with told_of(f"REFERENCE {self._entry}"):
+        self._kind, self.what = load_entry(entries[0]), f"REFERENCE {entries[0]}"
+        with named(self.what):
             self.name, self.text = str(self._kind.NAME), str(self._kind.TEXT)
-            self.columns = tuple(map(str, self._kind.COLUMNS))
+            columns = tuple(map(str, self._kind.COLUMNS))
         known = columns_of(STATES, figures_if_here(scenario.program))
-        if unknown := [name for name in self.columns if name not in known]:
-            raise ReferenceFailedError(f"REFERENCE {entries[0]}: {shown(unknown[0])} is no column of the states")
+        if unknown := [name for name in columns if name not in known]:
+            raise ReferenceFailedError(f"{self.what}: {shown(unknown[0])} is no column of the states")
+        self.columns = {name: known[name] for name in columns}
 
     def begin(self, setting: Setting) -> Callable[[int, Mapping[str, Array]], dict[str, float | list[float]]]:
         """Return `Reference.step` of one that is made for this setting."""
-        with told_of(f"REFERENCE {self._entry}"):
+        with named(self.what):
             made: Reference = self._kind(setting)
 
         def step(time_ns: int, states: Mapping[str, Array]) -> dict[str, float | list[float]]:
-            with told_of(f"REFERENCE {self._entry}"):
+            with named(self.what):
                 found = made.step(time_ns, states).items()
                 return {
                     name: [float(one) for one in each] if isinstance(each, list) else float(each)
@@ -316,14 +316,14 @@ class DeclaredReference:
 
 
 @contextmanager
-def told_of(what: str) -> Iterator[None]:
+def named(what: str) -> Iterator[None]:
     """Raise ReferenceFailedError, which names `what` and its line, for an exception of a program's code."""
     try:
         yield
     except VnetError:
         raise
     except (Exception, SystemExit) as error:
-        raise ReferenceFailedError(f"{what}: {error_line(error)} ({own_line(error)})") from error
+        raise ReferenceFailedError(f"{what} {told(error, __file__)[0]}") from error
 
 
 def reference_series(recorded: RecordedRun) -> dict[str, Array]:
@@ -349,5 +349,5 @@ def reference_series(recorded: RecordedRun) -> dict[str, Array]:
     if some is None:
         raise VnetError(f"no program reported what the {reference.name} is compared with")
     missing = {name: np.full_like(value, np.nan, dtype=float) for name, value in some.items()}
-    with told_of(f"the figures of the {reference.name}"):  # lists of different lengths
+    with named(reference.what):  # lists of different lengths
         return {name: np.array([row.get(name, missing[name]) for row in rows], dtype=float) for name in some}

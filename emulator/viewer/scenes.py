@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.events import WARNING, EventKind, level_of
-from emulator.records.metrics import DeclaredReference, ReferenceFailedError, Setting, told_of
-from emulator.records.period_figures import Views, figures_if_here
+from emulator.records.metrics import DeclaredReference, ReferenceFailedError, Setting, named
+from emulator.records.period_figures import Views
 from emulator.records.run_folder import SCENARIO_FILE
-from emulator.records.tables import STATES, columns_of
 from emulator.scenario.loading import parse_recorded_scenario
 from emulator.scenario.own_functions import declared, load_entry
 from emulator.scenario.scenario import Radio
@@ -762,13 +761,13 @@ class DrawnReference:
     def __init__(self, scene: Mapping[str, Any]) -> None:
         scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
         reference, self._count = DeclaredReference(scenario), len(scene["node_ids"])
-        self.label, self._columns = f"{reference.name}: {reference.text}", reference.columns
+        self.label = f"{reference.name}: {reference.text}"
         point_m = unpack(scene["lane_point_m"], 2).astype(float)
         heading_rad = unpack(scene["lane_heading_rad"])[:, 0].astype(float)
         component = np.frombuffer(scene["component"], dtype="<i2")
         self._sizes = {
             name: each.type.list_size if pa.types.is_fixed_size_list(each.type) else 1
-            for name, each in columns_of(STATES, figures_if_here(scenario.program)).items()
+            for name, each in reference.columns.items()
         }
         self._step = reference.begin(Setting(scenario, component, point_m, heading_rad))
 
@@ -778,7 +777,7 @@ class DrawnReference:
         Raises ReferenceFailedError.
         """
         told = {**period["columns"], **period}
-        states = {name: self._column(name, told[name]) for name in self._columns}
+        states = {name: self._column(name, told[name]) for name in self._sizes}
         up = np.frombuffer(period["up"], dtype=np.uint8).astype(bool)
         if "fix_m" in states:
             states["fix_m"] = np.where(up[:, None], states["fix_m"], np.nan)
@@ -799,7 +798,7 @@ def published(scene: Mapping[str, Any]) -> dict[str, tuple[str, float]]:
     try:
         scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
         for entry in declared(scenario.program, "PUBLISHED"):
-            with told_of(f"PUBLISHED {entry}"):
+            with named(f"PUBLISHED {entry}"):
                 values = load_entry(entry)(scene).items()
                 found |= {name: (str(label), float(value)) for name, (label, value) in values}
     except VnetError:  # a run is drawn all the same

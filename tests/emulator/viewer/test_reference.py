@@ -109,7 +109,18 @@ def test_a_reference_that_fails_is_named_and_the_run_is_drawn_and_reported(
     declares = {"REFERENCE": [f"{__name__}:{kind.__name__}"]}
     monkeypatch.setattr("emulator.records.metrics.declared", lambda program, name: declares.get(name, []))
     messages = tell(tmp_path / "run", f"{__name__}:say_nothing", run={"duration_s": 0.5})
-    with pytest.raises(ReferenceFailedError, match=rf"REFERENCE .*{kind.__name__}: {says}"):
+    with pytest.raises(ReferenceFailedError, match=rf"REFERENCE .*{kind.__name__} raises {says}"):
         DrawnReference(messages[0]).step(messages[1])
     with pytest.raises(ReferenceFailedError):
         Source(tmp_path / "run").reference_series  # noqa: B018
+
+
+class WithoutFixes(Reference):
+    COLUMNS = ("position_m",)
+
+
+def test_a_reference_need_not_look_at_fixes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    declares = {"REFERENCE": [f"{__name__}:{WithoutFixes.__name__}"]}
+    monkeypatch.setattr("emulator.records.metrics.declared", lambda program, name: declares.get(name, []))
+    messages = tell(tmp_path / "run", f"{__name__}:say_nothing", run={"duration_s": 0.5})
+    assert DrawnReference(messages[0]).step(messages[1]) == {"position_rmse_m": 1.0}
