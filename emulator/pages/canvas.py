@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -48,8 +49,6 @@ _LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 54, 12, 8, 42
 _LEGEND_ROW_PX, _LANE_PX = 18, 15
 _MOST_LANES = 6
 LEGEND_COLUMNS = 3
-_HANDLE_PX, _LEGEND_LETTER_PX = 38, 6.0
-"""Widths in a legend: of a line with the space around it, and of a letter on average."""
 _LETTER_PX = 5.6
 """The width of a letter of a fault's label, on average."""
 MOST_POINTS = 2 * (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
@@ -119,7 +118,6 @@ def styled() -> Iterator[None]:
 def canvas(
     x_label: str,
     y_label: str,
-    legend_rows: int = 0,
     spans: Sequence[FaultSpan] = (),
     end_s: float = 0.0,
     plot_px: float = PLOT_PX,
@@ -132,7 +130,7 @@ def canvas(
     from matplotlib.figure import Figure
 
     lanes = _in_lanes(spans, end_s)
-    height_px = _TOP_PX + legend_rows * _LEGEND_ROW_PX + len(lanes) * _LANE_PX + plot_px + _BOTTOM_PX
+    height_px = _TOP_PX + len(lanes) * _LANE_PX + plot_px + _BOTTOM_PX
     figure = Figure(figsize=(WIDTH_PX / 72, height_px / 72), dpi=72)
     figure.patch.set_visible(False)
     width = (WIDTH_PX - _LEFT_PX - _RIGHT_PX) / WIDTH_PX
@@ -182,30 +180,34 @@ def _draw_lanes(strip: Axes, lanes: Sequence[Sequence[FaultSpan]], end_s: float)
             strip.text(_reach(span, end_s)[0], row + 0.68, span.label, fontsize=10, color=QUIET, va="baseline")
 
 
-def legend_columns(labels: Sequence[str]) -> int:
-    """Return in how many columns, at most `LEGEND_COLUMNS`, a legend of these labels fits a figure."""
-    room_px = WIDTH_PX - _LEFT_PX - _RIGHT_PX
-    for columns in range(LEGEND_COLUMNS, 1, -1):
-        parts = np.array_split(list(map(len, labels)), columns)  # as matplotlib fills columns
-        if sum(_HANDLE_PX + _LEGEND_LETTER_PX * part.max(initial=0) for part in parts) <= room_px:
-            return columns
-    return 1
+def legend(of: Canvas, handles: Sequence[Artist] | None = None) -> None:
+    """Put a legend of these handles, or of all that have labels, above the figure, which grows by its rows.
 
-
-def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = LEGEND_COLUMNS) -> None:
-    """Put a legend of these handles, or of all that have labels, above the figure."""
-    of.figure.legend(
-        handles=of.axes.get_legend_handles_labels()[0] if handles is None else list(handles),
-        loc="upper left",
-        bbox_to_anchor=(_LEFT_PX / WIDTH_PX, 1),
-        ncols=columns,
-        handlelength=1.8,
-        handletextpad=0.5,
-        columnspacing=1.2,
-        labelspacing=0.35,
-        borderpad=0.1,
-        borderaxespad=0.1,
-    )
+    It has as many columns, at most `LEGEND_COLUMNS`, as fit beside each other.
+    """
+    shown = of.axes.get_legend_handles_labels()[0] if handles is None else list(handles)
+    for columns in range(min(LEGEND_COLUMNS, len(shown)), 0, -1):
+        drawn = of.figure.legend(
+            handles=shown,
+            loc="upper left",
+            bbox_to_anchor=(_LEFT_PX / WIDTH_PX, 1),
+            ncols=columns,
+            handlelength=1.8,
+            handletextpad=0.5,
+            columnspacing=1.2,
+            labelspacing=0.35,
+            borderpad=0.1,
+            borderaxespad=0.1,
+        )
+        if columns == 1 or drawn.get_window_extent().x1 <= of.figure.bbox.x1:
+            break
+        drawn.remove()
+    width, height = of.figure.get_size_inches()
+    taller = height + math.ceil(len(shown) / columns) * _LEGEND_ROW_PX / 72
+    of.figure.set_size_inches(width, taller)
+    for axes in of.figure.axes:
+        place = axes.get_position()
+        axes.set_position((place.x0, place.y0 * height / taller, place.width, place.height * height / taller))
 
 
 def from_zero(axes: Axes) -> None:

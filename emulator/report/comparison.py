@@ -360,7 +360,7 @@ def _delivered(comparison: Comparison) -> Drawing:
 def _latency(comparison: Comparison) -> Drawing:
     found, note = _of_both(comparison, latencies_ms)
     end_ms = max(float(np.percentile(values, 99.5)) for _, values in found) * 1.1
-    made: Canvas = canvas("latency (ms)", "deliveries (%)", legend_rows=1)
+    made: Canvas = canvas("latency (ms)", "deliveries (%)")
     for (name, colour, dash), values in found:
         counts, edges = np.histogram(values, bins=50, range=(0, max(end_ms, 1e-3)))
         label = f"{name}: median {np.median(values):.2f} ms"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +15,6 @@ from emulator.pages.canvas import (
     canvas,
     from_zero,
     legend,
-    legend_columns,
     logarithmic,
     styled,
     thin,
@@ -68,9 +66,7 @@ def time_figure(
     everything = np.concatenate([line.value[np.isfinite(line.value)] for line in lines])
     positive = everything[everything > 0]
     is_log = not linear and len(positive) > 0 and positive.max() > WIDE_RANGE * positive.min()
-    columns = legend_columns([line.label for line in lines])
-    rows = math.ceil(len(lines) / columns) if len(lines) > 1 else 0
-    made = canvas(TIME, y_label, rows, spans, end_s)
+    made = canvas(TIME, y_label, spans, end_s)
     for line in lines:
         marker = "o" if np.isfinite(line.value).sum() < 3 else None
         shown: dict[str, Any] = {
@@ -85,8 +81,8 @@ def time_figure(
         logarithmic(made.axes)
     else:
         from_zero(made.axes)
-    if rows:
-        legend(made, columns=columns)
+    if len(lines) > 1:
+        legend(made)
     return made
 
 

@@ -72,8 +72,7 @@ def links(source: Source) -> Drawing:
     distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
     physical, binned = source.scenario.radio.is_physical, source.moves or source.scenario.radio.is_physical
     alike = not physical and not isinstance(source.radio_inputs.links, LinkTable)
-    labels = 1 + (len(used) > MOST_LINKS) + alike + binned
-    made = canvas("distance (km)", "delivery ratio (%)", legend_rows=int(np.ceil(labels / 3)))
+    made = canvas("distance (km)", "delivery ratio (%)")
     if len(used) <= MOST_LINKS:
         dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4, "markeredgewidth": 0}
         made.axes.plot(distance_km, share, color=BLUE, alpha=0.55, label="a link", **dots)
@@ -151,7 +150,7 @@ def degrees(source: Source) -> Drawing:
     step = int(np.ceil((degree.max() + 1) / 40))
     edges = np.arange(0, degree.max() + step + 1, step) - 0.5
     counts, _ = np.histogram(degree, edges)
-    made = canvas("degree (vehicles in range)", "vehicles", legend_rows=1)
+    made = canvas("degree (vehicles in range)", "vehicles")
     made.axes.bar(edges[:-1] + step / 2, counts, width=0.85 * step, color=BLUE)
     made.axes.axvline(degree.mean(), color=RED, linestyle=DASHES[1], label=f"mean {degree.mean():.1f}")
     if degree.max() > source.scenario.radio.max_peers:
@@ -187,7 +186,7 @@ def peers(name: str, source: Source) -> Drawing:
     matrix = mean_of_peers(f"{name}.", source)
     if len(ids) > MOST_IN_MATRIX:
         raise VnetError(f"a matrix of {len(ids)} vehicles would not be readable")
-    made = canvas("for vehicle", "reporting vehicle", legend_rows=2, plot_px=270)
+    made = canvas("for vehicle", "reporting vehicle", plot_px=270)
     from matplotlib.patches import Patch, PathPatch
     from matplotlib.path import Path as Outline
 

@@ -43,8 +43,6 @@ OPACITY = (0.06, 0.25, 0.45, 0.7, 1.0)
 """Opacity of a vehicle's point, by the class of its value."""
 UNIT: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 8, "color": ORANGE, "zorder": 4}
 """Marker of a roadside unit."""
-LONG_LABEL = 14
-"""Letters of a class from which on the legend has two columns instead of three."""
 MOST_COLOURED = 6
 """Values with a map of their own."""
 KILOMETRES_FROM_M = 3000.0
@@ -62,7 +60,7 @@ def map_charts(source: Source) -> Drawers:
 
 def _network(source: Source) -> Drawing:
     """Draw roads, vehicles, and trajectories where vehicles drive, else the links that delivered frames."""
-    made, scale = _frame(source, 0)
+    made, scale = _frame(source)
     position_m = _last_positions(source)
     if source.moves:
         shown = _draw_trajectories(made, source, scale)
@@ -89,8 +87,7 @@ def _coloured(source: Source, name: str) -> Drawing:
     if len(set(last[known].tolist())) == 1:
         raise NothingToShow("all vehicles ended with the same value")
     index, labels = classes(last, source.is_boolean(name))
-    columns = 2 if max(map(len, labels)) > LONG_LABEL else 3
-    made, scale = _frame(source, -(-len(labels) // columns))
+    made, scale = _frame(source)
     position_m = _last_positions(source) * scale
     from matplotlib.colors import to_rgba
     from matplotlib.lines import Line2D
@@ -103,7 +100,7 @@ def _coloured(source: Source, name: str) -> Drawing:
         made.axes.plot(*position_m[index == number].T, **dots)
         handles.append(Line2D([], [], label=label, **dots))
     _draw_vehicles(made, position_m[~known], GREY)
-    legend(made, handles, columns)
+    legend(made, handles)
     silent = " Grey: never reported it." if (~known).any() else ""
     return Drawing(made, f"{label_of(name)}: what each vehicle reported last.{silent}")
 
@@ -136,7 +133,7 @@ def classes(value: Array, is_boolean: bool = False) -> tuple[NDArray[np.intp], l
     return index, labels
 
 
-def _frame(source: Source, legend_rows: int) -> tuple[Canvas, float]:
+def _frame(source: Source) -> tuple[Canvas, float]:
     """Make axes of equal scale around all vehicles, with the roads; returns also the axes' units a metre."""
     world = source.world
     low, high = world.area_m
@@ -145,7 +142,7 @@ def _frame(source: Source, legend_rows: int) -> tuple[Canvas, float]:
     half = np.maximum(half, (half[1] * INNER_PX / height_px, half[0] * height_px / INNER_PX))
     is_wide = 2 * half.max() > KILOMETRES_FROM_M
     scale, unit = (1e-3, "km") if is_wide else (1.0, "m")
-    made = canvas(f"east ({unit})", f"north ({unit})", legend_rows, plot_px=height_px)
+    made = canvas(f"east ({unit})", f"north ({unit})", plot_px=height_px)
     (left, bottom), (right, top) = (centre - half) * scale, (centre + half) * scale
     made.axes.set(xlim=(left, right), ylim=(bottom, top))
     made.axes.grid(visible=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 
-from emulator.pages.canvas import BLUE, CURVES, GREY, RED, canvas, legend, legend_columns
+from emulator.pages.canvas import BLUE, CURVES, GREY, RED, canvas, legend
 from emulator.records.reported import is_text
 from emulator.report.drawing import DASHES, TIME, Drawing, Line, faults_note, time_figure
 from emulator.report.source import NothingToShow, Source
@@ -99,13 +98,11 @@ def _texts(source: Source, name: str) -> Drawing:
         raise NothingToShow("nothing was reported")
     time_s = source.times_s
     drawn = texts[:MOST_TEXTS]
-    columns = legend_columns(drawn)
-    rows = math.ceil(len(drawn) / columns)
-    made = canvas(TIME, f"{title_of(name)} (% of vehicles)", rows, source.spans, source.end_s)
+    made = canvas(TIME, f"{title_of(name)} (% of vehicles)", source.spans, source.end_s)
     for index, text in enumerate(drawn):
         made.axes.plot(time_s, 100 * shares[:, index], color=CURVES[index], label=text)
     made.axes.set_ylim(0, 105)
-    legend(made, columns=columns)
+    legend(made)
     more = f" {len(texts) - MOST_TEXTS} rarer ones are not shown." if len(texts) > MOST_TEXTS else ""
     return Drawing(made, f"Share of the vehicles that report each text.{more}{faults_note(made, source)}")
 

@@ -89,7 +89,7 @@ def outcomes(source: Source) -> Drawing:
     bins = len(counts)
     share = 100 * counts / np.maximum(1, counts.sum(axis=1, keepdims=True))
     shown = [number for number, name in enumerate(names) if counts[:, number].any() and name in OUTCOME_COLOURS]
-    made = canvas(TIME, "share of receptions (%)", int(np.ceil(len(shown) / 3)), source.spans, source.end_s)
+    made = canvas(TIME, "share of receptions (%)", source.spans, source.end_s)
     edges = np.minimum(np.arange(bins + 1) * width_s, source.end_s)
     below = np.zeros(bins)
     for number in shown:
@@ -172,7 +172,7 @@ def latency(source: Source) -> Drawing:
     median, late, latest = np.percentile(latency_ms, [50, 99, 100])
     shown_ms = min(latest, 2.5 * np.percentile(latency_ms, 99.5))
     counts, edges = np.histogram(latency_ms, bins=50, range=(0, max(shown_ms * 1.02, 1e-3)))
-    made = canvas("latency (ms)", "deliveries", legend_rows=1)
+    made = canvas("latency (ms)", "deliveries")
     made.axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.8)
     made.axes.axvline(median, color=RED, linestyle=DASHES[1], label=f"median {median:.2f} ms")
     made.axes.axvline(late, color=GREEN, linestyle=DASHES[2], label=f"99 % within {late:.2f} ms")
@@ -192,7 +192,7 @@ def ages(source: Source) -> Drawing:
         "IPG: 95 %": ("inter_reception_p95_ms", SKY),
         "age: mean": ("age_mean_ms", RED),
     }
-    made = canvas("links, sorted (%)", "time (ms)", legend_rows=1)
+    made = canvas("links, sorted (%)", "time (ms)")
     drawn = []
     for (label, (name, colour)), dash in zip(lines.items(), (DASHES[0], DASHES[2], DASHES[1]), strict=True):
         values_ms = links[name].drop_null().to_numpy()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.pages.canvas import CURVES, GREY, NAVY, Canvas, canvas, legend, legend_columns
+from emulator.pages.canvas import CURVES, GREY, NAVY, Canvas, canvas, legend
 from emulator.pages.page import render, table
 from emulator.records.distributions import student_quantile
 from emulator.records.period_figures import KeyFigure, estimates_differ, figures_if_here
@@ -223,15 +223,14 @@ def _draw(rows: Rows, varied: Sequence[str], name: str, title: str) -> Drawing:
         ", ".join(f"{other.rpartition('.')[2]} {value}" for other, value in zip(others, values, strict=True))
         for values, _ in shown
     ]
-    columns = legend_columns(names)
-    made = canvas(key, title, -(-len(shown) // columns) if others else 0)
+    made = canvas(key, title)
     ticks = None if _all_numbers(rows, key) else list(dict.fromkeys(str(row[key]) for row in rows))
     for number, ((_, curve), label, colour) in enumerate(zip(shown, names, COLOURS, strict=False)):
         _draw_curve(made, curve, key, name, colour, label, ticks, number - (len(shown) - 1) / 2)
     if ticks is not None:
         made.axes.set_xticks(range(len(ticks)), ticks)
     if others:
-        legend(made, columns=columns)
+        legend(made)
     left = f" {len(curves) - len(shown)} more curves are not drawn." if len(curves) > len(shown) else ""
     return Drawing(made, f"Mean over seeds; bars: 95 % confidence interval of the mean.{left}")
 

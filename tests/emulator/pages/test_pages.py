@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import pytest
 from jinja2 import UndefinedError
 from markupsafe import Markup
 
-from emulator.pages.canvas import canvas, legend_columns, styled, to_svg
+from emulator.pages.canvas import FaultSpan, canvas, legend, styled, to_svg
 from emulator.pages.page import render, table
 from emulator.pages.text import LONGEST_TEXT, as_text, cell
 from emulator.records.verdicts import Verdict
@@ -165,6 +165,17 @@ def test_every_file_of_the_packages_is_shipped() -> None:
     assert marked == {ROOT / name for name in ("vnet", "agents", "emulator")}, "all of them have types"
 
 
-@pytest.mark.parametrize(("labels", "columns"), [("abc", 3), (["fifteen letters"] * 4, 2), (["x" * 30] * 4, 1)])
-def test_a_legend_has_as_many_columns_as_fit(labels: list[str], columns: int) -> None:
-    assert legend_columns(labels) == columns
+@pytest.mark.parametrize("labels", ["a", "abcdefg", ["fifteen letters"] * 4, ["x" * 30] * 4, ["x" * 20, "y"] * 5])
+def test_a_legend_stands_between_the_axes_and_the_edges_of_its_figure(labels: Sequence[str]) -> None:
+    with styled():
+        made = canvas("x", "y", [FaultSpan("jamming", 1.0, 2.0)], 3.0)
+        below = made.axes.get_window_extent().size
+        for label in labels:
+            made.axes.plot([0, 1], label=label)
+        legend(made)
+        made.figure.draw_without_rendering()
+    (drawn,) = made.figure.legends
+    place, whole = drawn.get_window_extent(), made.figure.bbox
+    assert place.y0 >= max(axes.get_window_extent().y1 for axes in made.figure.axes) - 0.5
+    assert place.x0 >= 0 and place.x1 <= whole.x1 and place.y1 <= whole.y1 + 0.5
+    assert made.axes.get_window_extent().size == pytest.approx(below), "the figure grows, its axes do not"
