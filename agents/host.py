@@ -669,6 +669,8 @@ class _RealTimeAgent:
     def _flush(self, final: bool = False) -> None:
         self._flush_pending = False
         traffic, again, self._said_again = self._host.take_traffic(), self._said_again, []
+        if final:  # no batch will say what a restart of the emulator has lost; who has ended twice has ended
+            again += [wire.Traffic(endings=each.endings) for each in self._said.values()]
         for name in ("notes", "unhandled", "endings") if again else ():
             parts = [getattr(each, name) for each in (*again, traffic)]
             traffic = replace(traffic, **{name: list(chain.from_iterable(parts))})

@@ -597,7 +597,7 @@ class Emulation:
         if notes or unhandled:
             self.log_book.tell(time_ns, notes, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
-            self._end(time_ns, ending)
+            self.take_end(time_ns, ending)
 
     def take_final(self, time_ns: int, traffic: Iterable[wire.Traffic], by_fault: bool = False) -> None:
         """Take what programs told as they were ended at `time_ns`; of frames, reports and endings nobody hears.
@@ -614,7 +614,8 @@ class Emulation:
             self.engine.set_positions(self.world.position_m(period))
             self._placed = period
 
-    def _end(self, time_ns: int, ending: wire.Ending) -> None:
+    def take_end(self, time_ns: int, ending: wire.Ending) -> None:
+        """Take the end of a program, of which the run hears at `time_ns`."""
         details: dict[str, Any] = {}
         if ending.error:
             details = {"how" if ending.kind == EventKind.died else "error": ending.error, "where": ending.details}
@@ -643,8 +644,9 @@ class Emulation:
     def _program_over(self, time_ns: int, node: str, kind: EventKind, details: dict[str, Any]) -> None:
         if self.presence.end(node):
             self.folder.event(time_ns, kind, node, **details)
-            self.engine.set_up(self.number[node], False)
-            self.driving.release(time_ns, node)
+            if self.ended_ns is None:
+                self.engine.set_up(self.number[node], False)
+                self.driving.release(time_ns, node)
 
     # Vehicles that programs drive.
 

@@ -88,6 +88,8 @@ class RealTime:
         self._next_period = 0
         self._origin_ns = time.monotonic_ns()
         self._collected_ns = self._taken_ns = 0
+        self._told_late: list[wire.Ending] = []
+        """Ends of programs that were told after the run, such as those that a restart of the emulator held back."""
         self.gaps = 0
 
     @property
@@ -166,6 +168,7 @@ class RealTime:
                 self._collect(now_ns - 1)  # what came before the end has arrived
             self._emulation.take(now_ns, [message.traffic])
         else:
+            self._told_late += message.traffic.endings
             self._emulation.take_final(self._emulation.duration_ns, [message.traffic])
 
     def take_answer(self, process_id: str, answer: wire.StackDump) -> None:
@@ -373,6 +376,9 @@ class RealTime:
         self._emulation.finish(self._emulation.duration_ns)
         end_ns = self._emulation.ended_ns
         assert end_ns is not None
+        for ending in self._told_late:
+            if ending.time_ns is not None and ending.time_ns < end_ns:
+                self._emulation.take_end(end_ns, ending)
         for waiting in self._unacknowledged.values():
             for sent in waiting.values():
                 self._lose(sent.deliveries)

@@ -112,12 +112,13 @@ def test_in_real_time_the_end_of_a_program_is_said_again_if_its_message_is_lost(
         for number in range(3):
             agent._take(wire.Batch([], number, [], lost=[(0, min(number, 1))]), 0)
             agent._flush()
+        agent._flush(final=True)  # nobody would say any more that it is lost
 
     asyncio.run(crashes())
     parts = [each.traffic for each in said if isinstance(each, wire.Frames) and each.traffic]
     told = [(len(each.frames), len(each.notes), [ending.error for ending in each.endings]) for each in parts]
     end = (0, 0, ["ValueError: boom"])
-    assert told == [(1, 1, []), end, (0, 1, []), end]
+    assert told == [(1, 1, []), end, (0, 1, []), end, end]
 
 
 def test_in_real_time_an_agent_speaks_as_soon_as_the_emulator_is_back_and_says_how_much_it_has_sent() -> None:

@@ -443,7 +443,8 @@ class Host:
         self._refill(self.nodes[node])
         self._active[node] = False
         self.nodes[node].radio.forget_results()
-        self._outbox.endings.append(wire.Ending(node, kind, error, details, place))  # type: ignore[arg-type]
+        ending = wire.Ending(node, kind, error, details, place, self._clock())  # type: ignore[arg-type]
+        self._outbox.endings.append(ending)
         self._on_line(node, f"{node} {kind}\n{details}".rstrip())
         for task in self._tasks_of(self.nodes[node]):
             if task is not asyncio.current_task(self._loop):

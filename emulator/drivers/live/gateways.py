@@ -283,7 +283,7 @@ class Gateways:
         elif not vehicle.commands and not vehicle.is_ready:
             self._say_hello(vehicle, failure=f"its commands have ended before they had connected: {HOW}")
         elif not vehicle.commands:
-            vehicle.outbox.endings.append(wire.Ending(node, "finished"))
+            vehicle.outbox.endings.append(wire.Ending(node, "finished", time_ns=self._now_ns()))
             self._flush_soon(vehicle)
         return True
 
@@ -298,7 +298,8 @@ class Gateways:
         except (OSError, msgspec.MsgspecError):
             return None
         error = f"ProgramError: {words} ended with {told['status']}" if told["status"] else told["error"]
-        return wire.Ending(vehicle.gateway.node_id, "crashed", error, told["details"], told["place"])
+        node = vehicle.gateway.node_id
+        return wire.Ending(node, "crashed", error, told["details"], told["place"], self._now_ns())
 
     async def _end(self, node: str) -> None:
         await self._wait_or_kill(self.detach(node))

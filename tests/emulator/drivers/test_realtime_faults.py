@@ -130,6 +130,19 @@ def test_what_came_before_a_program_ended_has_arrived_on_a_machine_that_is_late(
     assert len(emulation.metrics.metrics_table()) == periods
 
 
+def test_a_program_that_ended_within_the_run_has_ended_though_that_is_told_after_it() -> None:
+    """Its message was lost with a restart of the emulator; one that ends as the run does has ended by then."""
+    realtime, emulation = started(radio={"loss": 0.0, "range_m": 1e6})
+    end_ns = emulation.duration_ns
+    realtime.receive(10 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v02", b"x")])))
+    for node, time_ns in (("v01", end_ns - 1), ("v02", end_ns), ("v01", end_ns - 1)):
+        traffic = wire.Traffic(endings=[wire.Ending(node, "crashed", "boom", time_ns=time_ns)])
+        realtime.receive(end_ns + MS, node, wire.Frames(b"n", 1, 1, [], traffic, final=True))
+    realtime.finish()
+    assert [each.node for each in emulation.folder.events if each.kind == "crashed"] == ["v01"]
+    assert not emulation.engine.counts[Outcome.receiver_down], "what it was sent before counts as before"
+
+
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:
     return [(c.offset_ns, c.rate) for c in batches[node].clocks] if node in batches else []
 

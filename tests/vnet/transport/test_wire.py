@@ -38,7 +38,9 @@ reports = st.builds(
 frames = st.builds(SentFrame, names, st.binary(max_size=64), powers, powers, st.none() | names, times)
 results = st.lists(st.builds(WireSendResult, names, times, times, st.booleans(), times), max_size=2)
 actions = st.builds(Action, names, st.none() | st.floats(-1e6, 1e6), st.integers(-1, 1))
-endings = st.builds(wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names)
+endings = st.builds(
+    wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names, time_ns=st.none() | times
+)
 unhandled = st.builds(wire.Unhandled, names, st.none() | times, names, names, names)
 notes = st.builds(
     wire.Note,
