@@ -315,6 +315,7 @@ class Host:
             for task in asyncio_internals.abandon_pending(self._tasks_of(gone)):
                 self._context_of(gone).run(self._discard, task)
             self._killed[gone] = asyncio_internals.abandon_pending(self._tasks_of(gone))
+            self._disks.release(gone.id)
         self._stopped_ns.clear()
         self._hold()
 
@@ -712,7 +713,7 @@ class Disks:
         return folder
 
     def release(self, node: str) -> None:
-        """Release what a killed program holds open on its disk, unflushed and unlocked, as a system does.
+        """Release what a program that was ended holds open on its disk, unflushed and unlocked, as a system does.
 
         What it has left in buffers goes nowhere, and an open transaction of SQLite is rolled back.
         """

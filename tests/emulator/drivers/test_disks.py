@@ -80,8 +80,10 @@ async def holds_its_disk(node: Node) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
-def test_what_was_killed_holds_nothing_and_writes_no_more() -> None:
-    emulation = run_together(scenario_of(FAULTS[:1], f"{__name__}:holds_its_disk", vehicles=1))
+@pytest.mark.parametrize("kind", ["kill", "restart"])
+def test_what_was_ended_holds_nothing_and_writes_no_more(kind: str) -> None:
+    ended = FAULTS[0] | {"kind": kind}
+    emulation = run_together(scenario_of([ended], f"{__name__}:holds_its_disk", vehicles=1))
     concluded(emulation)
     gc.collect()  # while nobody minds files that were not closed
     assert not [event for event in emulation.folder.events if event.kind == "crashed"]
