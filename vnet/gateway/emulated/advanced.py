@@ -36,6 +36,7 @@ from vnet.gateway.emulated.values import (
     ZenohId,
     check,
     key_of,
+    unix_ns_of,
 )
 from vnet.runtime.own_asyncio import Task
 from vnet.units import NS_PER_S
@@ -243,11 +244,7 @@ def _start_of(text: str | None, unix_ns: int) -> int | None:
 
 
 def _is_since(sample: Sample, since_ns: int | None) -> bool:
-    return since_ns is None or sample.timestamp is None or _time_ns(sample.timestamp) >= since_ns
-
-
-def _time_ns(stamp: zenoh.Timestamp) -> int:
-    return stamp.get_time_as_ntp64().as_nanos()
+    return since_ns is None or sample.timestamp is None or unix_ns_of(sample.timestamp) >= since_ns
 
 
 class _Source:
@@ -358,7 +355,7 @@ class AdvancedSubscriber(Subscriber):
         if sample.source_info is not None:
             source, place = self._source(sample.source_info.source_id), sample.source_info.source_sn
         elif sample.timestamp is not None:
-            source, place = self._source(bytes(sample.timestamp.get_id())), _time_ns(sample.timestamp)
+            source, place = self._source(bytes(sample.timestamp.get_id())), unix_ns_of(sample.timestamp)
         else:
             self._sink.push(sample)
             return

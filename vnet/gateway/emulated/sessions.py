@@ -598,7 +598,8 @@ class Session(Ending):
             attachment=bytes_or_none(attachment),
             **{name: value for name, value in options.items() if value is not None},
         )
-        self.vehicle.put(self.inner, sample, allowed_destination != REMOTE, allowed_destination != LOCAL)
+        told = self.vehicle.stamped(sample, self._zid) if self.stamps else sample
+        self.vehicle.put(self.inner, told, allowed_destination != REMOTE, allowed_destination != LOCAL)
         return sample
 
     def get(self, selector: Any, handler: Any = None, **options: Any) -> Any:

@@ -307,6 +307,11 @@ def timestamp_at(unix_ns: int, zid: ZenohId) -> zenoh.Timestamp:
     return zenoh.Timestamp(zenoh.NTP64(*divmod(unix_ns, NS_PER_S)), bytes(zid))
 
 
+def unix_ns_of(stamp: zenoh.Timestamp) -> int:
+    """Return the instant of a timestamp."""
+    return stamp.get_time_as_ntp64().as_nanos()
+
+
 PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
 NOTHING = zenoh.ZBytes(b"")
 NO_ENCODING = zenoh.Encoding.ZENOH_BYTES

@@ -35,6 +35,7 @@ from vnet.gateway.emulated.values import (
     sample_of,
     timestamp_at,
     token_sample,
+    unix_ns_of,
 )
 from vnet.gateway.frames import (
     CrossingQuery,
@@ -54,6 +55,10 @@ from vnet.node import Node
 from vnet.radio import Packet
 from vnet.runtime.own_asyncio import Task
 from vnet.runtime.virtual_time import VirtualTimeLoop
+from vnet.units import NS_PER_S
+
+MOST_AHEAD_NS = NS_PER_S // 2
+"""How far ahead of its clock Zenoh believes a timestamp (`delta` of uhlc, its hybrid logical clock)."""
 
 
 class Vehicle(RadioSide[Asking]):
@@ -103,9 +108,17 @@ class Vehicle(RadioSide[Asking]):
         return self._loop.now_ns
 
     def new_timestamp(self, zid: ZenohId) -> zenoh.Timestamp:
-        """Return the present time by the vehicle's clock; later than all before it, as Zenoh's clock promises."""
+        """Return the present time by the vehicle's clock; later than all made or heard, as Zenoh promises."""
         self._stamped_ns = max(EPOCH_NS + self.node.now_ns, self._stamped_ns + 1)
         return timestamp_at(self._stamped_ns, zid)
+
+    def stamped(self, sample: Sample, zid: ZenohId) -> Sample:
+        """Return a sample with a time: a new one if it has none or one too far ahead; later ones follow it."""
+        stamp = sample.timestamp
+        if stamp is not None and (stamp_ns := unix_ns_of(stamp)) <= EPOCH_NS + self.node.now_ns + MOST_AHEAD_NS:
+            self._stamped_ns = max(self._stamped_ns, stamp_ns)
+            return sample
+        return msgspec.structs.replace(sample, timestamp=self.new_timestamp(zid))
 
     # Entities come and go.
 
@@ -167,8 +180,8 @@ class Vehicle(RadioSide[Asking]):
         matching = self._subscribers_of(key)
         if to_others:
             stamped = sample
-            if sample.timestamp is None and sample.kind == PUT:  # as routers do
-                stamped = msgspec.structs.replace(sample, timestamp=self.new_timestamp(self.zid))
+            if sample.timestamp is not None or sample.kind == PUT:  # as routers do
+                stamped = self.stamped(sample, self.zid)
             if self.crosses(key):
                 # Also a delete: by the radio Zenoh's routers would give it a later one, of the receiver's.
                 self._send(crossing_sample(stamped, stamped.timestamp or self.new_timestamp(self.zid)))
@@ -349,7 +362,7 @@ class Vehicle(RadioSide[Asking]):
             self.node.log(f"a frame of {packet.sender} is no sample: {error}", "debug")
 
     def _show(self, sample: CrossingSample) -> None:
-        shown = sample_of(sample)
+        shown = self.stamped(sample_of(sample), self.zid)
         for entity in self._subscribers_of(sample.key):
             if entity.is_remote:
                 entity.arrive(shown)
