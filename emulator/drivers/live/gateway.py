@@ -11,11 +11,14 @@ import json
 import os
 import re
 import ssl
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, TypeVar
 
 import zenoh
@@ -44,6 +47,15 @@ MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
 MOST_TOKENS = 2**16
 """Tokens that are read at once: Zenoh gives them within the call, which would wait for itself."""
+DROPS_AFTER_US = 1_000_000
+"""Time (µs) for which the router waits for programs that do not read before it drops a sample that may be dropped.
+
+Zenoh's own 1 ms is less than what a vehicle takes to read what came while it was paused.
+"""
+MOST_WAITING = 10_000
+"""Samples, queries and replies that wait for the programs of a vehicle, beyond which they are dropped."""
+SLOW_S = 0.5
+"""Time that Zenoh waits for a program, from which on that is told."""
 ANY_HOST = "0.0.0.0"
 """Host of endpoints that listen at each address: the system says at which one commands connect."""
 OTHER_HOST = (62, 64)
@@ -63,7 +75,9 @@ class Gateway(RadioSide[zenoh.Query]):
 
     `keys` cross the radio. `hear` takes on any thread "gateway", what programs do ("message", "query", "token",
     "session", "report"), and the gateway with what belongs to it: `take` then takes that on the run's loop.
-    It is told of a "bug", too, an exception on a thread of Zenoh's, which would only print it.
+    It is told of a "bug", too, an exception on a thread of Zenoh's, which would only print it, and of a "note".
+
+    Programs are given what they hear on a thread of its own, in order: Zenoh waits for those who do not read.
     """
 
     def __init__(
@@ -79,6 +93,9 @@ class Gateway(RadioSide[zenoh.Query]):
         self._settings, self._tell_run = settings, hear
         self.is_paused = False
         self._session: zenoh.Session | None = None
+        self._calls = SimpleQueue[Callable[[], object] | None]()
+        """What is put at the programs; None at the end."""
+        self._has_overflown = False
         self._watches: list[Any] = []
         self._declared: dict[str, zenoh.LivelinessToken] = {}
         """Tokens of other vehicles, which are declared at this one's programs.
@@ -96,7 +113,8 @@ class Gateway(RadioSide[zenoh.Query]):
         For a thread of its own: it takes a while.
         """
         session = open_local_router(listen, self._router_settings())
-        self._session = session
+        self._session, self._calls = session, SimpleQueue()
+        Thread(target=self._give, args=(session, self._calls), name=f"to {self.node_id}", daemon=True).start()
         endpoint = router_endpoint(session)
         for number, key in enumerate(self._keys):
             session.declare_subscriber(key, self._telling(partial(self._put, number)), allowed_origin=REMOTE)
@@ -114,8 +132,9 @@ class Gateway(RadioSide[zenoh.Query]):
         return endpoint
 
     def _router_settings(self) -> dict[str, Any]:
-        """Return what the router's transport needs for certificates and users."""
-        link: dict[str, Any] = {}
+        """Return what the router's transport needs for certificates and users, and for those who do not read."""
+        drop = dict.fromkeys(("wait_before_drop", "max_wait_before_drop_fragments"), DROPS_AFTER_US)
+        link: dict[str, Any] = {"tx": {"queue": {"congestion_control": {"drop": drop}}}}
         settings = self._settings
         if settings.certificate is not None:
             link["tls"] = {
@@ -123,7 +142,7 @@ class Gateway(RadioSide[zenoh.Query]):
                 "listen_private_key": str(settings.private_key),
             }
         auth = {} if settings.users is None else {"auth": {"usrpwd": {"dictionary_file": str(settings.users)}}}
-        return {**({"link": link} if link else {}), **auth}
+        return {"link": link, **auth}
 
     # Threads of Zenoh's.
 
@@ -168,11 +187,40 @@ class Gateway(RadioSide[zenoh.Query]):
     def _connected(self, event: zenoh.TransportEvent) -> None:
         self._tell("session", (session_name(event.transport), event.kind == zenoh.SampleKind.PUT))
 
+    # A thread of its own.
+
+    def _give(self, session: zenoh.Session, calls: SimpleQueue[Callable[[], object] | None]) -> None:
+        """Put at the programs what has been decided on the run's loop, until that closes the router."""
+        while (call := calls.get()) is not None:
+            began_s = time.monotonic()
+            try:
+                call()
+            except zenoh.ZError as error:  # of a reply that a fault has changed
+                if self._session is session:
+                    self._tell("note", ("debug", f"cannot be given to the programs: {error}"))
+            except Exception as error:
+                self._tell("bug", error)
+            if (waited_s := time.monotonic() - began_s) >= SLOW_S:
+                text = f"programs do not take what arrives: Zenoh has waited for {waited_s:.1f} s"
+                self._tell("note", ("warning", text))
+
     # The run's loop.
+
+    def _call(self, call: Callable[[], object]) -> None:
+        """Have something put at the programs, after all that was before."""
+        if self._calls.qsize() < MOST_WAITING:
+            self._calls.put(call)
+        elif not self._has_overflown:
+            self._has_overflown = True
+            text = (
+                f"programs do not take what arrives: beyond {MOST_WAITING:,} samples that wait, others are dropped"
+            )
+            self._tell("note", ("warning", text))
 
     async def close(self) -> None:
         """Close the router, with all that is connected to it."""
         session, self._session = self._session, None
+        self._calls.put(None)
         self._declared, self._watches = {}, []
         self._told = {}
         self._tokens.clear()  # nobody tells of those that end while there is no router, and of sessions
@@ -206,7 +254,7 @@ class Gateway(RadioSide[zenoh.Query]):
             super()._end(numbers)
 
     def _conclude(self, query: zenoh.Query) -> None:
-        query.drop()  # type: ignore[no-untyped-call]
+        self._call(query.drop)
 
     def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
         """Take a token that has appeared or is gone.
@@ -247,15 +295,16 @@ class Gateway(RadioSide[zenoh.Query]):
 
     def _publish(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
         if self._session is not None:
-            self._session.put(key, payload, attachment=attachment, allowed_destination=REMOTE)
+            self._call(partial(self._session.put, key, payload, attachment=attachment, allowed_destination=REMOTE))
 
     def _show(self, sample: CrossingSample) -> None:
         assert self._session is not None
+        key = zenoh.KeyExpr(sample.key)  # a fault may have changed it
         options = {**sample_options(sample), "source_info": _known_source(sample), "allowed_destination": REMOTE}
         if sample.is_delete:
-            self._session.delete(sample.key, **options)
+            self._call(partial(self._session.delete, key, **options))
         else:
-            self._session.put(sample.key, sample.payload, encoding=sample.encoding, **options)
+            self._call(partial(self._session.put, key, sample.payload, encoding=sample.encoding, **options))
 
     def _answer(self, asker: str, query: CrossingQuery) -> None:
         assert self._session is not None
@@ -265,8 +314,9 @@ class Gateway(RadioSide[zenoh.Query]):
                 _keep_publisher(reply.ok)
                 self._tell("message", crossing_reply(asker, query, reply))
 
-        self._session.get(
-            query.selector,
+        asked = partial(
+            self._session.get,
+            zenoh.Selector(query.selector),
             self._telling(answered),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
@@ -276,11 +326,12 @@ class Gateway(RadioSide[zenoh.Query]):
             attachment=query.attachment,
             allowed_destination=REMOTE,
         )
+        self._call(asked)
 
     def _reply(self, query: zenoh.Query, answer: CrossingReply) -> None:
         if answer.sample is None:
             content, encoding = answer.error or (b"", "")
-            query.reply_err(content, encoding=encoding)
+            self._call(partial(query.reply_err, content, encoding=encoding))
             return
         sample, options = answer.sample, sample_options(answer.sample)
         if _known_source(sample) is not None:  # which Python cannot give a reply, and advanced subscribers need
@@ -288,9 +339,9 @@ class Gateway(RadioSide[zenoh.Query]):
             return
         kept = {name: options[name] for name in ("attachment", "express", "timestamp")}
         if sample.is_delete:
-            query.reply_del(sample.key, **kept)
+            self._call(partial(query.reply_del, sample.key, **kept))
         else:
-            query.reply(sample.key, sample.payload, encoding=sample.encoding, **kept)
+            self._call(partial(query.reply, sample.key, sample.payload, encoding=sample.encoding, **kept))
 
     def _show_token(self, key: str, is_there: bool) -> None:
         """Declare a token of another vehicle at the programs, or take it back."""

@@ -479,6 +479,8 @@ class Gateways:
             return
         if what == "report":
             self._take_report(vehicle, told)
+        elif what == "note":
+            self._note(vehicle, *told)
         elif what in ("query", "message"):
             key = getattr(told, "key", told)  # each query is kept
             vehicle.replaced += vehicle.early.pop(key, None) is not None

@@ -142,6 +142,28 @@ def two_vehicles(
     return of
 
 
+@pytest.mark.parametrize("congestion", ["DROP", "BLOCK"])
+def test_who_reads_late_has_everything_and_nobody_waits_for_him(congestion: str) -> None:
+    """As after a pause: Zenoh waits for those who do not read, and drops after 1 ms what may be dropped."""
+    count, option = 300, getattr(zenoh.CongestionControl, congestion)
+
+    @two_vehicles(max_payload=100_000)
+    async def test(vehicles: list[Vehicle], sessions: list[zenoh.Session]) -> None:
+        late, heard = sessions[1].declare_subscriber("k", zenoh.handlers.FifoChannel(1)), vehicles[1].gateway.hear
+        settle(sessions[1])
+        vehicles[0].is_lost = lambda number: True
+        sessions[0].put("k", bytes(50_000), congestion_control=option)
+        while not vehicles[0].frames:
+            await asyncio.sleep(0)
+        for _ in range(count):
+            heard("v01", vehicles[0].frames[0], 0)
+        assert (
+            await asyncio.to_thread(lambda: sum(len(late.recv().payload) for _ in range(count))) == 50_000 * count
+        )
+
+    test()
+
+
 @two_vehicles()
 async def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody(
     vehicles: list[Vehicle], sessions: list[zenoh.Session]
