@@ -15,12 +15,22 @@ import zenoh
 
 from emulator.drivers.agent_keys import AgentKeys, Hear, hear_payloads, hear_tokens
 from emulator.drivers.router import SeparateRouter
+from emulator.scenario.scenario import Scenario
 from emulator.viewer.sinks import Sinks
 from vnet.errors import TransportError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.transport import keys, wire
 from vnet.transport.access import EMULATOR, Access
 from vnet.transport.session import open_client, open_router, router_endpoint
+
+LEASE_MS = 60_000
+"""Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
+
+
+def lease_ms(scenario: Scenario) -> int:
+    """Return the milliseconds without a message after which a connection ends; a planned pause must not end it."""
+    pauses_s = [fault.duration_s for fault in scenario.fault if fault.kind == "pause"]
+    return LEASE_MS + round(1000 * max(pauses_s, default=0.0))
 
 
 @dataclass(frozen=True)

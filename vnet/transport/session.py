@@ -161,7 +161,12 @@ def quiet_zenoh() -> None:
 
 def _queues(lease_ms: int) -> dict[str, Any]:
     """Return the leases, and queues as long as Zenoh allows: in real time messages to a full queue are dropped."""
-    return {"tx": {"lease": lease_ms, "keep_alive": 4, "queue": {"size": {"data": 16}}}}
+    return {"tx": {**lease_settings(lease_ms), "queue": {"size": {"data": 16}}}}
+
+
+def lease_settings(lease_ms: int) -> dict[str, Any]:
+    """Return the settings of a connection that its peer may leave without a message for so many milliseconds."""
+    return {"lease": lease_ms, "keep_alive": 4}
 
 
 def _identification(identity: Identity | None) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from emulator.drivers.agent_keys import Hear
+from emulator.drivers.attachment import LEASE_MS
 from emulator.scenario.program import Program, ZenohSessions
 from vnet.errors import ProgramError, shown
 from vnet.gateway import STARTUP, client_config, session_variables
@@ -41,7 +42,7 @@ from vnet.gateway.frames import (
 from vnet.gateway.keys import REPORT_KEY
 from vnet.gateway.radio_side import RadioSide
 from vnet.gateway.ros2 import Ros2
-from vnet.transport.session import open_local_router, router_endpoint
+from vnet.transport.session import lease_settings, open_local_router, router_endpoint
 
 MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
@@ -88,9 +89,10 @@ class Gateway(RadioSide[zenoh.Query]):
         settings: ZenohSessions,
         hear: Hear,
         ros2: Ros2 | None = None,
+        lease_ms: int = LEASE_MS,
     ) -> None:
         super().__init__(node, incarnation, keys, settings.query_s, settings.liveliness_s, ros2)
-        self._settings, self._tell_run = settings, hear
+        self._settings, self._tell_run, self._lease_ms = settings, hear, lease_ms
         self.is_paused = False
         self._session: zenoh.Session | None = None
         self._calls = SimpleQueue[Callable[[], object] | None]()
@@ -134,7 +136,8 @@ class Gateway(RadioSide[zenoh.Query]):
     def _router_settings(self) -> dict[str, Any]:
         """Return what the router's transport needs for certificates and users, and for those who do not read."""
         drop = dict.fromkeys(("wait_before_drop", "max_wait_before_drop_fragments"), DROPS_AFTER_US)
-        link: dict[str, Any] = {"tx": {"queue": {"congestion_control": {"drop": drop}}}}
+        queue = {"congestion_control": {"drop": drop}}
+        link: dict[str, Any] = {"tx": {**lease_settings(self._lease_ms), "queue": queue}}
         settings = self._settings
         if settings.certificate is not None:
             link["tls"] = {
@@ -372,7 +375,12 @@ def is_peer(name: str) -> bool:
 
 
 def session_environment(
-    node: str, endpoint: str, program: Program, folder: Path, inherited: Mapping[str, str]
+    node: str,
+    endpoint: str,
+    program: Program,
+    folder: Path,
+    inherited: Mapping[str, str],
+    lease_ms: int = LEASE_MS,
 ) -> dict[str, str]:
     """Return the environment in which an unmodified program connects to its vehicle's router alone.
 
@@ -380,14 +388,13 @@ def session_environment(
     """
     settings = program.sessions
     client = client_config(endpoint)
-    transport: dict[str, Any] = {}
+    link: dict[str, Any] = {"tx": lease_settings(lease_ms)}  # the router ends who is paused for longer
+    client["transport"] = transport = {"link": link}
     if settings.authority is not None:
-        transport["link"] = {"tls": {"root_ca_certificate": str(settings.authority)}}
+        link["tls"] = {"root_ca_certificate": str(settings.authority)}
     if settings.users is not None:
         user, password = next(iter(read_users(settings.users).items()))
         transport["auth"] = {"usrpwd": {"user": user, "password": password}}
-    if transport:
-        client["transport"] = transport
     path = folder / f"{node}.json5"
     path.write_text(json.dumps(client))
     path.chmod(0o600)

@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 from msgspec.structs import replace
 
-from emulator.drivers.attachment import Attachment, LiveOptions
+from emulator.drivers.attachment import Attachment, LiveOptions, lease_ms
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.join import Membership, split_into_processes
 from emulator.drivers.launch import Exit, Launcher
@@ -38,8 +38,6 @@ from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, host_user
 from vnet.transport.wire import Contents, MessageRef, SentMessage, refs_of
 
-LEASE_MS = 60_000
-"""Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
 RECORDER = "recorder"
 RECORDER_POLL_S = 0.05
 """Seconds between two looks whether the recorder listens: nothing tells of it."""
@@ -104,7 +102,7 @@ class LiveProcesses(Processes):
         self.members = Membership(node_ids, later, emulation.world.has_traffic)
         has_gateways = emulation.scenario.has_gateways
         self.attachment = attach(
-            options, node_ids, _lease_ms(emulation), self._realtime, self.hear, not has_gateways
+            options, node_ids, lease_ms(emulation.scenario), self._realtime, self.hear, not has_gateways
         )
         self.fleet = self._make_fleet() if options.access.hosts else None
         self.gateways = self._make_gateways() if has_gateways else None
@@ -716,9 +714,3 @@ async def to_its_end(work: Coroutine[Any, Any, None]) -> bool:
             cancelled = True
     task.result()
     return cancelled
-
-
-def _lease_ms(emulation: Emulation) -> int:
-    """Milliseconds without a message after which a connection ends; a planned pause must not end it."""
-    pauses_s = [fault.duration_s for fault in emulation.scenario.fault if fault.kind == "pause"]
-    return LEASE_MS + round(1000 * max(pauses_s, default=0.0))

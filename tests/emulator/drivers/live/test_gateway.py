@@ -26,8 +26,10 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import NameOID
 
+from emulator.drivers.attachment import lease_ms
 from emulator.drivers.live.gateway import Gateway, check_trust, read_users, session_environment
 from emulator.scenario.program import Program, ZenohSessions
+from tests.support.multi_loop_driver import scenario_of
 from vnet.errors import ProgramError
 from vnet.gateway.frames import CrossingReply, CrossingTokens, Fragments
 from vnet.gateway.keys import FIX_KEY, RADIO_KEYS, REPORT_KEY, check_keys
@@ -659,6 +661,17 @@ def test_users_are_those_whom_zenoh_reads(tmp_path: Path) -> None:
     path = tmp_path / "users"
     path.write_bytes(b"\n car : a:b \r\nbus:c\ncar:d")
     assert read_users(path) == {"car": "d", "bus": "c"}
+
+
+def test_neither_a_program_nor_its_router_ends_what_a_planned_pause_silences(tmp_path: Path) -> None:
+    """Each tells the other after how long it may be taken for dead, which is 10 s with Zenoh."""
+    pause = {"kind": "pause", "at_s": 1.0, "duration_s": 600.0}
+    lease = lease_ms(scenario_of([pause], "agents.beacon:main", run={"duration_s": 700.0}))
+    gateway = Gateway("v01", 0, RADIO_KEYS, QUIET, lambda *_: None, None, lease)
+    environment = session_environment("v01", "tcp/127.0.0.1:7447", Program(), tmp_path, {}, lease)
+    program = zenoh.Config.from_file(environment["ZENOH_CONFIG"])
+    told_ms = [gateway._router_settings()["link"]["tx"]["lease"], int(program.get_json("transport/link/tx/lease"))]
+    assert min(told_ms) > 600_000
 
 
 def test_commands_find_modules_in_the_folders_of_the_program(tmp_path: Path) -> None:
