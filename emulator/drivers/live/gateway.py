@@ -12,13 +12,13 @@ import os
 import re
 import ssl
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Thread
+from threading import Lock, Thread, current_thread
 from typing import Any, TypeVar
 
 import zenoh
@@ -55,8 +55,10 @@ Zenoh's own 1 ms is less than what a vehicle takes to read what came while it wa
 """
 MOST_WAITING = 10_000
 """Samples, queries and replies that wait for the programs of a vehicle, beyond which they are dropped."""
+WAITS_S = 0.02
+"""Time that Zenoh waits for a program, from which on others are given theirs by another thread."""
 SLOW_S = 0.5
-"""Time that Zenoh waits for a program, from which on that is told."""
+"""The same, from which on it is told."""
 ANY_HOST = "0.0.0.0"
 """Host of endpoints that listen at each address: the system says at which one commands connect."""
 OTHER_HOST = (62, 64)
@@ -78,7 +80,7 @@ class Gateway(RadioSide[zenoh.Query]):
     "session", "report"), and the gateway with what belongs to it: `take` then takes that on the run's loop.
     It is told of a "bug", too, an exception on a thread of Zenoh's, which would only print it, and of a "note".
 
-    Programs are given what they hear on a thread of its own, in order: Zenoh waits for those who do not read.
+    Programs are given what they hear by a `giver`, in order: Zenoh waits for those who do not read.
     """
 
     def __init__(
@@ -90,14 +92,13 @@ class Gateway(RadioSide[zenoh.Query]):
         hear: Hear,
         ros2: Ros2 | None = None,
         lease_ms: int = LEASE_MS,
+        giver: Giver | None = None,
     ) -> None:
         super().__init__(node, incarnation, keys, settings.query_s, settings.liveliness_s, ros2)
         self._settings, self._tell_run, self._lease_ms = settings, hear, lease_ms
+        self._giver = Giver() if giver is None else giver
         self.is_paused = False
         self._session: zenoh.Session | None = None
-        self._calls = SimpleQueue[Callable[[], object] | None]()
-        """What is put at the programs; None at the end."""
-        self._has_overflown = False
         self._watches: list[Any] = []
         self._declared: dict[str, zenoh.LivelinessToken] = {}
         """Tokens of other vehicles, which are declared at this one's programs.
@@ -115,8 +116,7 @@ class Gateway(RadioSide[zenoh.Query]):
         For a thread of its own: it takes a while.
         """
         session = open_local_router(listen, self._router_settings())
-        self._session, self._calls = session, SimpleQueue()
-        Thread(target=self._give, args=(session, self._calls), name=f"to {self.node_id}", daemon=True).start()
+        self._session = session
         endpoint = router_endpoint(session)
         for number, key in enumerate(self._keys):
             session.declare_subscriber(key, self._telling(partial(self._put, number)), allowed_origin=REMOTE)
@@ -190,40 +190,37 @@ class Gateway(RadioSide[zenoh.Query]):
     def _connected(self, event: zenoh.TransportEvent) -> None:
         self._tell("session", (session_name(event.transport), event.kind == zenoh.SampleKind.PUT))
 
-    # A thread of its own.
+    # Threads of the giver's.
 
-    def _give(self, session: zenoh.Session, calls: SimpleQueue[Callable[[], object] | None]) -> None:
-        """Put at the programs what has been decided on the run's loop, until that closes the router."""
-        while (call := calls.get()) is not None:
-            began_s = time.monotonic()
-            try:
-                call()
-            except zenoh.ZError as error:  # of a reply that a fault has changed
-                if self._session is session:
-                    self._tell("note", ("debug", f"cannot be given to the programs: {error}"))
-            except Exception as error:
-                self._tell("bug", error)
-            if (waited_s := time.monotonic() - began_s) >= SLOW_S:
-                text = f"programs do not take what arrives: Zenoh has waited for {waited_s:.1f} s"
-                self._tell("note", ("warning", text))
+    def give(self, session: zenoh.Session, call: Callable[[], object]) -> None:
+        """Put at the programs what has been decided on the run's loop, while the router is the same."""
+        if self._session is not session:
+            return
+        began_s = time.monotonic()
+        try:
+            call()
+        except zenoh.ZError as error:  # of a reply that a fault has changed, or as the router was closed
+            if self._session is session:
+                self._tell("note", ("debug", f"cannot be given to the programs: {error}"))
+        except Exception as error:
+            self._tell("bug", error)
+        if (waited_s := time.monotonic() - began_s) >= SLOW_S:
+            self.warn(f"Zenoh has waited for {waited_s:.1f} s")
+
+    def warn(self, what: str) -> None:
+        """Tell of programs that do not read."""
+        self._tell("note", ("warning", f"programs do not take what arrives: {what}"))
 
     # The run's loop.
 
     def _call(self, call: Callable[[], object]) -> None:
         """Have something put at the programs, after all that was before."""
-        if self._calls.qsize() < MOST_WAITING:
-            self._calls.put(call)
-        elif not self._has_overflown:
-            self._has_overflown = True
-            text = (
-                f"programs do not take what arrives: beyond {MOST_WAITING:,} samples that wait, others are dropped"
-            )
-            self._tell("note", ("warning", text))
+        assert self._session is not None
+        self._giver.take(self, partial(self.give, self._session, call))
 
     async def close(self) -> None:
         """Close the router, with all that is connected to it."""
         session, self._session = self._session, None
-        self._calls.put(None)
         self._declared, self._watches = {}, []
         self._told = {}
         self._tokens.clear()  # nobody tells of those that end while there is no router, and of sessions
@@ -257,7 +254,8 @@ class Gateway(RadioSide[zenoh.Query]):
             super()._end(numbers)
 
     def _conclude(self, query: zenoh.Query) -> None:
-        self._call(query.drop)
+        if self._session is not None:
+            self._call(query.drop)
 
     def _take_token(self, key: str, is_there: bool) -> CrossingTokens | None:
         """Take a token that has appeared or is gone.
@@ -362,6 +360,66 @@ class Gateway(RadioSide[zenoh.Query]):
             self._declared.pop(key).undeclare()  # type: ignore[no-untyped-call]
             if self._is_alive(key):
                 self._tokens.add(key)
+
+
+class Giver:
+    """Gives programs what they hear, on a thread beside the run's loop, in order at each gateway.
+
+    Zenoh waits for who does not read, up to 5 s. A thread that waits goes on with that gateway alone, and another
+    takes the others.
+    """
+
+    def __init__(self) -> None:
+        self._calls = SimpleQueue[tuple[Gateway, Callable[[], object]] | None]()
+        self._lock = Lock()
+        self._thread: Thread | None = None
+        self._busy: tuple[Gateway, float] | None = None
+        """The gateway at which the thread is, and since when (s)."""
+        self._alone: dict[Gateway, deque[Callable[[], object]]] = {}
+        """What waits for gateways that have a thread of their own."""
+
+    def take(self, gateway: Gateway, call: Callable[[], object]) -> None:
+        """Have a gateway's call made soon."""
+        self._calls.put((gateway, call))
+        with self._lock:
+            if self._thread is not None:
+                if self._busy is None or time.monotonic() - self._busy[1] < WAITS_S:
+                    return
+                self._alone[self._busy[0]] = deque()
+            self._busy, self._thread = None, Thread(target=self._run, name="giver", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """End the thread once all that was before is done."""
+        self._calls.put(None)
+
+    def _run(self) -> None:
+        while (item := self._calls.get()) is not None:
+            gateway, call = item
+            with self._lock:
+                waiting = self._alone.get(gateway)
+                if waiting is None:
+                    self._busy = gateway, time.monotonic()
+                elif len(waiting) < MOST_WAITING:
+                    waiting.append(call)
+                elif len(waiting) == MOST_WAITING:
+                    waiting.append(partial(gateway.warn, f"of {MOST_WAITING:,} that wait, later ones were dropped"))
+            if waiting is not None:
+                continue
+            call()
+            with self._lock:
+                if self._thread is not current_thread():
+                    break
+                self._busy = None
+        else:
+            return
+        while True:
+            with self._lock:
+                if not self._alone[gateway]:
+                    del self._alone[gateway]
+                    return
+                call = self._alone[gateway].popleft()
+            call()
 
 
 def session_name(session: zenoh.Transport | zenoh.Hello) -> str:

@@ -32,6 +32,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import Exit, Launcher
 from emulator.drivers.live.gateway import (
     Gateway,
+    Giver,
     check_trust,
     is_peer,
     read_users,
@@ -62,6 +63,8 @@ BY_HAND = f"{ENDPOINTS} in the run's folder has all endpoints, for Zenoh 1"
 """Hints for those whose program does not connect: started by vnet, or by hand."""
 _ESTABLISHED = "01"
 """State of a connection in proc_net(5)."""
+SWITCH_S = 0.001
+"""Time after which a thread lets another one run, Python's 5 ms else: what programs put and hear is on others."""
 TURNS_S = 0.1
 """Seconds over which vehicles begin, one after another, what all of them do: at one instant it would be late."""
 
@@ -125,6 +128,8 @@ class Gateways:
         self._check(emulation.world.node_ids)
         self._folder = tempfile.TemporaryDirectory(prefix="vnet-")
         self._vehicles: dict[str, _Vehicle] = {}
+        self._giver, self._switch_s = Giver(), sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
         self._numbers = count(1)
         self._closing: dict[str, asyncio.Task[None]] = {}
         """Gateways that are being closed, whose endpoints the next of their vehicles needs."""
@@ -181,7 +186,9 @@ class Gateways:
         for (node,) in groups:
             rules = None if self._ros2 is None else Ros2(node, self._ros2.inside, self._ros2.domain)
             keys, incarnation = self._emulation.scenario.radio.keys, self._emulation.incarnation[node]
-            gateway = Gateway(node, incarnation, keys, self._settings, self._hear, rules, self._lease_ms)
+            gateway = Gateway(
+                node, incarnation, keys, self._settings, self._hear, rules, self._lease_ms, self._giver
+            )
             vehicle = self._vehicles[node] = _Vehicle(next(self._numbers), gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 
@@ -355,6 +362,8 @@ class Gateways:
             task.cancel()
         await asyncio.gather(*waits, *self._closing.values(), *self._tasks, return_exceptions=True)
         self._stop_scouting()
+        self._giver.close()
+        sys.setswitchinterval(self._switch_s)
         self._folder.cleanup()
 
     # In the place of an agent: what it is told.

@@ -9,6 +9,7 @@ from datetime import datetime
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import msgspec
@@ -27,7 +28,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import NameOID
 
 from emulator.drivers.attachment import lease_ms
-from emulator.drivers.live.gateway import Gateway, check_trust, read_users, session_environment
+from emulator.drivers.live.gateway import Gateway, Giver, check_trust, read_users, session_environment
 from emulator.scenario.program import Program, ZenohSessions
 from tests.support.multi_loop_driver import scenario_of
 from vnet.errors import ProgramError
@@ -661,6 +662,25 @@ def test_users_are_those_whom_zenoh_reads(tmp_path: Path) -> None:
     path = tmp_path / "users"
     path.write_bytes(b"\n car : a:b \r\nbus:c\ncar:d")
     assert read_users(path) == {"car": "d", "bus": "c"}
+
+
+def test_who_does_not_read_holds_up_nobody_else_and_misses_nothing() -> None:
+    """Zenoh waits with the thread for programs that do not read; each gateway's order stays."""
+    giver, reads, said = Giver(), Event(), list[str]()
+    slow, other = (Gateway(name, 0, RADIO_KEYS, QUIET, lambda *_: None) for name in ("v01", "v02"))
+    for round_number in range(2):
+        reads.clear()
+        giver.take(slow, partial(reads.wait, PATIENCE_S))
+        for number in range(100):
+            giver.take(slow, partial(said.append, f"{round_number}.{number}"))
+        heard = Event()
+        while not heard.wait(0.001):
+            giver.take(other, heard.set)
+        reads.set()
+        while len(said) < 100 * (round_number + 1):
+            giver.take(other, lambda: None)
+    giver.close()
+    assert said == [f"{round_number}.{number}" for round_number in range(2) for number in range(100)]
 
 
 def test_neither_a_program_nor_its_router_ends_what_a_planned_pause_silences(tmp_path: Path) -> None:
