@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.usage import cpu_time_ns
@@ -312,15 +312,61 @@ def rest_of_group_ended(pid: int) -> Iterator[None]:
             os.waitpid(-pid, 0)
 
 
+COMMAND = "VNET_COMMAND"
+"""Variable of a command's environment whose value no other command has: by it all is found that it has started."""
+
+
+STRAY_LOOKS = 2
+"""Times that a command's processes outside of its group are ended: one may just have started another."""
+
+
 class GroupProcess(subprocess.Popen[bytes]):
-    """A process started in a group of its own, which ends with it."""
+    """A process started in a group of its own, which ends with it.
+
+    A command's processes do so wherever they have gone: job control, `setsid` and `script` leave the group.
+    """
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], **options: Any) -> None:
+        self._mark = f"{COMMAND}={environment[COMMAND]}".encode() if COMMAND in environment else None
+        super().__init__(command, env=environment, **options)
 
     def poll(self) -> int | None:
         """Return the exit status (minus the signal's number), or None while it runs."""
         if self.returncode is None and has_ended(self.pid):
             with rest_of_group_ended(self.pid):
                 super().poll()
+            for _ in range(STRAY_LOOKS):
+                for stray in self._strays():
+                    with suppress(OSError):  # it has ended, or its parent waits for it
+                        os.kill(stray, signal.SIGKILL)
+                        wait_until_ended(stray, 1.0)
+                        os.waitpid(stray, os.WNOHANG)
         return self.returncode
+
+    def signal_all(self, number: int) -> None:
+        """Send a signal to the process and all that it has started.
+
+        A shell that sees its job stopped waits for it no longer: it is stopped first, and goes on last.
+        """
+        if number != signal.SIGCONT:
+            os.killpg(self.pid, number)
+        for stray in self._strays():
+            with suppress(ProcessLookupError):
+                os.kill(stray, number)
+        if number == signal.SIGCONT:
+            os.killpg(self.pid, number)
+
+    def _strays(self) -> list[int]:
+        """Return the command's processes that are outside of its group."""
+        if self._mark is None:
+            return []
+        found = list[int]()
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):  # of somebody else, or gone
+                pid = int(path.parent.name)
+                if self._mark in path.read_bytes().split(b"\0") and os.getpgid(pid) != self.pid:
+                    found.append(pid)
+        return found
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for its end, at most so many seconds. Raises subprocess.TimeoutExpired."""
@@ -549,13 +595,13 @@ class Launcher:
             with (self.logs / f"{name}.log").open("ab") as log, inherit:
                 self._processes[name] = GroupProcess(
                     command,
+                    environment,
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     pass_fds=descriptors,
                     process_group=None if own_session else 0,
                     start_new_session=own_session,
-                    env=environment,
                 )
         except OSError as error:
             raise _cannot_start(name, error.strerror) from None
@@ -616,10 +662,10 @@ class Launcher:
             self._processes[name].send_signal(number)
 
     def signal_group(self, name: str, number: int) -> None:
-        """Send a signal to a process and all that it has started in its group, if it is there."""
+        """Send a signal to a command and all that it has started, if it is there."""
         process = self._processes.get(name)
-        if process is not None and process.poll() is None:
-            os.killpg(process.pid, number)
+        if isinstance(process, GroupProcess) and process.poll() is None:
+            process.signal_all(number)
 
     def takes_end(self, name: str, how: Exit) -> bool:
         """All that it starts are agents, and what belongs to the run itself."""

@@ -29,7 +29,7 @@ import zenoh
 
 from emulator.drivers.attachment import lease_ms
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.launch import Exit, Launcher
+from emulator.drivers.launch import COMMAND, Exit, Launcher
 from emulator.drivers.live.gateway import (
     Gateway,
     Giver,
@@ -408,7 +408,7 @@ class Gateways:
             environment["ROS_DOMAIN_ID"] = str(self._ros2.domain)
         try:
             for name, words in self._commands_of(node).items():
-                environment[FAILURE] = str(self._failure_path(vehicle, name))
+                environment[FAILURE] = environment[COMMAND] = str(self._failure_path(vehicle, name))
                 found = _located(words, environment.get("PATH"))
                 self._launcher.start_command(name, found, environment, vehicle.nice)
                 vehicle.commands[name] = " ".join(words)

@@ -1,19 +1,21 @@
 """Processes that a run starts: where they stand among the others of the machine."""
 
 import os
+import shutil
 import signal
 from pathlib import Path
 
 import pytest
 
 from emulator.drivers import launch
-from emulator.drivers.launch import Launcher
+from emulator.drivers.launch import COMMAND, Launcher
 from emulator.drivers.router import ROUTER, SeparateRouter
-from tests.support.processes import has_ended
+from tests.support.processes import has_ended, wait_until
 from vnet.transport.access import Access
 
 pytestmark = pytest.mark.slow
 
+BASH = shutil.which("bash") or "bash"
 SAY = "import os; print(os.getsid(0), os.getpgrp() == os.getpid())"
 
 
@@ -72,6 +74,23 @@ def test_what_a_process_has_forked_ends_with_it(tmp_path: Path, then: str) -> No
         launcher.wait_for("v1", 60.0)
         assert launcher.ended()["v1"].status == (3 if then else 0)
     launcher.stop()
+    assert has_ended(child, 60)
+
+
+@pytest.mark.parametrize("leave", ["set -m; sleep 600", "setsid sleep 600"])
+def test_what_a_command_has_started_is_paused_and_ends_with_it_outside_of_its_group(
+    tmp_path: Path, leave: str
+) -> None:
+    """Shells with job control, `setsid` and `script` put what they start into a group of its own."""
+    launcher, environment = Launcher(tmp_path), {**os.environ, COMMAND: str(tmp_path)}
+    launcher.start_command("v1", [BASH, "-c", f"{leave} & echo $!; wait"], environment, 0)
+    wait_until(lambda: bool(launcher.log_tail("v1").strip()))
+    child, shell = int(launcher.log_tail("v1")), launcher.pids["v1"]
+    wait_until(lambda: os.getpgid(child) != os.getpgid(shell))
+    for number, state in ((signal.SIGSTOP, "T"), (signal.SIGCONT, "S")):
+        launcher.signal_group("v1", number)
+        wait_until(lambda: {launch._state_of(pid) for pid in (child, shell)} == {state})  # noqa: B023
+    launcher.kill("v1")
     assert has_ended(child, 60)
 
 
