@@ -44,7 +44,7 @@ class Command:
     @property
     def needed_mb(self) -> int:
         """Address space in MB that it needs at least: libraries and their threads, most of it never touched."""
-        return 3000 if self.name in ("run", "emulator", "demo", "host") else 800
+        return 3000 if self.name in ("run", "emulator", "demo", "host") else 1100
 
 
 COMMANDS = (

@@ -371,6 +371,7 @@ _lock = threading.Lock()
 _simulations: list[tuple[Callable[[Node], bool], NodeLogs]] = []
 _streams: tuple[Any, Any] = sys.stdout, sys.stderr
 """Stdout and stderr as they were before programs ran."""
+_users = 0
 
 
 @contextmanager
@@ -380,20 +381,31 @@ def output_kept(is_its_own: Callable[[Node], bool], logs: NodeLogs) -> Iterator[
     What is printed on nobody's behalf, as by a module that is imported, goes to the terminal alone.
     """
     simulation = (is_its_own, logs)
-    global _streams
+    with output_branched():
+        _simulations.append(simulation)
+        try:
+            yield
+        finally:
+            _simulations.remove(simulation)
+            logs.end_lines()
+
+
+@contextmanager
+def output_branched() -> Iterator[None]:
+    """Let what is printed, or bound by a module that is imported, be streams that write to logs, too."""
+    global _streams, _users
     with _lock:
-        if not _simulations:
+        if not _users:
             _streams = sys.stdout, sys.stderr
             sys.stdout, sys.stderr = map(_Branched, _streams)
-        _simulations.append(simulation)
+        _users += 1
     try:
         yield
     finally:
         with _lock:
-            _simulations.remove(simulation)
-            if not _simulations:  # also where a program has set others
+            _users -= 1
+            if not _users:  # also where a program has set others
                 sys.stdout, sys.stderr = _streams
-        logs.end_lines()
 
 
 class _Branched:

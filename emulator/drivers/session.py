@@ -33,6 +33,7 @@ from emulator.drivers.conclude import conclude, judge_unkept
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.launch import AGENT_ENVIRONMENT, Exit
+from emulator.drivers.local import output_branched
 from emulator.drivers.lockstep import Lockstep, no_horizon
 from emulator.drivers.simulate import ProcessCount, process_count, simulate
 from emulator.records.code_digest import entries_of
@@ -146,8 +147,9 @@ class Session:
         scenario = self.emulation.scenario
         if self.live is None:
             search_programs_in(scenario.program.folders)
-            for entry in entries_of(scenario):
-                load_program(entry)
+            with output_branched():
+                for entry in entries_of(scenario):
+                    load_program(entry)
         _ = self.emulation.metrics.declared  # what cannot be is refused before anything is written
         self.folder.open(scenario)
         return self

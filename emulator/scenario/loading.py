@@ -24,6 +24,7 @@ from datetime import date, time
 from functools import wraps
 from pathlib import Path, PurePath
 from typing import Any, ParamSpec, TypeVar
+from zipfile import is_zipfile
 
 import tomli_w
 from pydantic import ValidationError
@@ -293,7 +294,7 @@ class _Modules:
     def _folder(self, path: Path, base: Path | None) -> Path:
         folder = (base or Path()) / path
         try:
-            if folder.is_dir():
+            if folder.is_dir() or is_zipfile(folder):  # Python imports from both
                 return folder.resolve()
         except (OSError, ValueError, RuntimeError):
             pass

@@ -61,7 +61,7 @@ _SEED_BYTES = 16
 _system_bytes, _seed, _system_entropy = os.urandom, random.Random.seed, os.getrandom
 _python_state, _numpy_state = random._inst, np.random.mtrand._rand
 _set_threshold, _signal, _basic_config = gc.set_threshold, signal.signal, logging.basicConfig
-_watch_later = faulthandler.dump_traceback_later
+_watch_later, _remove_handler = faulthandler.dump_traceback_later, logging.Logger.removeHandler
 _OTHER_NAMES = {"ranf": "random_sample", "sample": "random_sample", "seed": "seed"}
 """Functions of `numpy.random` that are no methods of its generator, and the methods that they call."""
 
@@ -304,14 +304,24 @@ class _Nobodys(random.Random):
 def _configure_logging(**options: Any) -> None:
     """Configure logging as if vnet had no handler; it stays."""
     root = logging.getLogger()
-    ours = [handler for handler in root.handlers if getattr(handler, "is_vnets", False)]
+    ours = list(filter(_is_vnets, root.handlers))
     for handler in ours:
-        root.removeHandler(handler)
+        _remove_handler(root, handler)
     try:
         _basic_config(**options)
     finally:
         for handler in ours:
             root.addHandler(handler)
+
+
+def _is_vnets(handler: logging.Handler) -> bool:
+    return getattr(handler, "is_vnets", False)
+
+
+def _handler_removed(logger: logging.Logger, handler: logging.Handler) -> None:
+    """Remove a handler, but for vnet's if a program asks, as `logging.config` does of all."""
+    if present_node() is None or not _is_vnets(handler):
+        _remove_handler(logger, handler)
 
 
 def _signal_set(number: int, handler: Any) -> Any:
@@ -363,6 +373,7 @@ _STAND_INS: list[tuple[Any, str, Any, Any]] = [
     (signal, "signal", _signal, _signal_set),
     (faulthandler, "dump_traceback_later", _watch_later, _watched_later),
     (logging, "basicConfig", _basic_config, _configure_logging),
+    (logging.Logger, "removeHandler", _remove_handler, _handler_removed),
 ]
 _OTHER = {id(own): other for owner, _, own, other in _STAND_INS if owner is not tempfile}
 """Stand-ins by the identity of what they stand for, under whatever name; `random.Random` stays itself."""

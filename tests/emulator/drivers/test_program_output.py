@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+import emulator
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.local import output_kept
 from emulator.drivers.session import Session
@@ -64,6 +65,27 @@ def test_prints_are_in_the_log_of_their_vehicle_and_in_the_terminal(
         assert log_of(emulation, node).splitlines() == [*said, *rest]
         assert [line for line in said if f"{line}\n" not in terminal.out] == [f"{node} in error"]
         assert f"{node} in error\n" in terminal.err
+
+
+@pytest.mark.slow
+def test_what_a_modules_handler_writes_is_in_the_log_of_the_vehicle(tmp_path: Path) -> None:
+    """It has bound the stream while the module was imported, as loguru does."""
+    (tmp_path / "tells.py").write_text(
+        """
+import logging, sys
+log = logging.getLogger("tells")
+log.addHandler(logging.StreamHandler(sys.stdout))
+
+async def main(node):
+    log.warning(node.id)
+"""
+    )
+    scenario = Scenario.model_validate(
+        {"network": {"vehicles": 2}, "program": {"entry": "tells:main", "folders": [str(tmp_path)]}}
+    )
+    emulator.simulate(scenario, out=tmp_path / "run")
+    logs = [(tmp_path / "run" / "logs" / f"{node}.log").read_text() for node in ("v01", "v02")]
+    assert [text.splitlines().count(node) for text, node in zip(logs, ("v01", "v02"), strict=True)] == [1, 1]
 
 
 async def prints_a_beginning(node: Node) -> None:

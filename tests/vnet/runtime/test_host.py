@@ -3,6 +3,7 @@
 import asyncio
 import io
 import logging
+import logging.config
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -293,17 +294,20 @@ def test_a_program_may_configure_logging_in_main() -> None:
     before, root.handlers = root.handlers, []
 
     async def program(node: Node) -> None:
-        logging.basicConfig(level=logging.INFO, stream=io.StringIO(), force=node.id == "v2")
+        if node.id == "v3":
+            logging.config.dictConfig({"version": 1, "root": {"level": "INFO"}})
+        else:
+            logging.basicConfig(level=logging.INFO, stream=io.StringIO(), force=node.id == "v2")
         logging.info("told by %s", node.id)
 
-    world = World("v1", "v2")
+    world = World("v1", "v2", "v3")
     try:
         world.run(program)
     finally:
         root.handlers = before
         root.setLevel(logging.WARNING)
     notes = [(note.node, note.text.removeprefix("root: ")) for traffic in world.traffic for note in traffic.notes]
-    assert notes == [("v1", "told by v1"), ("v2", "told by v2")]
+    assert notes == [(node, f"told by {node}") for node in ("v1", "v2", "v3")]
 
 
 def test_an_early_exit_takes_the_nodes_other_tasks_with_it() -> None:

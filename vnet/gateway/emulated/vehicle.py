@@ -373,7 +373,9 @@ class Vehicle(RadioSide[Asking]):
     async def tell_fixes(self) -> None:
         """Put each fix at the sessions, from the first subscriber on that takes them."""
         await self._locates.wait()
-        self.node.gnss.drain()
+        for fix in self.node.gnss.drain():
+            if fix.time_ns == self.node.now_ns:  # the first fix is that of the instant at which programs begin
+                self.show_fix(fix)
         async for fix in self.node.gnss:
             self.show_fix(fix)
 
