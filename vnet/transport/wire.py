@@ -214,7 +214,7 @@ class Ending(msgspec.Struct, frozen=True, array_like=True):
     place: str = ""
     """File and line of the program at which it ended, if that is known."""
     time_ns: TimeNs | None = None
-    """When that was: what is told after the run (real time) counts if it was within."""
+    """The instant of the end: what is told after the run (real time) counts if it was within."""
 
 
 class Unhandled(msgspec.Struct, frozen=True, array_like=True):

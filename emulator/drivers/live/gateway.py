@@ -376,7 +376,7 @@ class Giver:
         self._busy: tuple[Gateway, float] | None = None
         """The gateway at which the thread is, and since when (s)."""
         self._alone: dict[Gateway, deque[Callable[[], object]]] = {}
-        """What waits for gateways that have a thread of their own."""
+        """Calls that wait for gateways with a thread of their own."""
 
     def take(self, gateway: Gateway, call: Callable[[], object]) -> None:
         """Have a gateway's call made soon."""

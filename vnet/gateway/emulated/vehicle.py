@@ -58,7 +58,7 @@ from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.units import NS_PER_S
 
 MOST_AHEAD_NS = NS_PER_S // 2
-"""How far ahead of its clock Zenoh believes a timestamp (`delta` of uhlc, its hybrid logical clock)."""
+"""Time ahead of its clock up to which Zenoh believes a timestamp (`delta` of uhlc, its hybrid logical clock)."""
 
 
 class Vehicle(RadioSide[Asking]):
