@@ -45,7 +45,7 @@ def measure(vehicles: int = 50, duration_s: float = 35.0) -> dict[str, float]:
         access = Access.create(RUN, [["v01"]])
         credentials = folder / "observer.json"
         credentials.write_text(access.credentials(OBSERVER).dumps())
-        with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as session:
+        with open_router("tcp/127.0.0.1:0", access) as session:
             endpoint = router_endpoint(session)
             command = [sys.executable, "-P", "-m", "emulator", "record", "--connect", endpoint, "--run", RUN]
             command += ["--credentials", str(credentials), "--out", str(folder / RECORDING), "--rerun", "serve"]

@@ -15,22 +15,12 @@ import zenoh
 
 from emulator.drivers.agent_keys import AgentKeys, Hear, hear_payloads, hear_tokens
 from emulator.drivers.router import SeparateRouter
-from emulator.scenario.scenario import Scenario
 from emulator.viewer.sinks import Sinks
 from vnet.errors import TransportError
 from vnet.runtime.debug_target import DebugTarget
 from vnet.transport import keys, wire
-from vnet.transport.access import EMULATOR, Access
+from vnet.transport.access import EMULATOR, LEASE_MS, Access
 from vnet.transport.session import open_client, open_router, router_endpoint
-
-LEASE_MS = 60_000
-"""Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
-
-
-def lease_ms(scenario: Scenario) -> int:
-    """Return the milliseconds without a message after which a connection ends; a planned pause must not end it."""
-    pauses_s = [fault.duration_s for fault in scenario.fault if fault.kind == "pause"]
-    return LEASE_MS + round(1000 * max(pauses_s, default=0.0))
 
 
 @dataclass(frozen=True)
@@ -62,7 +52,6 @@ class Attachment:
         self,
         options: LiveOptions,
         node_ids: tuple[str, ...],
-        lease_ms: int,
         drops: bool,
         hear: Hear,
         has_agents: bool = True,
@@ -73,7 +62,6 @@ class Attachment:
         self._options = options
         self._run = options.access.run
         self._node_ids = node_ids
-        self._lease_ms = lease_ms
         self._drops = drops
         self._hear = hear
         self._stack = ExitStack()
@@ -87,13 +75,11 @@ class Attachment:
         """
         stack, options = self._stack, self._options
         if self._connect is None:
-            session = stack.enter_context(
-                open_router(self.endpoint, options.access, self._lease_ms, not self._drops)
-            )
+            session = stack.enter_context(open_router(self.endpoint, options.access, not self._drops))
             self.endpoint = router_endpoint(session)
         else:
             login = options.access.credentials(EMULATOR)
-            session = stack.enter_context(open_client(self._connect, login, self._lease_ms))
+            session = stack.enter_context(open_client(self._connect, login, LEASE_MS))
             alive = keys.emulator_alive(self._run)
             if not again and any(reply.ok for reply in session.liveliness().get(alive)):
                 raise TransportError(f"{self._connect}: run {self._run} has an emulator there already")

@@ -326,9 +326,9 @@ class GroupProcess(subprocess.Popen[bytes]):
     A command's processes do so wherever they have gone: job control, `setsid` and `script` leave the group.
     """
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str], **options: Any) -> None:
-        self._mark = f"{COMMAND}={environment[COMMAND]}".encode() if COMMAND in environment else None
-        super().__init__(command, env=environment, **options)
+    def __init__(self, command: Sequence[str], mark: str | None, **options: Any) -> None:
+        self._mark = None if mark is None else f"{COMMAND}={mark}".encode()
+        super().__init__(command, **options)
 
     def poll(self) -> int | None:
         """Return the exit status (minus the signal's number), or None while it runs."""
@@ -571,7 +571,7 @@ class Launcher:
 
     def start_command(self, name: str, words: Sequence[str], environment: Mapping[str, str], nice: int) -> None:
         """Start a command in a group of its own that ends with this process; it prints to `logs/{name}.log`."""
-        self._start(name, [*TIED, *words], environment)
+        self._start(name, [*TIED, *words], environment, mark=environment[COMMAND])
         self._lower_priority(name, nice)
 
     def _start(
@@ -581,6 +581,7 @@ class Launcher:
         environment: Mapping[str, str],
         credentials: Credentials | None = None,
         own_session: bool = False,
+        mark: str | None = None,
     ) -> None:
         """Start a command, with the path of a pipe that holds the credentials in place of `CREDENTIALS`."""
         descriptors: list[int] = []
@@ -595,13 +596,14 @@ class Launcher:
             with (self.logs / f"{name}.log").open("ab") as log, inherit:
                 self._processes[name] = GroupProcess(
                     command,
-                    environment,
+                    mark,
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     pass_fds=descriptors,
                     process_group=None if own_session else 0,
                     start_new_session=own_session,
+                    env=environment,
                 )
         except OSError as error:
             raise _cannot_start(name, error.strerror) from None

@@ -294,7 +294,7 @@ class _Modules:
     def _folder(self, path: Path, base: Path | None) -> Path:
         folder = (base or Path()) / path
         try:
-            if folder.is_dir() or is_zipfile(folder):  # Python imports from both
+            if folder.is_dir() or (folder.is_file() and is_zipfile(folder)):  # Python imports from both
                 return folder.resolve()
         except (OSError, ValueError, RuntimeError):
             pass

@@ -162,7 +162,7 @@ def test_a_host_gets_and_says_nothing_but_its_own() -> None:
         if sample.payload.to_bytes() == b"last":
             over.set()
 
-    with open_router("tcp/127.0.0.1:0", access, 10_000) as router, ExitStack() as stack:
+    with open_router("tcp/127.0.0.1:0", access) as router, ExitStack() as stack:
         stack.enter_context(router.declare_subscriber("vnet/r/**", hear))
         stack.enter_context(router.liveliness().declare_subscriber("vnet/r/**", hear))
         thief, client = (

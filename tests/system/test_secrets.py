@@ -74,5 +74,5 @@ def test_an_embedded_router_leaves_nothing_on_the_disk(
     listen: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with open_router(listen, create(listen), 1000):
+    with open_router(listen, create(listen)):
         assert list(tmp_path.iterdir()) == []

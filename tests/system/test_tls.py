@@ -39,7 +39,7 @@ def access(monkeypatch: pytest.MonkeyPatch) -> Access:
 
 @pytest.fixture
 def router(access: Access) -> Iterator[zenoh.Session]:
-    with open_router(LISTEN, access, LEASE_MS) as opened:
+    with open_router(LISTEN, access) as opened:
         yield opened
 
 
@@ -96,7 +96,7 @@ def test_a_client_believes_only_its_own_runs_router(access: Access, router: zeno
 def test_a_client_verifies_the_name_of_the_router(access: Access) -> None:
     elsewhere: Certificates = issue_certificates(access.passwords, ["elsewhere.example"])
     moved = replace(access, tls=elsewhere)
-    with open_router(LISTEN, moved, LEASE_MS) as router:
+    with open_router(LISTEN, moved) as router:
         assert not joins(router, moved.credentials(V01))
 
 

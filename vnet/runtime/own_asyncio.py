@@ -318,10 +318,10 @@ def _is_vnets(handler: logging.Handler) -> bool:
     return getattr(handler, "is_vnets", False)
 
 
-def _handler_removed(logger: logging.Logger, handler: logging.Handler) -> None:
+def _handler_removed(logger: logging.Logger, hdlr: logging.Handler) -> None:
     """Remove a handler, but for vnet's if a program asks, as `logging.config` does of all."""
-    if present_node() is None or not _is_vnets(handler):
-        _remove_handler(logger, handler)
+    if present_node() is None or not _is_vnets(hdlr):
+        _remove_handler(logger, hdlr)
 
 
 def _signal_set(number: int, handler: Any) -> Any:

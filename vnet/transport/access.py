@@ -20,7 +20,7 @@ from typing import Any
 
 from vnet.errors import TransportError, shown
 from vnet.extras import require
-from vnet.transport import keys
+from vnet.transport import keys, wire
 from vnet.transport.credentials import (
     Certificates,
     Credentials,
@@ -268,10 +268,22 @@ def is_tls(endpoint: str) -> bool:
     return endpoint.startswith("tls/")
 
 
+LEASE_MS = 3_600_000
+"""Time after which a router ends a silent connection. Long: who is paused or starved is not dead, a connection that
+closes is seen at once, and silence is judged by the emulator, which knows what it waits for."""
+
+
+def queues(lease_ms: int) -> dict[str, Any]:
+    """Return the leases, and queues as long as Zenoh allows: in real time messages to a full queue are dropped."""
+    return {"tx": {"lease": lease_ms, "keep_alive": 4, "queue": {"size": {"data": 16}}}}
+
+
 def router_config(
     listen: Sequence[str], dictionary: Path, access_control: dict[str, Any], tls: Certificates | None
 ) -> dict[str, Any]:
     """Return the configuration of a router, embedded or separate, that admits only the run's users."""
+    # Zenoh drops a larger message without a word: those of agents are refused by name up to twice their bound.
+    link: dict[str, Any] = {**queues(LEASE_MS), "rx": {"max_message_size": wire.LARGEST_BUNDLE_BYTES}}
     config: dict[str, Any] = {
         "mode": "router",
         "listen": {"endpoints": list(listen)},
@@ -280,17 +292,16 @@ def router_config(
             "shared_memory": {"enabled": False},
             "auth": {"usrpwd": {"dictionary_file": str(dictionary)}},
             "unicast": {"accept_pending": MOST_SESSIONS, "max_sessions": MOST_SESSIONS},
+            "link": link,
         },
         "access_control": access_control,
     }
     if tls is not None:
-        config["transport"]["link"] = {
-            "tls": {
-                "root_ca_certificate_base64": as_base64(tls.authority),
-                "listen_certificate_base64": as_base64(tls.router.certificate),
-                "listen_private_key_base64": as_base64(tls.router.private_key),
-                "enable_mtls": True,
-            }
+        link["tls"] = {
+            "root_ca_certificate_base64": as_base64(tls.authority),
+            "listen_certificate_base64": as_base64(tls.router.certificate),
+            "listen_private_key_base64": as_base64(tls.router.private_key),
+            "enable_mtls": True,
         }
     return config
 

@@ -18,8 +18,7 @@ from typing import Any
 import zenoh
 
 from vnet.errors import TransportError
-from vnet.transport import wire
-from vnet.transport.access import Access, is_tls, router_config
+from vnet.transport.access import Access, is_tls, queues, router_config
 from vnet.transport.credentials import Credentials, Identity, as_base64, write_private
 
 _ONE_POOL = "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),app:(worker_threads:{}))"
@@ -41,7 +40,7 @@ _NO_CONFIGURATIONS = "zenoh::api::session=off"
 
 
 @contextmanager
-def open_router(listen: str, access: Access, lease_ms: int, one_pool: bool = False) -> Iterator[zenoh.Session]:
+def open_router(listen: str, access: Access, one_pool: bool = False) -> Iterator[zenoh.Session]:
     """Open a session in router mode that listens at `listen` (e.g. tcp/127.0.0.1:0) with the run's rules.
 
     With `one_pool` Zenoh's tasks share two threads, if this is the first session of the process: all later ones
@@ -53,9 +52,6 @@ def open_router(listen: str, access: Access, lease_ms: int, one_pool: bool = Fal
         dictionary = Path(folder) / "users.txt"
         write_private(dictionary, access.dictionary())
         config = router_config([listen], dictionary, access.access_control(), access.tls)
-        # Zenoh drops a larger message without a word: those of agents are refused by name up to twice their bound.
-        link = {**_queues(lease_ms), "rx": {"max_message_size": wire.LARGEST_BUNDLE_BYTES}}
-        config["transport"]["link"] = {**config["transport"].get("link", {}), **link}
         config["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
         with _runtime(ROUTER_RUNTIME) if one_pool else nullcontext():
             session = _open(config, f"cannot listen on {listen}")
@@ -100,7 +96,7 @@ def open_client(
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},
-            "link": {**_queues(lease_ms), **_identification(identity)},
+            "link": {**queues(lease_ms), **_identification(identity)},
         },
     }
     if credentials is not None:
@@ -157,16 +153,6 @@ def quiet_zenoh() -> None:
     if not wanted.endswith(_NO_CONFIGURATIONS):
         os.environ["RUST_LOG"] = f"{wanted},{_NO_CONFIGURATIONS}"  # for child processes too
     zenoh.init_log_from_env_or("off")
-
-
-def _queues(lease_ms: int) -> dict[str, Any]:
-    """Return the leases, and queues as long as Zenoh allows: in real time messages to a full queue are dropped."""
-    return {"tx": {**lease_settings(lease_ms), "queue": {"size": {"data": 16}}}}
-
-
-def lease_settings(lease_ms: int) -> dict[str, Any]:
-    """Return the settings of a connection that its peer may leave without a message for so many milliseconds."""
-    return {"lease": lease_ms, "keep_alive": 4}
 
 
 def _identification(identity: Identity | None) -> dict[str, Any]:

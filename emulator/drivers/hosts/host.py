@@ -31,7 +31,7 @@ from emulator.drivers.usage import CpuWatch, MemoryWatch, first_over
 from emulator.records.code_digest import vnet_digest
 from vnet.errors import TransportError, VnetError, WireError, counted
 from vnet.transport import keys, wire
-from vnet.transport.access import Access
+from vnet.transport.access import LEASE_MS, Access
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import PROMPT_SLICE_NS, set_time_slice
 from vnet.transport.session import open_client, open_router, router_endpoint
@@ -84,9 +84,6 @@ class Relay:
 
 LISTEN = "tcp/127.0.0.1:0"
 """Agents are on the same host."""
-LEASE_MS = 3_600_000
-"""Milliseconds. A paused or starved agent must not look like a dead one: a closed connection is seen at once, and
-silence of a host is judged by the emulator, which knows what it waits for."""
 
 
 class Down:
@@ -100,7 +97,7 @@ class Down:
 
     def open(self, stack: ExitStack) -> None:
         """Listen until `stack` is closed. Raises TransportError."""
-        access, session = self.access, stack.enter_context(open_router(LISTEN, self.access, LEASE_MS))
+        access, session = self.access, stack.enter_context(open_router(LISTEN, self.access))
         self._session = session
         self.endpoint = router_endpoint(session)
         nodes = [node for nodes in access.processes for node in nodes]

@@ -24,7 +24,6 @@ from typing import Any, TypeVar
 import zenoh
 
 from emulator.drivers.agent_keys import Hear
-from emulator.drivers.attachment import LEASE_MS
 from emulator.scenario.program import Program, ZenohSessions
 from vnet.errors import ProgramError, shown
 from vnet.gateway import STARTUP, client_config, session_variables
@@ -42,7 +41,8 @@ from vnet.gateway.frames import (
 from vnet.gateway.keys import REPORT_KEY
 from vnet.gateway.radio_side import RadioSide
 from vnet.gateway.ros2 import Ros2
-from vnet.transport.session import lease_settings, open_local_router, router_endpoint
+from vnet.transport.access import LEASE_MS, queues
+from vnet.transport.session import open_local_router, router_endpoint
 
 MOST_PUBLISHERS = 100_000
 """Publishers whose ids are kept for samples on their way."""
@@ -91,11 +91,10 @@ class Gateway(RadioSide[zenoh.Query]):
         settings: ZenohSessions,
         hear: Hear,
         ros2: Ros2 | None = None,
-        lease_ms: int = LEASE_MS,
         giver: Giver | None = None,
     ) -> None:
         super().__init__(node, incarnation, keys, settings.query_s, settings.liveliness_s, ros2)
-        self._settings, self._tell_run, self._lease_ms = settings, hear, lease_ms
+        self._settings, self._tell_run = settings, hear
         self._giver = Giver() if giver is None else giver
         self.is_paused = False
         self._session: zenoh.Session | None = None
@@ -136,8 +135,8 @@ class Gateway(RadioSide[zenoh.Query]):
     def _router_settings(self) -> dict[str, Any]:
         """Return what the router's transport needs for certificates and users, and for those who do not read."""
         drop = dict.fromkeys(("wait_before_drop", "max_wait_before_drop_fragments"), DROPS_AFTER_US)
-        queue = {"congestion_control": {"drop": drop}}
-        link: dict[str, Any] = {"tx": {**lease_settings(self._lease_ms), "queue": queue}}
+        link: dict[str, Any] = queues(LEASE_MS)
+        link["tx"]["queue"]["congestion_control"] = {"drop": drop}
         settings = self._settings
         if settings.certificate is not None:
             link["tls"] = {
@@ -375,19 +374,33 @@ class Giver:
         self._thread: Thread | None = None
         self._busy: tuple[Gateway, float] | None = None
         """The gateway at which the thread is, and since when (s)."""
+        self._looks = False
         self._alone: dict[Gateway, deque[Callable[[], object]]] = {}
         """Calls that wait for gateways with a thread of their own."""
 
     def take(self, gateway: Gateway, call: Callable[[], object]) -> None:
-        """Have a gateway's call made soon."""
+        """Have a gateway's call made soon; on the run's loop."""
         self._calls.put((gateway, call))
+        if self._thread is None:
+            self._start()
+        if not self._looks:
+            self._looks = True
+            asyncio.get_running_loop().call_later(WAITS_S, self._look)
+
+    def _start(self) -> None:
+        self._busy, self._thread = None, Thread(target=self._run, name="giver", daemon=True)
+        self._thread.start()
+
+    def _look(self) -> None:
+        """Have another thread go on if the present one waits; look again while there is anything to give."""
         with self._lock:
-            if self._thread is not None:
-                if self._busy is None or time.monotonic() - self._busy[1] < WAITS_S:
-                    return
-                self._alone[self._busy[0]] = deque()
-            self._busy, self._thread = None, Thread(target=self._run, name="giver", daemon=True)
-            self._thread.start()
+            busy = self._busy
+            if busy is not None and time.monotonic() - busy[1] >= WAITS_S:
+                self._alone[busy[0]] = deque()
+                self._start()
+        self._looks = busy is not None or not self._calls.empty()
+        if self._looks:
+            asyncio.get_running_loop().call_later(WAITS_S, self._look)
 
     def close(self) -> None:
         """End the thread once all that was before is done."""
@@ -438,7 +451,6 @@ def session_environment(
     program: Program,
     folder: Path,
     inherited: Mapping[str, str],
-    lease_ms: int = LEASE_MS,
 ) -> dict[str, str]:
     """Return the environment in which an unmodified program connects to its vehicle's router alone.
 
@@ -446,7 +458,7 @@ def session_environment(
     """
     settings = program.sessions
     client = client_config(endpoint)
-    link: dict[str, Any] = {"tx": lease_settings(lease_ms)}  # the router ends who is paused for longer
+    link: dict[str, Any] = queues(LEASE_MS)
     client["transport"] = transport = {"link": link}
     if settings.authority is not None:
         link["tls"] = {"root_ca_certificate": str(settings.authority)}

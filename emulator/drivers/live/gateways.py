@@ -27,7 +27,6 @@ from typing import Any, Literal, cast
 import msgspec
 import zenoh
 
-from emulator.drivers.attachment import lease_ms
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.launch import COMMAND, Exit, Launcher
 from emulator.drivers.live.gateway import (
@@ -122,7 +121,7 @@ class Gateways:
         scenario = emulation.scenario
         self._emulation, self._launcher, self._starts = emulation, launcher, starts
         self._program, self._settings = scenario.program, scenario.program.sessions
-        self._ros2, self._lease_ms = scenario.radio.ros2, lease_ms(scenario)
+        self._ros2 = scenario.radio.ros2
         self._hear, self._tell, self._time_ns, self._changes = hear, tell, time_ns, changes
         self._loop = asyncio.get_running_loop()
         self._check(emulation.world.node_ids)
@@ -186,9 +185,7 @@ class Gateways:
         for (node,) in groups:
             rules = None if self._ros2 is None else Ros2(node, self._ros2.inside, self._ros2.domain)
             keys, incarnation = self._emulation.scenario.radio.keys, self._emulation.incarnation[node]
-            gateway = Gateway(
-                node, incarnation, keys, self._settings, self._hear, rules, self._lease_ms, self._giver
-            )
+            gateway = Gateway(node, incarnation, keys, self._settings, self._hear, rules, self._giver)
             vehicle = self._vehicles[node] = _Vehicle(next(self._numbers), gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 
@@ -402,7 +399,7 @@ class Gateways:
         inherited = {name: value for name, value in os.environ.items() if name != RUNTIME_VARIABLE}
         own = self._program.of(node).environment
         inherited |= zip(own, filled_in(own.values(), node, endpoint), strict=True)
-        environment = session_environment(node, endpoint, self._program, folder, inherited, self._lease_ms)
+        environment = session_environment(node, endpoint, self._program, folder, inherited)
         environment |= {STARTED_BY_VNET: "1", "PYTHONUNBUFFERED": "1"}
         if self._ros2 is not None:
             environment["ROS_DOMAIN_ID"] = str(self._ros2.domain)

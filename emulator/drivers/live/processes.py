@@ -18,7 +18,7 @@ from typing import Any
 import zenoh
 from msgspec.structs import replace
 
-from emulator.drivers.attachment import Attachment, LiveOptions, lease_ms
+from emulator.drivers.attachment import Attachment, LiveOptions
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.join import Membership, split_into_processes
 from emulator.drivers.launch import Exit, Launcher
@@ -101,9 +101,7 @@ class LiveProcesses(Processes):
         later = [node for node, up in emulation.up.items() if not up]
         self.members = Membership(node_ids, later, emulation.world.has_traffic)
         has_gateways = emulation.scenario.has_gateways
-        self.attachment = attach(
-            options, node_ids, lease_ms(emulation.scenario), self._realtime, self.hear, not has_gateways
-        )
+        self.attachment = attach(options, node_ids, self._realtime, self.hear, not has_gateways)
         self.fleet = self._make_fleet() if options.access.hosts else None
         self.gateways = self._make_gateways() if has_gateways else None
         if self.gateways is not None:

@@ -94,6 +94,19 @@ def test_what_a_command_has_started_is_paused_and_ends_with_it_outside_of_its_gr
     assert has_ended(child, 60)
 
 
+def test_a_vnet_that_a_command_has_started_takes_nothing_of_that_command_for_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It once killed itself as the first of its own processes ended."""
+    monkeypatch.setenv(COMMAND, "of another run")
+    launcher = Launcher(tmp_path)
+    launcher.start("v1", ["-c", ""], None, {})
+    process = launcher._processes["v1"]
+    assert isinstance(process, launch.GroupProcess) and process._strays() == []
+    launcher.wait_for("v1", 60.0)
+    launcher.stop()
+
+
 def test_agents_wait_as_long_as_they_may_join_for_a_router_that_many_ask(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -94,7 +94,7 @@ def test_without_cryptography_the_error_says_what_to_install(monkeypatch: pytest
 
 
 def test_certificates_and_endpoint_go_together(tmp_path: Path) -> None:
-    with pytest.raises(TransportError, match="only at tls/HOST:PORT"), open_router(TCP, create(TLS), 1000):
+    with pytest.raises(TransportError, match="only at tls/HOST:PORT"), open_router(TCP, create(TLS)):
         pass
     with pytest.raises(TransportError, match="vnet access --listen tls/"):
         create(TCP).save(tmp_path, TLS, tmp_path)

@@ -26,7 +26,7 @@ def test_what_is_too_large_does_not_reach_the_emulator(monkeypatch: pytest.Monke
     monkeypatch.setattr(wire, "LARGEST_BUNDLE_BYTES", 2**20)
     access, key = Access.create("r", [["v01"]]), keys.node_tx("r", "v01")
     received: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(10)
-    with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router:
+    with open_router("tcp/127.0.0.1:0", access) as router:
         subscriber = router.declare_subscriber(key, received)
         with open_client(router_endpoint(router), access.credentials(node_user("v01")), LEASE_MS) as client:
             for size in (2**20 - 1000, 2**21, 7):
@@ -47,7 +47,7 @@ def test_only_a_unit_has_rights_on_its_keys_of_the_backbone(user: str, may: bool
     def take(sample: zenoh.Sample) -> None:
         got.put(str(sample.key_expr))
 
-    with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router:
+    with open_router("tcp/127.0.0.1:0", access) as router:
         router.declare_subscriber("vnet/r/**", lambda sample: heard.put(str(sample.key_expr)))
         with open_client(router_endpoint(router), access.credentials(node_user(user)), LEASE_MS) as client:
             for key in (rx, tx, "vnet/r/backbone/**", own_rx):
@@ -83,7 +83,7 @@ def test_a_router_has_one_pool_of_threads_unless_the_user_has_set_another(
         raise TransportError("not opened")
 
     monkeypatch.setattr(session, "_open", fail)
-    with pytest.raises(TransportError), open_router("tcp/127.0.0.1:0", Access.create("r", [["v01"]]), 1000, True):
+    with pytest.raises(TransportError), open_router("tcp/127.0.0.1:0", Access.create("r", [["v01"]]), True):
         pass
     assert seen == [given or session.ROUTER_RUNTIME]
     assert os.environ.get(session.RUNTIME_VARIABLE) == given
@@ -92,7 +92,7 @@ def test_a_router_has_one_pool_of_threads_unless_the_user_has_set_another(
 def test_many_that_log_in_at_once_do_not_keep_an_agent_out() -> None:
     """By Zenoh's defaults the 101st was refused, and tried again so long that a run of many did not start."""
     access = Access.create("r", [["v01"]])
-    with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router, ExitStack() as stack:
+    with open_router("tcp/127.0.0.1:0", access) as router, ExitStack() as stack:
         host, port = router_endpoint(router).removeprefix("tcp/").split(":")
         for _ in range(150):
             stack.enter_context(socket.create_connection((host, int(port))))
@@ -141,7 +141,7 @@ def test_a_peer_that_does_not_answer_does_not_keep_a_session_from_ending(monkeyp
 
     opened = Unanswered()
     monkeypatch.setattr(session, "_open", lambda *_: opened)
-    with open_router("tcp/127.0.0.1:0", Access.create("r", [["v01"]]), LEASE_MS):
+    with open_router("tcp/127.0.0.1:0", Access.create("r", [["v01"]])):
         pass
     with open_client("tcp/127.0.0.1:1", None, LEASE_MS):
         pass
