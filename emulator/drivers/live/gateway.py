@@ -98,6 +98,7 @@ class Gateway(RadioSide[zenoh.Query]):
         self._giver = Giver() if giver is None else giver
         self.is_paused = False
         self._session: zenoh.Session | None = None
+        self._closing: asyncio.Future[None] | None = None
         self._watches: list[Any] = []
         self._declared: dict[str, zenoh.LivelinessToken] = {}
         """Tokens of other vehicles, which are declared at this one's programs.
@@ -218,15 +219,17 @@ class Gateway(RadioSide[zenoh.Query]):
         self._giver.take(self, partial(self.give, self._session, call))
 
     async def close(self) -> None:
-        """Close the router, with all that is connected to it."""
+        """Close the router, with all that is connected to it: Zenoh waits 10 s for programs that do not read."""
         session, self._session = self._session, None
         self._declared, self._watches = {}, []
         self._told = {}
         self._tokens.clear()  # nobody tells of those that end while there is no router, and of sessions
         self.sessions.clear()
         if session is not None:
+            self._closing = asyncio.ensure_future(asyncio.to_thread(session.close))
+        if self._closing is not None:
             with suppress(zenoh.ZError):
-                await asyncio.to_thread(session.close)
+                await asyncio.shield(self._closing)
 
     # From the programs.
 

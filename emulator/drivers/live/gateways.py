@@ -16,7 +16,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -62,6 +62,8 @@ BY_HAND = f"{ENDPOINTS} in the run's folder has all endpoints, for Zenoh 1"
 """Hints for those whose program does not connect: started by vnet, or by hand."""
 _ESTABLISHED = "01"
 """State of a connection in proc_net(5)."""
+CLOSE_S = 1.0
+"""Time for which the routers of all vehicles are awaited to close, so that they open together."""
 SWITCH_S = 0.001
 """Time after which a thread lets another one run, Python's 5 ms else: what programs put and hear is on others."""
 TURNS_S = 0.1
@@ -189,10 +191,11 @@ class Gateways:
             vehicle = self._vehicles[node] = _Vehicle(next(self._numbers), gateway, Reporter(node), nice)
             self._spawn(self._open(node, vehicle))
 
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._done)
+        return task
 
     def _done(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
@@ -333,19 +336,25 @@ class Gateways:
         async with self._restarting:  # a router that is being opened cannot be closed
             there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
             self._down |= there  # not those whose programs are starting: these do not wait for one
-            await asyncio.gather(*(vehicle.gateway.close() for vehicle in there.values()))
+            await self._all_but_slow(vehicle.gateway.close() for vehicle in there.values())
         while (left_s := self._down_until_s - self._loop.time()) > 0:  # another restart may last longer
             await asyncio.sleep(left_s)
         async with self._restarting:
             down, self._down = self._down, {}
-            await asyncio.gather(*(self._open_again(vehicle) for vehicle in down.values()))
+            await self._all_but_slow(self._open_again(vehicle) for vehicle in down.values())
         self._emulation.folder.event(self._now_ns(), EventKind.router_restarted, None, down_s=down_s)
+
+    async def _all_but_slow(self, work: Iterable[Coroutine[Any, Any, None]]) -> None:
+        """Do something for many vehicles at once; nobody waits for long for another one's programs."""
+        if tasks := [self._spawn(each) for each in work]:
+            await asyncio.wait(tasks, timeout=CLOSE_S)
 
     async def _open_again(self, vehicle: _Vehicle) -> None:
         node = vehicle.gateway.node_id
         if self._vehicles.get(node) is not vehicle:  # a fault has ended it meanwhile
             return
         try:
+            await vehicle.gateway.close()  # which may last
             await _opened(vehicle.gateway, self.endpoints[node])
         except VnetError as error:
             self._tell("ended", node, Exit(1, str(error)))
