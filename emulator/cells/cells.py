@@ -206,7 +206,7 @@ def worker_died(error: Exception) -> bool:
 def progress_bar(title: str, total: int, done: int) -> Iterator[Callable[[], None]]:
     """Show a progress bar on standard error; yields what moves it on by one."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(*columns, console=Console(stderr=True, force_jupyter=False)) as progress:  # which has no widgets
         task = progress.add_task(title, total=total, completed=done)
         yield lambda: progress.advance(task)
 

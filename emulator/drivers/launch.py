@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.usage import cpu_time_ns
@@ -326,9 +326,13 @@ class GroupProcess(subprocess.Popen[bytes]):
     A command's processes do so wherever they have gone: job control, `setsid` and `script` leave the group.
     """
 
+    _groups: ClassVar[set[int]] = {os.getpgrp()}
+    """This process's own group, and those of all that it has started."""
+
     def __init__(self, command: Sequence[str], mark: str | None, **options: Any) -> None:
         self._mark = None if mark is None else f"{COMMAND}={mark}".encode()
         super().__init__(command, **options)
+        self._groups.add(self.pid)
 
     def poll(self) -> int | None:
         """Return the exit status (minus the signal's number), or None while it runs."""
@@ -341,6 +345,7 @@ class GroupProcess(subprocess.Popen[bytes]):
                         os.kill(stray, signal.SIGKILL)
                         wait_until_ended(stray, 1.0)
                         os.waitpid(stray, os.WNOHANG)
+            self._groups.discard(self.pid)
         return self.returncode
 
     def signal_all(self, number: int) -> None:
@@ -361,10 +366,11 @@ class GroupProcess(subprocess.Popen[bytes]):
         if self._mark is None:
             return []
         found = list[int]()
-        for path in Path("/proc").glob("[0-9]*/environ"):
+        for pid in [int(entry.name) for entry in os.scandir("/proc") if entry.name.isdigit()]:
             with suppress(OSError):  # of somebody else, or gone
-                pid = int(path.parent.name)
-                if self._mark in path.read_bytes().split(b"\0") and os.getpgid(pid) != self.pid:
+                if os.getpgid(pid) in self._groups:  # most are, and to read all takes long
+                    continue
+                if self._mark in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0"):
                     found.append(pid)
         return found
 

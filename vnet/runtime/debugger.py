@@ -142,7 +142,7 @@ class NodeDebugger(pdb.Pdb):
 
     def _is_own(self, frame: FrameType) -> bool:
         module = str(frame.f_globals.get("__name__"))
-        if module.startswith(_NOT_STEPPED_INTO):
+        if module.startswith(_NOT_STEPPED_INTO) or frame.f_code.co_filename == "<string>":  # made, as by dataclass
             return False
         return module.partition(".")[0] == self._package or not frame.f_code.co_filename.startswith(_LIBRARIES)
 
