@@ -98,6 +98,7 @@ def agent(
     _pass_breakpoints()
     search_programs_in(path or ())
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    os.register_at_fork(after_in_child=_end_at_sigterm)
     quiet_zenoh()
     try:
         for name in [run, *node]:
@@ -113,6 +114,12 @@ def agent(
         sys.exit(2 if isinstance(error, ProgramError) else 3)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _end_at_sigterm() -> None:
+    """Have what a program forks end at SIGTERM as other processes do, unless the program handles it."""
+    if signal.getsignal(signal.SIGTERM) is signal.default_int_handler:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _check_timeout(option: str, timeout_s: float) -> None:

@@ -38,7 +38,7 @@ from vnet.runtime.arrivals import Mail
 from vnet.runtime.host import Disks, Host
 from vnet.runtime.outside_loop import collected_by_schedule, count_as_death, end_within
 from vnet.runtime.programs import Programs, load_programs
-from vnet.runtime.virtual_time import SkewedLoop, VirtualTimeLoop
+from vnet.runtime.virtual_time import SkewedLoop, VirtualTimeLoop, end_fork
 from vnet.transport import keys, wire
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, never_preempt, set_time_slice
@@ -498,10 +498,20 @@ class _WallClockLoop(SkewedLoop):
 
     origin_ns = 0
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._process = os.getpid()
+
     @property
     def now_ns(self) -> int:
         """Nanoseconds since the start of the run."""
         return max(monotonic_ns() - self.origin_ns, 0)
+
+    def time(self) -> float:
+        """As asyncio's, which asks in each round; not for what a program has forked, without Zenoh's threads."""
+        if os.getpid() != self._process:
+            end_fork()
+        return super().time()
 
 
 class _RealTimeAgent:

@@ -349,13 +349,13 @@ class GroupProcess(subprocess.Popen[bytes]):
         return self.returncode
 
     def signal_all(self, number: int) -> None:
-        """Send a signal to the process and all that it has started.
+        """Send a signal to the process and all of its group; SIGSTOP and SIGCONT to all that it has started.
 
         A shell that sees its job stopped waits for it no longer: it is stopped first, and goes on last.
         """
         if number != signal.SIGCONT:
             os.killpg(self.pid, number)
-        for stray in self._strays():
+        for stray in self._strays() if number in (signal.SIGSTOP, signal.SIGCONT) else ():
             with suppress(ProcessLookupError):
                 os.kill(stray, number)
         if number == signal.SIGCONT:

@@ -186,6 +186,8 @@ def legend(of: Canvas, handles: Sequence[Artist] | None = None) -> None:
     It has as many columns, at most `LEGEND_COLUMNS`, as fit beside each other.
     """
     shown = of.axes.get_legend_handles_labels()[0] if handles is None else list(handles)
+    if not shown:
+        return
     for columns in range(min(LEGEND_COLUMNS, len(shown)), 0, -1):
         drawn = of.figure.legend(
             handles=shown,

@@ -736,6 +736,10 @@ class Disks:
                 if str(descriptor.readlink()).startswith(below):
                     os.dup2(nowhere, int(descriptor.name), inheritable=False)
         os.close(nowhere)
+        for logger in [logging.getLogger(), *logging.Logger.manager.loggerDict.values()]:
+            for handler in list(getattr(logger, "handlers", ())):  # else the next incarnation would log to nowhere
+                if os.path.realpath(getattr(handler, "baseFilename", "/")).startswith(below):
+                    logger.removeHandler(handler)  # type: ignore[union-attr]
 
 
 def _open_databases() -> list[Any]:

@@ -501,7 +501,7 @@ class VirtualTimeLoop(SkewedLoop):
     def _wait(self, timeout: float | None, poll: Callable[[float | None], list[Any]]) -> list[Any]:
         """Yield, in place of the selector's sleep."""
         if os.getpid() != self._process:
-            _end_fork()
+            end_fork()
         self._queue.running = None
         if self._meter is not None:
             self._meter.end()
@@ -638,7 +638,7 @@ def _copy_result(job: Job[Any], outer: asyncio.Future[Any]) -> None:
         outer.set_result(job.result())
 
 
-def _end_fork() -> NoReturn:
+def end_fork() -> NoReturn:
     """End a process that a program has forked and that comes back: there is one run, and it is the parent's."""
     sys.stderr.write("vnet: a process that a program forked came back to the event loop; it ends here\n")
     sys.stderr.flush()

@@ -202,7 +202,7 @@ class Gateway(RadioSide[zenoh.Query]):
         except zenoh.ZError as error:  # of a reply that a fault has changed, or as the router was closed
             if self._session is session:
                 self._tell("note", ("debug", f"cannot be given to the programs: {error}"))
-        except Exception as error:
+        except BaseException as error:  # Zenoh's panics are no `Exception`
             self._tell("bug", error)
         if (waited_s := time.monotonic() - began_s) >= SLOW_S:
             self.warn(f"Zenoh has waited for {waited_s:.1f} s")

@@ -3,6 +3,7 @@
 import asyncio
 import fcntl
 import gc
+import logging
 import os
 import sqlite3
 import weakref
@@ -93,6 +94,30 @@ def test_what_was_ended_holds_nothing_and_writes_no_more(kind: str) -> None:
     with closing(sqlite3.connect(disk / "rows.db")) as database:
         ((rows,),) = database.execute("select count(*) from rows")
     assert incarnation == 1 and rows >= counted - 2, "what either has committed is there"
+
+
+async def logs_to_its_disk(node: Node) -> None:
+    logging.basicConfig(filename=node.folder / f"{node.id}.log", level=logging.INFO)
+    async for fix in node.gnss:
+        logging.info("incarnation %d", node.incarnation)
+        node.report(fix.position_m, fix.covariance_m2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["kill", "restart"])
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_program_that_was_ended_configures_logging_anew(kind: str) -> None:
+    """The handler of the incarnation before would write to nowhere."""
+    root = logging.getLogger()
+    before, root.handlers = root.handlers, []
+    try:
+        ended = FAULTS[0] | {"kind": kind}
+        emulation = run_together(scenario_of([ended], f"{__name__}:logs_to_its_disk", vehicles=1))
+        concluded(emulation)
+    finally:
+        root.handlers = before
+        root.setLevel(logging.WARNING)
+    assert "incarnation 1" in (emulation.folder.path / "files" / "v01" / "v01.log").read_text()
 
 
 class Collected:
