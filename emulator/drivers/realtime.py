@@ -162,14 +162,15 @@ class RealTime:
             self._lateness[process] = counts
         if message.final:
             self._awaited.discard(process_id)
-        if now_ns < self._emulation.duration_ns:
+        if now_ns < self._emulation.duration_ns and self._emulation.ended_ns is None:
             self._change_by(now_ns)
-            if message.traffic.endings and now_ns > self._collected_ns and self._emulation.ended_ns is None:
+            if message.traffic.endings and now_ns > self._collected_ns:
                 self._collect(now_ns - 1)  # what came before the end has arrived
             self._emulation.take(now_ns, [message.traffic])
         else:
             self._told_late += message.traffic.endings
-            self._emulation.take_final(self._emulation.duration_ns, [message.traffic])
+            if self._emulation.ended_ns is None:  # else the run was interrupted
+                self._emulation.take_final(self._emulation.duration_ns, [message.traffic])
 
     def take_answer(self, process_id: str, answer: wire.StackDump) -> None:
         """Take the answer of a process after a restart, which has lost what is missing before its `seq`."""

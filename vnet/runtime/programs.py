@@ -66,6 +66,10 @@ def load_program(entry: str) -> Program:
             raise ProgramError(f"program.entry = {entry!r} {needed}") from error
         missed = getattr(error, "name", None) if isinstance(error, ImportError) else None
         raise _load_error(entry, f"cannot import: {error_line(error)}", missed or module_name) from error
+    except SystemExit as left:
+        status = 0 if left.code is None else left.code if isinstance(left.code, int) else 1
+        how = f"importing it ended the process (exit status {status})"
+        raise ProgramError(f"program.entry = {entry!r}: {how}") from None
     finally:
         own_asyncio.detach()
     if is_new:

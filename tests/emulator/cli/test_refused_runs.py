@@ -82,6 +82,13 @@ def test_the_number_is_not_used_up_and_latest_stays() -> None:
     assert Path("runs/latest").readlink() == Path("beacon-1-2")
 
 
+@pytest.mark.parametrize("command", ["simulate", "run"])
+def test_a_program_that_leaves_as_it_is_imported_is_no_valid_run(here: Path, command: str) -> None:
+    (here / "exits.py").write_text("import sys\nasync def main(node): ...\nsys.exit()\n")
+    said = "vnet: program.entry = 'exits:main': importing it ended the process (exit status 0)\n"
+    assert vnet(command, BEACON, *SHORT, "--program", "exits:main") == (2, said)
+
+
 def test_an_import_that_does_not_end_is_ended(here: Path) -> None:
     (here / "waits_for_ever.py").write_text("import threading\nthreading.Event().wait()\n")
     options = ["--program", "waits_for_ever:main", "--set", "run.join_timeout_s=0.1"]

@@ -130,11 +130,16 @@ def test_what_came_before_a_program_ended_has_arrived_on_a_machine_that_is_late(
     assert len(emulation.metrics.metrics_table()) == periods
 
 
-def test_a_program_that_ended_within_the_run_has_ended_though_that_is_told_after_it() -> None:
+@pytest.mark.parametrize("interrupted_ms", [None, 50])
+def test_a_program_that_ended_within_the_run_has_ended_though_that_is_told_after_it(
+    interrupted_ms: int | None,
+) -> None:
     """Its message was lost with a restart of the emulator; one that ends as the run does has ended by then."""
     realtime, emulation = started(radio={"loss": 0.0, "range_m": 1e6})
-    end_ns = emulation.duration_ns
+    end_ns = emulation.duration_ns if interrupted_ms is None else interrupted_ms * MS
     realtime.receive(10 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic([SentFrame("v02", b"x")])))
+    if interrupted_ms is not None:
+        emulation.finish(end_ns)
     for node, time_ns in (("v01", end_ns - 1), ("v02", end_ns), ("v01", end_ns - 1)):
         traffic = wire.Traffic(endings=[wire.Ending(node, "crashed", "boom", time_ns=time_ns)])
         realtime.receive(end_ns + MS, node, wire.Frames(b"n", 1, 1, [], traffic, final=True))

@@ -374,7 +374,7 @@ class Vehicle(RadioSide[Asking]):
         """Put each fix at the sessions, from the first subscriber on that takes them."""
         await self._locates.wait()
         for fix in self.node.gnss.drain():
-            if fix.time_ns == self.node.now_ns:  # the first fix is that of the instant at which programs begin
+            if fix.time_ns == self._true_ns:  # the first fix is that of the instant at which programs begin
                 self.show_fix(fix)
         async for fix in self.node.gnss:
             self.show_fix(fix)
