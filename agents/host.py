@@ -40,6 +40,7 @@ from vnet.runtime.outside_loop import collected_by_schedule, count_as_death, end
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, VirtualTimeLoop, end_fork
 from vnet.transport import keys, wire
+from vnet.transport.access import LEASE_MS
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, never_preempt, set_time_slice
 from vnet.transport.session import open_client
@@ -63,8 +64,6 @@ TOLD_S = 5.0
 """Seconds for which an agent waits for the answer of the emulator to what it has left unhandled, at most."""
 
 _WHERE = wire.encode(wire.StackRequest())
-LEASE_MS = 60_000
-"""Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
 
 UNSEEN_NS = 1_000_000_000
 """Nanoseconds after which a message of the backbone that has not come is asked for again: each key has a thread of

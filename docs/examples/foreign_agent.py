@@ -163,7 +163,7 @@ class Agent:
 def client_config(endpoint: str, credentials: dict[str, Any]) -> zenoh.Config:
     """A client of the emulator's router: user and password, and a certificate where the router asks for one."""
     login = {name: credentials[name] for name in ("user", "password")}
-    link: dict[str, Any] = {"tx": {"lease": 60_000}}  # a starved machine must not look like a dead one
+    link: dict[str, Any] = {"tx": {"lease": 3_600_000}}  # who is paused or starved must not look dead
     if tls := credentials.get("tls"):
         pem = {"root_ca_certificate": tls["authority"], "connect_certificate": tls["own"]["certificate"]}
         pem["connect_private_key"] = tls["own"]["private_key"]
