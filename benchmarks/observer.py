@@ -30,7 +30,6 @@ from vnet.transport.session import open_router, router_endpoint
 
 ROOT = Path(__file__).parents[1]
 RUN = "observed"
-LEASE_MS = 60_000
 LOWEST = 19
 """Priority."""
 BEGINNING_S = 5.0

@@ -269,8 +269,8 @@ def is_tls(endpoint: str) -> bool:
 
 
 LEASE_MS = 3_600_000
-"""Time after which a router ends a silent connection. Long: who is paused or starved is not dead, a connection that
-closes is seen at once, and silence is judged by the emulator, which knows what it waits for."""
+"""Time after which a silent connection ends. Long: who is paused or starved is not dead, a connection that closes
+is seen at once, and silence is judged by the emulator, which knows what it waits for."""
 
 
 def queues(lease_ms: int) -> dict[str, Any]:
