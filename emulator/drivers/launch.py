@@ -13,7 +13,6 @@ megabytes. `agents/zygote.py` is the other side of the `Zygote` here.
 from __future__ import annotations
 
 import _posixsubprocess
-import ctypes
 import inspect
 import os
 import select
@@ -22,7 +21,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
@@ -35,7 +33,7 @@ from emulator.drivers.usage import cpu_time_ns
 from emulator.records.disk import cut_log
 from vnet.errors import VnetError
 from vnet.runtime import forking
-from vnet.runtime.die_with_parent import STARTED_BY_VNET, TIED
+from vnet.runtime.die_with_parent import STARTED_BY_VNET, TIED, adoption
 from vnet.runtime.environment import KEPT_MEMORY, SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport.access import Access, node_user
@@ -57,9 +55,6 @@ START_TIMEOUT_S = 60.0
 """Seconds for the zygote to import its modules, or to answer: long enough for a loaded machine."""
 ROOM_FOR_ARGUMENTS = 300
 """Characters of its arguments that a forked agent can show in /proc/PID/cmdline beside its interpreter's path."""
-
-_PR_SET_CHILD_SUBREAPER = 36
-_PR_GET_CHILD_SUBREAPER = 37
 
 LOG_TAIL_LINES = 12
 LOWEST_PRIORITY = 19
@@ -117,40 +112,6 @@ class ForkedProcess:
         self.send_signal(signal.SIGKILL)
 
 
-class _Subreaper:
-    """Adoption of orphaned descendants by this process, as long as a zygote is in use."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._zygotes = 0
-        self._before = 0
-
-    def begin(self) -> None:
-        """Adopt orphans from now on."""
-        with self._lock:
-            if self._zygotes == 0:
-                before = ctypes.c_int()
-                _prctl(_PR_GET_CHILD_SUBREAPER, ctypes.byref(before))
-                self._before = before.value
-                _prctl(_PR_SET_CHILD_SUBREAPER, 1)
-            self._zygotes += 1
-
-    def end(self) -> None:
-        """Do as before the first `begin`, once every one of them has had its `end`."""
-        with self._lock:
-            self._zygotes -= 1
-            if self._zygotes == 0:
-                _prctl(_PR_SET_CHILD_SUBREAPER, self._before)
-
-
-def _prctl(option: int, argument: object) -> None:
-    if ctypes.CDLL(None).prctl(option, argument, 0, 0, 0) != 0:
-        raise VnetError('run.start = "fork": this system cannot adopt processes; use --set run.start=spawn')
-
-
-_subreaper = _Subreaper()
-
-
 def can_fork() -> bool:
     """Return whether agents can be forked here.
 
@@ -179,10 +140,10 @@ class Zygote:
 
     def start(self) -> None:
         """Start the process, again if need be; it is ready a little later. Raises VnetError."""
-        if self._process is None:
-            _subreaper.begin()
-        else:
+        if self._process is not None:
             self._discard()
+        elif not adoption.begin():
+            raise VnetError('run.start = "fork": this system cannot adopt processes; use --set run.start=spawn')
         self._ready = False
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  # closed by _discard
         self._channel, other_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -263,7 +224,7 @@ class Zygote:
         if self._process is not None:
             self._discard()
             self._process = None
-            _subreaper.end()
+            adoption.end()
 
     def _discard(self) -> None:
         assert self._process is not None

@@ -47,7 +47,7 @@ from vnet.node import Node
 from vnet.runtime import interrupts, running_node
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.die_with_parent import adoption, end_left, signal_at_parent_death
 from vnet.runtime.error_text import NOT_THE_PROGRAM, error_line
 from vnet.runtime.host import Disks, Host, is_discarding
 from vnet.runtime.outside_loop import caught, collected_by_schedule, present_node
@@ -317,17 +317,15 @@ def process_kept() -> Iterator[None]:
     The processes that they have started are ended, as by a live vehicle's end, unless another thread may have.
     """
     folder, variables, modules = Path.cwd(), dict(os.environ), list(sys.path)
-    here = threading.current_thread()
-    is_alone = here is threading.main_thread() and all(
-        each.daemon or each is here for each in threading.enumerate()
-    )
-    others, finalizers = set(_started_processes(os.getpid())), {*_finalizers()}
+    is_alone = _is_alone()
+    others, finalizers = {*_started_processes(os.getpid())}, {*_finalizers()}
     try:
         with imports_noted(lambda: present_node() is not None):
             yield
     finally:
         if is_alone:
-            _end_started(others, finalizers)
+            _end_pools(finalizers)
+            end_started(others)
         os.chdir(folder)
         sys.path[:] = modules
         if os.environ != variables:
@@ -335,17 +333,37 @@ def process_kept() -> Iterator[None]:
             os.environ.update(variables)
 
 
-def _end_started(others: set[int], finalizers: set[Any]) -> None:
-    """End the processes beyond those that were there, and pools first: they would start others in their place."""
+@contextmanager
+def orphans_ended() -> Iterator[None]:
+    """End what processes of programs that end within the block leave, unless another thread may have started it."""
+    is_alone, others = _is_alone(), {*_started_processes(os.getpid())}
+    adopts = is_alone and adoption.begin()
+    try:
+        yield
+    finally:
+        if is_alone:
+            end_started(others)
+        if adopts:
+            adoption.end()
+
+
+def _is_alone() -> bool:
+    """Return whether no other thread is at work in this process."""
+    here = threading.current_thread()
+    return here is threading.main_thread() and all(each.daemon or each is here for each in threading.enumerate())
+
+
+def _end_pools(others: set[Any]) -> None:
+    """End the pools of processes beyond those that were there: they would replace processes that are ended."""
     for key, finalizer in _finalizers().items():
-        if key not in finalizers:
+        if key not in others:
             with suppress(Exception):
                 finalizer()
-    tracker = getattr(sys.modules.get("multiprocessing.resource_tracker"), "_resource_tracker", None)
-    kept = {*others, getattr(tracker, "_pid", None)}  # it ends by itself, once it has removed what others left
-    for process in {*_started_processes(os.getpid())} - kept:
-        with suppress(ProcessLookupError):
-            os.kill(process, signal.SIGKILL)
+
+
+def end_started(others: set[int]) -> None:
+    """End the processes that this one has started or adopted, but for those that were there."""
+    end_left({*_started_processes(os.getpid())} - others)
 
 
 def _finalizers() -> dict[Any, Callable[[], object]]:
@@ -673,6 +691,7 @@ class Pipes(LocalProcesses):
         died, self._died = self._died, {}
         return died
 
+    @orphans_ended()
     def run(self, course: Coroutine[Any, Any, None]) -> None:
         """Fork the processes, and run the loop of the pacing, which waits for them. Raises KeyboardInterrupt."""
         processes = self._processes

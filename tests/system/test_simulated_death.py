@@ -108,11 +108,18 @@ def test_a_program_that_catches_all_that_ends_it_has_died_after_the_run_if_it_do
     assert died(tmp_path / "run") == ({"v02"} if status else set())
 
 
+STALL = "all(True for _ in iter(int, 1))"
+
+
 @pytest.mark.parametrize("processes", ["1", "2"])
-def test_what_a_program_has_started_ends_with_the_simulation(tmp_path: Path, processes: str) -> None:
+@pytest.mark.parametrize(("end", "status"), [("0", 0), (FAULT, 1), (STALL, 3)], ids=["ends", "fault", "stall"])
+def test_what_a_program_has_started_ends_with_the_simulation(
+    tmp_path: Path, end: str, status: int, processes: str
+) -> None:
     """Otherwise it would keep what is printed open, and who reads that would wait for ever."""
-    begins = "__import__('subprocess').Popen(['sh', '-c', 'sleep 1000; true'])"
-    ended([*command(tmp_path, begins), "--processes", processes], tmp_path, 0)
+    begins = f"__import__('subprocess').Popen(['sh', '-c', 'sleep 1000; true']); {end}"
+    words = [*command(tmp_path, begins), "--set", "run.stall_timeout_s=0.5"]
+    ended([*words, "--processes", processes], tmp_path, status)
 
 
 LATER = """

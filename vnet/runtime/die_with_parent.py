@@ -13,8 +13,12 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterable
+from pathlib import Path
 
 PR_SET_PDEATHSIG = 1
+PR_SET_CHILD_SUBREAPER = 36
+PR_GET_CHILD_SUBREAPER = 37
 STARTED_BY_VNET = "VNET_ENDS_WITH_PARENT"
 """Variable in the environment of agents, and of hosts, that an emulator or a host has started."""
 TIED = (sys.executable, "-I", "-S", __file__)
@@ -36,6 +40,48 @@ def signal_at_parent_death(number: signal.Signals) -> None:
                 os.kill(os.getpid(), number)
             return
     threading.Thread(target=_watch, args=(parent, number), daemon=True).start()
+
+
+class Adoption:
+    """Adoption of orphaned descendants by this process (on Linux), as long as somebody has asked for it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._asked = 0
+        self._before = 0
+
+    def begin(self) -> bool:
+        """Adopt orphans from now on; returns whether the system can."""
+        with self._lock, contextlib.suppress(OSError, AttributeError):
+            before = ctypes.c_int()
+            if ctypes.CDLL(None).prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(before), 0, 0, 0):
+                return False
+            if self._asked == 0:
+                self._before = before.value
+            if not before.value:  # a child that was forked within does not inherit it
+                ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+            self._asked += 1
+            return True
+        return False
+
+    def end(self) -> None:
+        """Do as before the first `begin`, once every one of them that could has had its `end`."""
+        with self._lock:
+            self._asked -= 1
+            if self._asked == 0:
+                ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, self._before, 0, 0, 0)
+
+
+adoption = Adoption()
+"""That of this process."""
+
+
+def end_left(processes: Iterable[int]) -> None:
+    """Kill what programs have left, but for Python's tracker, which ends once it has removed what others left."""
+    for process in processes:
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            if b"resource_tracker" not in Path(f"/proc/{process}/cmdline").read_bytes():
+                os.kill(process, signal.SIGKILL)
 
 
 def _watch(parent: int, number: signal.Signals) -> None:

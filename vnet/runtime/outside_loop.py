@@ -49,6 +49,8 @@ _process = os.getpid()
 _is_programs_own = False
 _before_death: list[Callable[[], None]] = []
 _status_late = 0
+_importing: set[int] = set()
+"""Threads that import a module of the user's."""
 
 
 class _Collector:
@@ -343,6 +345,21 @@ def caught(taker: Callable[[Node | None, str], None]) -> Iterator[None]:
         _end_takers.remove(taker)
 
 
+@contextmanager
+def ends_refused() -> Iterator[None]:
+    """Raise SystemExit where the present thread would end this process, if it is not a program's, in the block."""
+    global _process
+    _replace()
+    thread, _process = threading.get_ident(), os.getpid()
+    is_first = thread not in _importing
+    _importing.add(thread)
+    try:
+        yield
+    finally:
+        if is_first:
+            _importing.discard(thread)
+
+
 def count_as_death(*first: Callable[[], None]) -> None:
     """Have this process, which is that of its programs, end with a status other than 0 if one of them ends it.
 
@@ -384,6 +401,8 @@ def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
             for call_first in _before_death:
                 call_first()
             _end_as_death(node, call, status)
+        if threading.get_ident() in _importing:
+            raise SystemExit(args[0] if name == "_exit" and args else 0)
         if not _end_takers or (node is None and not threading.current_thread().name.startswith(f"{JOBS}_")):
             if _status_late and (name != "_exit" or not args or args[0] == 0):
                 sys.stderr.write(f"vnet: {call} ended the process of the tests\n")

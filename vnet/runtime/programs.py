@@ -121,9 +121,11 @@ def imports_noted(is_ours: Callable[[], bool]) -> Iterator[None]:
 
 
 def import_for_run(name: str) -> ModuleType:
-    """Import a module, and note what it imports. Raises whatever its code does."""
+    """Import a module, and note what it imports. Raises what its code does, SystemExit if it ends the process."""
+    from vnet.runtime.outside_loop import ends_refused  # asyncio, too
+
     thread = get_ident()
-    with imports_noted(lambda: get_ident() == thread):
+    with imports_noted(lambda: get_ident() == thread), ends_refused():
         return importlib.import_module(name)
 
 

@@ -6,8 +6,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest.mock import patch
@@ -68,6 +69,25 @@ def test_a_worker_is_fit_and_does_many_jobs(worker: Worker) -> None:
     with pytest.raises(VnetError, match=r"PayloadTooLargeError: payload of 3 bytes"):
         worker.call(send_too_much)
     assert worker.call(os.getpid) == worker.pid, "no error ends it"
+
+
+def start_another(pipe: str, then: Callable[[], None]) -> None:
+    """Start a process that keeps a pipe open for writing."""
+    subprocess.Popen(["sleep", "1000"], stdout=os.open(pipe, os.O_WRONLY))
+    then()
+
+
+@pytest.mark.parametrize("then", [os.getpid, os.abort])
+def test_what_a_job_has_started_ends_with_its_worker(tmp_path: Path, then: Callable[[], None]) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    one = Worker(Place.here(SCENARIO))
+    with suppress(WorkerDiedError):
+        one.call(start_another, str(tmp_path / "pipe"), then)
+    one.close()
+    os.set_blocking(reader, True)
+    assert os.read(reader, 1) == b"", "nobody has it open any more"
+    os.close(reader)
 
 
 def test_code_that_is_not_the_same_is_refused() -> None:

@@ -82,9 +82,10 @@ def test_the_number_is_not_used_up_and_latest_stays() -> None:
     assert Path("runs/latest").readlink() == Path("beacon-1-2")
 
 
+@pytest.mark.parametrize("leave", ["sys.exit()", "os._exit(0)", "os.execv('/bin/true', ['true'])"])
 @pytest.mark.parametrize("command", ["simulate", "run"])
-def test_a_program_that_leaves_as_it_is_imported_is_no_valid_run(here: Path, command: str) -> None:
-    (here / "exits.py").write_text("import sys\nasync def main(node): ...\nsys.exit()\n")
+def test_a_program_that_leaves_as_it_is_imported_is_no_valid_run(here: Path, command: str, leave: str) -> None:
+    (here / "exits.py").write_text(f"import os, sys\nasync def main(node): ...\n{leave}\n")
     said = "vnet: program.entry = 'exits:main': importing it ended the process (exit status 0)\n"
     assert vnet(command, BEACON, *SHORT, "--program", "exits:main") == (2, said)
 
