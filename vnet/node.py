@@ -285,8 +285,9 @@ class Node:
     def event(self, name: str, /, **details: NoteDetail) -> None:
         """Record that something happened, at the present time: event `event` of `events.jsonl`.
 
-        `details` are numbers, booleans or texts. Raise ValueError for any other value, an empty name, and a name by
-        which properties know the moments of faults.
+        `details` are numbers, booleans or texts; numbers that JSON has not (NaN, infinite, beyond 64 bits) are
+        recorded as texts. Of each vehicle 10,000 events are kept. Raise ValueError for any other value, an empty
+        name, and a name by which properties know the moments of faults.
         """
         if not isinstance(name, str) or not name or name in MOMENTS_OF_FAULTS:
             raise ValueError(f"event({name!r}): a name is expected, other than {' and '.join(MOMENTS_OF_FAULTS)}")

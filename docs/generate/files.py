@@ -106,7 +106,7 @@ VERDICT = {
     "not_exercised": "list of {`name`, `reason`}",
     "trace_sha256": "SHA-256 of the trace's content, independent of its storage",
     "metrics_sha256": "SHA-256 of the metrics' content",
-    "emulated_s": "emulated length reached",
+    "emulated_s": "length of all periods that were completed",
     "start_up_s": "time until all processes had joined; 0 if simulated",
     "wall_s": "wall-clock time from time 0 to the end",
     "real_time_factor": "emulated by wall-clock time",

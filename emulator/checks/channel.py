@@ -41,7 +41,7 @@ from vnet.errors import counted, first_names
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS, NS_PER_S
 
-LOSS_BAND = 0.999
+LOSS_BAND = 1 - 1e-6
 LOSS_SIGMAS = 4.9
 """Half-width of the band of measured losses, in standard deviations: one sound run in a million is outside."""
 IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.out_of_range))
@@ -315,7 +315,7 @@ def check_loss_rate(recorded: RecordedRun) -> Finding:
     wrong_way = recorded.outcome_is("lost") if lost > high else drawing & ~recorded.outcome_is("lost")
     outside = not low <= lost <= high
     rows = recorded.rows(wrong_way) if outside else []
-    return result(int(outside), text, f"{text}: outside the {LOSS_BAND:.1%} band", rows, **figures)
+    return result(int(outside), text, f"{text}: outside the {LOSS_BAND:.4%} band", rows, **figures)
 
 
 def _check_measured_losses(recorded: RecordedRun) -> Finding:

@@ -186,7 +186,7 @@ CHECKS: list[Check] = [
         RADIO,
         "Of the receptions that no fault decided and that could be decoded, the share `radio.loss` is lost; with "
         "links over time that of their losses.",
-        invalid="outside the binomial 99.9 % band, or lost on a link that loses nothing",
+        invalid="outside the binomial 99.9999 % band, or lost on a link that loses nothing",
         unknown="no reception came so far",
         not_applicable=NOBODY_IN_RANGE,
         without_positions=WithoutPositions.UNKNOWN,

@@ -3,20 +3,21 @@
 A predicate is asked at each *moment*: once for each vehicle and period in which it is in the network, and at each
 event. It answers True, False, or None where it has nothing to say. A moment that has no value of a name that the
 predicate reads, as a vehicle that is down, is skipped. Each function returns a `Result`, for a check of one's own;
-a failure says when, who, and what had happened to the vehicle before.
+a failure says when, who, and what had happened to the vehicle before. What could be otherwise with events that were
+left out, because a vehicle had too many, is unknown.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from emulator.checks.own import Result
-from emulator.records.events import EventKind
+from emulator.records.events import MOST_EVENTS, EventKind
 from emulator.records.parting import before
 from emulator.records.run import Run
 from vnet.errors import VnetError, counted
@@ -37,9 +38,9 @@ class NoValue(KeyError):
 class Moment:
     """One vehicle at one time: at a period's start, or at an event of it.
 
-    `values` has, by name, what it reported (`m["speed_m_s"]`) and, of a period, the columns of states, with the
-    truth: `position_m`, `common_error_m` …; of an event its details. `fault_started` and `fault_ended` are events
-    of each node on which the fault acted when it started, with `fault`, its label, and `kind`.
+    `values` has, by name, what it reported last in the period (`m["speed_m_s"]`), and the columns of states, with
+    the truth: `position_m`, `common_error_m` …; of an event its details. `fault_started` and `fault_ended` are
+    events of each node on which the fault acted when it started, with `fault`, its label, and `kind`.
     """
 
     time_ns: int
@@ -95,7 +96,8 @@ def moments(run: Run, at: str = PERIOD) -> list[Moment]:
 def _periods(run: Run) -> Iterator[Moment]:
     for row in run.states.to_pylist():
         if not np.isnan(row["position_m"]).any():
-            yield Moment(row["time_ns"], row["node"], values=row)
+            more = {name: one[0] if len(one) == 1 else one for name, one in row.get("values") or ()}
+            yield Moment(row["time_ns"], row["node"], values=more | row)
 
 
 def _events(run: Run) -> Iterator[Moment]:
@@ -137,41 +139,54 @@ def eventually(
 ) -> Result:
     """Judge that a predicate becomes true of each vehicle, within so many seconds of its coming into the network.
 
-    `nodes` are the vehicles of which it is asked, by default all; one without any moment fails as well. One that is
-    in the network for less than `within_s` before the end of the run counts only if the predicate has come true.
-    Unknown if the run has no vehicle of such a name.
+    `nodes` are the vehicles of which it is asked, by default all; one without any moment fails as well. With
+    `within_s` it is asked of each stay in the network; one that is shorter, as before the end of the run, counts
+    only if the predicate has come true. Unknown if the run has no vehicle of such a name.
     """
     _check_within(name, within_s)
     if missing := sorted({*(nodes or ())} - {*run.nodes}):
         return Result(name, "unknown", f"there is no vehicle {', '.join(missing)}")
     present = moments(run)
-    entered_s = {m.node: m.time_s for m in reversed(present) if nodes is None or m.node in nodes}
-    reached: dict[str, float] = {}
+    among = [moment for moment in present if nodes is None or moment.node in nodes]
+    stays = _stays(among, math.inf if math.isinf(within_s) else _period_ns(run))
+    reached: dict[tuple[str, int], float] = {}
     for moment in present if at == PERIOD else moments(run, at):
-        if moment.node not in entered_s or moment.node in reached:
+        mine = stays.get(moment.node, ())
+        entered_ns = max((since_ns for since_ns, _ in mine if since_ns <= moment.time_ns), default=None)
+        if entered_ns is None or (moment.node, entered_ns) in reached:
             continue
-        waited_s = moment.time_s - entered_s[moment.node]
+        waited_s = (moment.time_ns - entered_ns) / NS_PER_S
         if waited_s <= within_s + _ROUNDING_S and _ask(name, predicate, moment):
-            reached[moment.node] = waited_s
-    end_s = _end_ns(run) / NS_PER_S
+            reached[moment.node, entered_ns] = waited_s
     late = [
-        Moment(round(entered_s[node] * NS_PER_S), node)
-        for node in sorted(entered_s.keys() - reached.keys(), key=lambda node: (entered_s[node], node))
-        if math.isinf(within_s) or entered_s[node] + within_s <= end_s + _ROUNDING_S
+        Moment(since_ns, node)
+        for since_ns, node, last_ns in sorted((since, node, last) for node in stays for since, last in stays[node])
+        if (node, since_ns) not in reached
+        and (math.isinf(within_s) or since_ns + within_s * NS_PER_S <= last_ns + _period_ns(run) + 1)
     ]
-    if late:
+    gone = _events_gone(run, at)
+    if surely := [moment for moment in late if moment.node not in gone]:
         limit = "" if math.isinf(within_s) else f" within {within_s:g} s"
-        return _failed(run, name, late, f"never came true{limit}")
+        return _failed(run, name, surely, f"never came true{limit}")
+    if late:
+        return _unheard(run, name)
     if not reached:
-        why = f"no vehicle is there for {within_s:g} s" if entered_s else "no such vehicle enters the network"
+        why = f"no vehicle is there for {within_s:g} s" if stays else "no such vehicle enters the network"
         return Result(name, "unknown", why)
     slowest_s = max(reached.values())
-    return Result(
-        name,
-        "valid",
-        f"true of {counted(len(reached), 'vehicle')} within {slowest_s:g} s",
-        {"slowest_s": slowest_s},
-    )
+    text = f"true of {counted(len({node for node, _ in reached}), 'vehicle')} within {slowest_s:g} s"
+    return Result(name, "valid", text, {"slowest_s": slowest_s})
+
+
+def _stays(present: Sequence[Moment], gap_ns: float) -> dict[str, list[tuple[int, int]]]:
+    """Return the first and the last time in ns of each stay of each vehicle; longer gaps end one."""
+    stays: dict[str, list[tuple[int, int]]] = {}
+    for moment in present:
+        mine = stays.setdefault(moment.node, [])
+        goes_on = mine and moment.time_ns - mine[-1][1] <= gap_ns
+        since_ns = mine.pop()[0] if goes_on else moment.time_ns
+        mine.append((since_ns, moment.time_ns))
+    return stays
 
 
 def leads_to(
@@ -188,25 +203,35 @@ def leads_to(
 
     `effect(moment, cause)` is given both moments: it says whether they belong together, for example
     `moment.node == cause.node`. A cause less than `within_s` before the end of the run counts only if its effect
-    came. `at` says at what moments causes are looked for, `effect_at` the same of effects, by default as `at`.
+    came. `at` says at what moments causes are looked for, `effect_at` the same of effects, by default as `at`. The
+    time of a period is its start, and that of its last report is not recorded: what a period has as an effect
+    counts if the period ends after its cause.
     """
     _check_within(name, within_s)
     causes = [moment for moment in moments(run, at) if _ask(name, cause, moment)]
     effects = moments(run, effect_at or at)
     times_ns = np.array([moment.time_ns for moment in effects], dtype=np.int64)
-    end_ns = _end_ns(run)
+    period_ns, end_ns = _period_ns(run), _end_ns(run, effect_at or at)
     within_ns = round(min(within_s * NS_PER_S, end_ns))
-    failed, delays_s = [], []
+    gone = _events_gone(run, effect_at or at)
+    failed, delays_s, is_unheard = [], [], bool(_events_gone(run, at))
     for moment in causes:
-        first, last = np.searchsorted(times_ns, [moment.time_ns, moment.time_ns + within_ns + 1])
-        found = next((each for each in effects[first:last] if _ask(name, effect, each, moment)), None)
-        if found is not None:
-            delays_s.append(found.time_s - moment.time_s)
-        elif math.isinf(within_s) or moment.time_ns + within_ns < end_ns:
+        since_ns = moment.time_ns - (period_ns - 1 if moment.event else 0)
+        first, last = np.searchsorted(times_ns, [since_ns, moment.time_ns + within_ns + 1])
+        found = (each for each in effects[first:last] if each.time_ns >= moment.time_ns or not each.event)
+        if effect_of := next((each for each in found if _ask(name, effect, each, moment)), None):
+            delays_s.append(max(0.0, effect_of.time_s - moment.time_s))
+        elif not (math.isinf(within_s) or moment.time_ns + within_ns < end_ns):
+            continue
+        elif any(since_ns <= moment.time_ns + within_ns for since_ns in gone.values()):
+            is_unheard = True
+        else:
             failed.append(moment)
     if failed:
         limit = "" if math.isinf(within_s) else f" within {within_s:g} s"
         return _failed(run, name, failed, f"was not followed{limit}", of=len(causes))
+    if is_unheard:
+        return _unheard(run, name)
     if not delays_s:
         late = f"{counted(len(causes), 'cause')} came less than {within_s:g} s before the end of the run"
         return Result(name, "unknown", late if causes else "the cause never came true")
@@ -215,8 +240,36 @@ def leads_to(
     return Result(name, "valid", text, {"slowest_s": slowest_s})
 
 
-def _end_ns(run: Run) -> int:
-    return round(len(run.times_s) * run.period_s * NS_PER_S)
+def _period_ns(run: Run) -> int:
+    return round(run.period_s * NS_PER_S)
+
+
+def _end_ns(run: Run, at: str) -> int:
+    """Return the time up to which a run has such moments: periods that are complete, or events to its end."""
+    periods_ns = len(run.times_s) * _period_ns(run)
+    ended = [event.time_ns for event in run.events if event.kind == EventKind.ended]
+    return max([periods_ns, *ended]) if at == EVENT else periods_ns
+
+
+def _left_out(run: Run) -> dict[str, int]:
+    """Return how many events of each vehicle's program were left out."""
+    told = [event for event in run.events if event.kind == EventKind.left_out and event.details["what"] == "event"]
+    return {str(event.node): int(event.details["count"]) for event in told}
+
+
+def _events_gone(run: Run, at: str) -> dict[str, int]:
+    """Return the vehicles of which events among such moments were left out, with the time of the last one kept."""
+    out = {} if at == PERIOD else _left_out(run)
+    kept = [event for event in run.events if event.kind == EventKind.event and event.node in out]
+    return {str(event.node): event.time_ns for event in kept}
+
+
+def _unheard(run: Run, name: str) -> Result:
+    """Return the result of a property that depends on events that were left out."""
+    out = _left_out(run)
+    first, others = min(out), f" and {counted(len(out) - 1, 'other')}" if len(out) > 1 else ""
+    count = counted(sum(out.values()), "event")
+    return Result(name, "unknown", f"{count} of {first}{others} left out: {MOST_EVENTS:,} are kept of each vehicle")
 
 
 def _check_within(name: str, within_s: float) -> None:
@@ -253,6 +306,8 @@ def _held(run: Run, name: str, predicate: Predicate, at: str, wanted: bool) -> R
     if not asked and (wanted or not is_quiet):
         values = "".join(f": none has a value {value!r}" for value in sorted(missing)[:1])
         return Result(name, "unknown", f"the predicate had nothing to say at any moment{values}")
+    if _events_gone(run, at):
+        return _unheard(run, name)
     of = f"{len(asked):,} of " if len(asked) < len(answers) else ""
     text = f"{'true' if wanted else 'false'} at {of}{counted(len(answers), 'moment')}"
     return Result(name, "valid", text, {"moments": len(asked)})

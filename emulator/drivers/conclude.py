@@ -53,13 +53,12 @@ def _start_up_s(emulation: Emulation) -> float | None:
 def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
     """Return the tables of a run that is over. None of them is kept yet."""
     folder = emulation.folder
-    emulation.log_book.tell_left_out(emulation.emulated_ns)
+    over_ns = emulation.emulated_ns if emulation.ended_ns is None else emulation.ended_ns
+    emulation.log_book.tell_left_out(over_ns)
     for node, left_out in collect(folder, emulation.world.node_ids, emulation.scenario.run.files_max_mb).items():
-        folder.event(
-            emulation.emulated_ns, EventKind.files_left_out, node, count=left_out.count, which=left_out.which
-        )
+        folder.event(over_ns, EventKind.files_left_out, node, count=left_out.count, which=left_out.which)
     metrics = emulation.metrics.metrics_table()  # figures that fail are an event
-    folder.event(emulation.emulated_ns, EventKind.ended, wall_s=round(wall_s, 3))
+    folder.event(over_ns, EventKind.ended, wall_s=round(wall_s, 3))
     return RecordedRun(
         emulation.scenario,
         emulation.engine.trace.to_table(),

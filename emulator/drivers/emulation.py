@@ -33,7 +33,7 @@ from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.radio.topology import connectivity_of
 from emulator.records.costs import Costs
-from emulator.records.events import KINDS, EventKind
+from emulator.records.events import KINDS, MOST_EVENTS, EventKind
 from emulator.records.metrics import Metrics
 from emulator.records.run_folder import RunFolder
 from emulator.records.samples import SampleRecorder
@@ -345,8 +345,8 @@ class BusyFeed:
 MOST_EXCEPTIONS = 20
 """Unhandled exceptions of a node that are written down, with their tracebacks; further ones are counted."""
 MOST_NOTES = 1000
-"""Log lines of a node that are written down, and as many of its events; further ones are counted."""
-MOST = {"exception": MOST_EXCEPTIONS, "log": MOST_NOTES, "event": MOST_NOTES}
+"""Log lines of a node that are written down; further ones are counted."""
+MOST = {"exception": MOST_EXCEPTIONS, "log": MOST_NOTES, "event": MOST_EVENTS}
 LONGEST_TEXT = 4000
 """Characters of a text that are written down."""
 MOST_DETAILS = 50

@@ -24,6 +24,8 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
+from itertools import pairwise
+from statistics import median
 
 import numpy as np
 
@@ -37,14 +39,18 @@ from emulator.scenario.radio import CrLimit, LteMode4, NrMode2, Receiver
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio, least_transit_ns
 from vnet.types import Array, IntArray, Mask
-from vnet.units import NS_PER_MS
+from vnet.units import NS_PER_MS, NS_PER_S
 
 REPEAT_SLOTS = 15
 """Most slots from a transmission to its blind retransmission (TS 36.321)."""
 UNUSED = 3
 """Reservations in succession that a sender may leave unused before it gives them up (sl-ReselectAfter)."""
 INTERVALS = 8
-"""Intervals between frames from whose mean a period is learned."""
+"""Intervals between frames from whose median a period is learned."""
+INSTANT_NS = NS_PER_MS
+"""Time within which frames of a sender are of one instant, as programs in real time send them."""
+MOST_FLOWS = {LteMode4: 2, NrMode2: 16}
+"""Most reservations of one period for frames of one instant: sidelink processes (TS 36.321, 5.14.1; TS 38.321)."""
 ONE_SHOT = 2, 6
 """Least and largest number of frames from one that is sent on a resource of its own to the next (J3161/1)."""
 OCCUPANCY_MS = 1000
@@ -86,24 +92,46 @@ class _Grant:
 
 @dataclass(slots=True, eq=False)
 class _Station:
-    """A sender: its flows by the period that their frames tell (0 for none), and the slots that it has booked.
+    """A sender: its flows, and the slots that it has booked.
 
-    `frames` counts those that wait, or will be ready; `ready_ns` is when the last of them is. Those in a throttle's
-    queue do not count. `used` are the last slots and lengths of its transmissions.
+    A flow has the frames that tell one period (0 for none). Of those that come at one instant, again and again,
+    each has its own: their numbers, and 0 for all others, are the second part of the key. `frames` counts those
+    that wait, or will be ready; `ready_ns` is when the last of them is. Those in a throttle's queue do not count.
+    `used` are the last slots and lengths of its transmissions.
     """
 
     node: int
-    flows: dict[float, _Flow] = field(default_factory=dict)
+    flows: dict[tuple[float, int], _Flow] = field(default_factory=dict)
+    bursts: dict[float, _Burst] = field(default_factory=dict)
+    flow_of: dict[Transmission, _Flow] = field(default_factory=dict)
+    """The flows of the frames that are not ready yet."""
     frames: int = 0
     ready_ns: int = 0
     booked: set[int] = field(default_factory=set)
     used: deque[tuple[int, int]] = field(default_factory=deque)
 
-    def flow(self, period_ms: float) -> _Flow:
-        """Return the flow of the frames that tell a period."""
-        if period_ms not in self.flows:
-            self.flows[period_ms] = _Flow(self)
-        return self.flows[period_ms]
+    def flow(self, frame: Frame, most: int) -> _Flow:
+        """Return the flow of a frame that comes, one of `most` for the frames of an instant."""
+        key = frame.period_ms, self.bursts.setdefault(frame.period_ms, _Burst()).number(frame.sent_ns, most)
+        if key not in self.flows:
+            self.flows[key] = _Flow(self)
+        return self.flows[key]
+
+
+@dataclass(slots=True, eq=False)
+class _Burst:
+    """Frames of one period that a sender enqueues at one instant: how many now, and how many the time before."""
+
+    time_ns: int = -NS_PER_S
+    count: int = 0
+    before: int = 0
+
+    def number(self, sent_ns: int, most: int) -> int:
+        """Return the number of a frame in its instant, or 0 where the instant before had no such frame."""
+        if sent_ns >= self.time_ns + INSTANT_NS:
+            self.time_ns, self.before, self.count = sent_ns, self.count, 0
+        self.count += 1
+        return self.count - 1 if self.count <= min(self.before, most) else 0
 
 
 @dataclass(slots=True, eq=False)
@@ -179,6 +207,7 @@ class Sidelink(Mac):
         self._meter = BusyMeter(mac, signals.count, 2 * least_transit_ns(radio) + 2 * WINDOW_NS)
         self._is_dynamic = isinstance(mac, NrMode2) and mac.scheduling == "dynamic"
         self._checks_again = isinstance(mac, NrMode2) and mac.re_evaluation
+        self._most_flows = MOST_FLOWS[type(mac)]
         self._one_shot = isinstance(mac, LteMode4) and mac.one_shot
         self._throttle = ThrottledQueue()
         self._stations: dict[int, _Station] = {}
@@ -205,21 +234,24 @@ class Sidelink(Mac):
         station = self._stations.get(frame.sender)
         if station is None:
             station = self._stations[frame.sender] = _Station(frame.sender)
+        flow = station.flow(frame, self._most_flows)
         sent.signal = self._signals.of(frame)
         ready_ns = frame.sent_ns
         if self._jitter_ns:
             ready_ns += int(self._jitter_ns * sender_draw(sent, JITTER))
         if self._throttle.slows(frame.sender):
-            station.flow(frame.period_ms).sent_ns.append(frame.sent_ns)  # later ones may be ready before it
+            flow.sent_ns.append(frame.sent_ns)  # later ones may be ready before it
             slow_ns = self._throttle.put(frame, max(ready_ns, station.ready_ns), self._limit)
             if slow_ns is None:
                 self._leave(sent, Outcome.queue_full, frame.sent_ns)
             else:
+                station.flow_of[sent] = flow
                 self._plan(slow_ns, SLOWLY_READY, frame.sender, sent)
         elif station.frames >= self._limit:
             self._leave(sent, Outcome.queue_full, frame.sent_ns)
         else:
             station.frames += 1
+            station.flow_of[sent] = flow
             station.ready_ns = max(ready_ns, station.ready_ns)
             self._plan(station.ready_ns, READY, frame.sender, sent)
 
@@ -255,29 +287,29 @@ class Sidelink(Mac):
             self._check_again(about)
         else:
             assert about is not None
-            station, frame = self._stations[node], about.frame
+            station = self._stations[node]
+            flow = station.flow_of.pop(about)
             if kind == READY:
-                station.flow(frame.period_ms).sent_ns.append(frame.sent_ns)
+                flow.sent_ns.append(about.frame.sent_ns)
             elif station.frames < self._limit:
                 station.frames += 1
             else:
                 self._leave(about, Outcome.queue_full, self._now_ns)
                 return
-            self._ready(station, about)
+            self._ready(flow, about)
 
     def _draw(self, frame: Frame, index: int) -> float:
         return float(self._draws.uniform(frame.sender, frame.seq, _TIES, frame.draw)[index])
 
     # Selecting resources.
 
-    def _ready(self, station: _Station, sent: Transmission) -> None:
+    def _ready(self, flow: _Flow, sent: Transmission) -> None:
         """Give a frame a place in its flow's grant, or a resource of its own."""
         frame, slot = sent.frame, self._now_ns // self._slot_ns
-        flow = station.flow(frame.period_ms)
         length = self._link.length(frame.size_bytes)
         grant = flow.grant
         if grant is not None and grant.length < length:
-            station.booked.discard(grant.slot)
+            flow.station.booked.discard(grant.slot)
             flow.grant = grant = None
         if self._is_dynamic:
             self._send_alone(flow, sent, slot)
@@ -312,9 +344,10 @@ class Sidelink(Mac):
         """Return the reservation interval in slots: what a program says, or what its frames' intervals are."""
         period_ms = frame.period_ms or self._mac.reservation_ms
         times_ns = flow.sent_ns
-        if not frame.period_ms and len(times_ns) > 1 and times_ns[-1] > times_ns[0]:
-            mean_ms = (times_ns[-1] - times_ns[0]) / (len(times_ns) - 1) / NS_PER_MS
-            period_ms = min(self._mac.periods_ms, key=lambda each: (abs(each - mean_ms), each))
+        intervals_ns = [later - ns for ns, later in pairwise(times_ns) if later >= ns + INSTANT_NS]
+        if intervals_ns and not frame.period_ms:
+            usual_ms = median(intervals_ns) / NS_PER_MS  # of whoever was silent for a while the mean is long
+            period_ms = min(self._mac.periods_ms, key=lambda each: (abs(each - usual_ms), each))
         return period_ms * NS_PER_MS // self._slot_ns
 
     def _reserve(self, flow: _Flow) -> None:

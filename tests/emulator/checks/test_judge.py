@@ -264,7 +264,7 @@ def test_a_delivery_to_someone_out_of_range_breaks_range_and_conservation(line: 
 
 def test_the_loss_rate_is_valid_up_to_the_border_of_its_band_and_invalid_beyond(line: RecordedRun) -> None:
     drawn = int(line.outcome_is("lost", "delivered").sum())
-    low, high = binomial_interval(0.999, drawn, 0.2)
+    low, high = binomial_interval(1 - 1e-6, drawn, 0.2)
     assert damaged(line, with_lost(line, low)) == damaged(line, with_lost(line, high)) == {}
     for lost in (low - 1, high + 1):
         found = damaged(line, with_lost(line, lost))

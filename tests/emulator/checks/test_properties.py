@@ -2,17 +2,19 @@
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from emulator.api import simulate
 from emulator.checks.properties import Moment, always, eventually, leads_to, moments, never
-from emulator.records.events import Event
+from emulator.records.events import Event, EventKind
+from emulator.records.parting import RECEPTION
 from emulator.records.run import Run
 from emulator.testing.harness import RunHarness
 from emulator.testing.scenarios import make_scenario
@@ -342,3 +344,110 @@ def test_events_of_a_run_and_moments_of_a_property_are_named_alike() -> None:
     assert found == [("warned", {"number": 3}), ("crashed", {"error": "tired"}), ("", {})]
     run = cast(Run, SimpleNamespace(events=[own, vnets, foreign], scenario=SimpleNamespace(fault=[])))
     assert [(m.name, m.values) for m in moments(run, "event")] == [(e.name, e.values) for e in run.events]
+
+
+# What a run does not have: events that were left out, reports between two periods, vehicles that leave.
+
+MS = 1_000_000
+
+
+def made(
+    events: Sequence[Event] = (),
+    rows: Mapping[str, Sequence[dict[str, Any] | None]] | None = None,
+    periods: int = 10,
+) -> Run:
+    """Return a run of periods of 100 ms with these events, and what each vehicle has reported in each period."""
+    there = [
+        {"time_ns": number * 100 * MS, "node": node, "position_m": [0.0, 0.0], "values": None, **row}
+        for node, its in (rows or {"v01": [{}] * periods}).items()
+        for number, row in enumerate(its)
+        if row is not None
+    ]
+    trace = pa.table({name: pa.array([], pa.string()) for name in RECEPTION})
+    return cast(
+        Run,
+        SimpleNamespace(
+            events=events,
+            scenario=SimpleNamespace(fault=[]),
+            states=SimpleNamespace(to_pylist=lambda: there),
+            trace=trace,
+            nodes=sorted({row["node"] for row in there}),
+            times_s=np.arange(periods) / 10,
+            period_s=0.1,
+        ),
+    )
+
+
+def said(name: str, time_ms: int, node: str = "v01") -> Event:
+    return Event(time_ms * MS, EventKind.event, node, {"name": name, "details": {}})
+
+
+LEFT_OUT = Event(1000 * MS, EventKind.left_out, "v01", {"what": "event", "count": 7})
+
+
+def named(name: str) -> Callable[..., bool]:
+    return lambda moment, cause=None: moment.name == name
+
+
+@pytest.mark.parametrize("at", ["event", "any"])
+def test_events_that_were_left_out_leave_unknown_what_they_could_change(at: str) -> None:
+    kept = [said("tick", 100), said("ask", 200)]
+    out = made([*kept, LEFT_OUT])
+    assert never(out, "disaster", named("disaster"), at=at).verdict == "unknown"
+    assert never(out, "ask", named("ask"), at=at).verdict == "invalid", "whatever else there was"
+    assert eventually(out, "answer", named("answer"), 0.5, at=at).verdict == "unknown"
+    assert leads_to(out, "answers", named("ask"), named("answer"), 0.5, at=at).verdict == "unknown"
+    assert leads_to(out, "answers", named("tick"), named("ask"), 0.5, at=at).verdict == "unknown", "other ticks"
+    soon = leads_to(out, "answers", named("tick"), named("answer"), 0.05, at=at)
+    assert soon.verdict == "invalid", "the last that was kept is later"
+    assert never(out, "values", lambda m: False).verdict == "valid", "of periods nothing is left out"
+
+
+def test_other_vehicles_and_kinds_of_events_are_judged_as_ever() -> None:
+    logs = made([said("tick", 100), Event(MS, EventKind.left_out, "v01", {"what": "log", "count": 7})])
+    assert never(logs, "disaster", named("disaster"), at="event").verdict == "valid"
+    two = made([said("tick", 100), LEFT_OUT], {"v01": [{}] * 10, "v02": [{}] * 10})
+    failed = eventually(two, "answer", named("answer"), 0.5, at="event")
+    assert failed.verdict == "invalid" and failed.figures["rows"] == [{"node": "v02", "time_s": 0.0}]
+
+
+def test_what_is_reported_in_the_rest_of_its_causes_period_follows_it() -> None:
+    rows = {"v01": [{"got": number == 5} for number in range(10)]}
+    run = made([said("packet", 553)], rows)
+    followed = leads_to(run, "got", named("packet"), lambda m, cause: m["got"], within_s=0.04)
+    assert followed.verdict == "valid" and followed.figures["slowest_s"] == 0.0
+    before = leads_to(made([said("packet", 600)], rows), "got", named("packet"), lambda m, cause: m["got"], 0.2)
+    assert before.verdict == "invalid", "its period is over"
+
+
+def test_an_event_before_its_cause_is_no_effect() -> None:
+    run = made([said("answer", 520), said("ask", 553)])
+    assert leads_to(run, "answers", named("ask"), named("answer"), 0.2).verdict == "invalid"
+
+
+def test_causes_near_the_end_of_a_run_that_ends_within_a_period() -> None:
+    end = Event(1090 * MS, EventKind.ended, None, {})
+    run = made([said("ask", 1020), end])
+    assert leads_to(run, "answers", named("ask"), named("answer"), 0.02, at="event").verdict == "invalid"
+    assert leads_to(run, "answers", named("ask"), named("answer"), 0.02).verdict == "unknown", "nor has it periods"
+
+
+def test_a_property_sees_lists_and_names_without_a_column() -> None:
+    run = made(rows={"v01": [{"values": [("vec", [1.0, 2.0]), ("n63", [3.0])]}] * 10})
+    assert always(run, "vec", lambda m: m["vec"] == [1.0, 2.0]).verdict == "valid"
+    assert always(run, "n63", lambda m: m["n63"] == 3.0).verdict == "valid"
+
+
+@pytest.mark.parametrize(
+    ("ready", "verdict"),
+    [
+        ([False, False, None, None, False, True, False, False, False, False], "valid"),
+        ([False, False, None, None, False, False, False, False, False, True], "invalid"),
+        ([True, False, None, None, False, False, False, False, False, False], "invalid"),
+        ([False, False, None, None, None, None, None, None, None, False], "unknown"),
+    ],
+    ids=["leaves early", "second stay late", "second stay never", "too short"],
+)
+def test_eventually_is_asked_of_each_stay_that_is_long_enough(ready: list[bool | None], verdict: str) -> None:
+    run = made(rows={"v01": [None if each is None else {"ready": each} for each in ready]})
+    assert eventually(run, "ready", lambda m: m["ready"], within_s=0.4).verdict == verdict

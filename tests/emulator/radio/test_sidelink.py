@@ -165,6 +165,27 @@ def test_a_period_is_learned_from_frames_where_a_program_does_not_say_it() -> No
     assert gaps[50] > 0.7 * len(rows)
 
 
+@pytest.mark.parametrize("radio", [LTE, NR])
+def test_a_silence_is_no_interval_of_the_frames_after_it(radio: dict[str, Any]) -> None:
+    rows = sent(radio, ((n * 100 * MS, 1, None) for n in [*range(20), *range(70, 110)]))[20:]
+    gaps = Counter((b["on_air_ns"] - a["on_air_ns"]) // MS for a, b in pairwise(rows))
+    assert gaps[100] > 0.7 * len(rows)
+
+
+@pytest.mark.parametrize("apart_ns", [0, MS // 10])
+@pytest.mark.parametrize("period_ms", [None, 100])
+@pytest.mark.parametrize("radio", [LTE, NR])
+def test_frames_that_come_together_have_a_reservation_each(
+    radio: dict[str, Any], period_ms: int | None, apart_ns: int
+) -> None:
+    frames = ((n * 100 * MS + k * apart_ns, (100, 120)[k], period_ms) for n in range(60) for k in range(2))
+    rows = sent(with_mac(radio, keep_probability=0.8), frames)
+    for size in (100, 120):
+        on_air_ns = [row["on_air_ns"] for row in rows if row["size_bytes"] == size][10:]
+        assert sum(after - before == 100 * MS for before, after in pairwise(on_air_ns)) >= 0.8 * len(on_air_ns)
+    assert len({row["on_air_ns"] for row in rows}) == len(rows)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("radio", [LTE, NR])
 def test_flows_of_two_periods_have_a_reservation_each(radio: dict[str, Any]) -> None:
