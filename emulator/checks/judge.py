@@ -411,7 +411,7 @@ CHECKS: list[Check] = [
         f"half of a process's life, and by at least {FLOOR_KIB:g} KiB in all without a step or two. The emulator's "
         "own process keeps the trace and is not judged.",
         unknown="a process exceeded `run.memory_limit_mb`, which ended the run",
-        not_applicable="not measured by vnet simulate, or measured for less than 30 s",
+        not_applicable="no process of a program was measured, as by vnet simulate, or for less than 30 s",
         without_positions=WithoutPositions.JUDGE,
         subject=Subject.MACHINE,
     ),

@@ -53,7 +53,31 @@ def check_transport(recorded: RecordedRun) -> Finding:
             f"{counted(gaps, 'gap')} in sequence numbers, {missing} that never arrived: the machine, not the radio"
         )
         return unknown(text, gaps=gaps, lost=count)
+    if unheard := _without_a_program(recorded):
+        names, count = sorted({row["node"] for row in unheard}), sum(row["count"] for row in unheard)
+        text = f"{counted(count, 'delivery', 'deliveries')} to {first_names(names)} while no program was connected"
+        return unknown(text, rows=unheard)
     return valid("no message between agents and emulator went missing", gaps=0)
+
+
+def _without_a_program(recorded: RecordedRun) -> list[dict[str, Any]]:
+    """Return the times at which a vehicle whose programs others have started had none, and what arrived in them."""
+    since_ns: dict[str, int] = {}
+    times = []
+    for event in [*recorded.event(EventKind.session_gone, EventKind.session_back, EventKind.ended)]:
+        if event.kind == EventKind.session_gone:
+            since_ns[event.node or ""] = event.time_ns
+        else:
+            back = [event.node] if event.node else list(since_ns)
+            times += [(node, since_ns.pop(node), event.time_ns) for node in back if node in since_ns]
+    delivered = recorded.trace.filter(recorded.outcome_is("delivered"))
+    receiver, arrival_ns = delivered["receiver"].cast(pa.string()), delivered["arrival_ns"]
+    rows = []
+    for node, from_ns, to_ns in times:
+        within = pc.and_(pc.greater_equal(arrival_ns, from_ns), pc.less(arrival_ns, to_ns))
+        count = pc.sum(pc.and_(pc.equal(receiver, node), within)).as_py() or 0
+        rows += [{"node": node, "from_ns": from_ns, "to_ns": to_ns, "count": count}] if count else []
+    return rows
 
 
 def check_agents_alive(recorded: RecordedRun) -> Finding:
@@ -423,7 +447,7 @@ def check_memory(recorded: RecordedRun) -> Finding:
         e for e in recorded.event(EventKind.memory) if e.node in recorded.number and "private_kb" in e.details
     ]
     if not measured:
-        return not_exercised("not measured by vnet simulate")
+        return not_exercised("no process of a program was measured")
     judged = [e for e in measured if is_long_enough(e.details["time_s"])]
     if not judged:
         return not_exercised("no process was measured for 30 s")

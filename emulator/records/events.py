@@ -164,6 +164,10 @@ class EventKind(StrEnum):
     extra_session = (
         "extra_session", "vehicle", "count limit which", "more Zenoh sessions than `program.zenoh.sessions` are "
         "connected to its endpoint: a way around the radio, and no isolation", FAILURE)
+    session_gone = (
+        "session_gone", "vehicle", "", "the last Zenoh session of its programs, which others have started, is "
+        "gone: what arrives from now on reaches no program", WARNING)
+    session_back = "session_back", "vehicle", "", "there is one again", CHANGE
     found_session = (
         "found_session", "vehicle", "which", "this session of its program is a peer that others find by multicast, "
         "past the radio: mode `client`, which `Config.from_env()` has, prevents it", FAILURE)

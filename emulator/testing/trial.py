@@ -28,7 +28,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.cells.cells import BROKEN, MOST_TRIES, WorkerPool, worker_died
-from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
+from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly, temporary_prefix
 from emulator.checks.judge import Verdict
 from emulator.checks.replay import compare_tables, events_table, first_call
 from emulator.drivers.determinism import calls_recorded, scattered
@@ -127,7 +127,7 @@ def _difference_of_another(emulation: Emulation) -> str:
     """Simulate a run again, in two processes, without windows, at other addresses; returns what differs, or ""."""
     scenario = emulation.scenario
     scenario = scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": False})})
-    with tempfile.TemporaryDirectory(prefix="vnet-again-") as name:
+    with tempfile.TemporaryDirectory(prefix=temporary_prefix(os.getpid())) as name:
         folder = RunFolder.scratch(Path(name) / "run")
         again = Session(scenario, folder, Local(processes=2))
         with calls_recorded(folder.path, True), scattered():
@@ -253,7 +253,7 @@ def _get_ready() -> None:
 
 def _run_elsewhere(scenario: Scenario, limit_s: float, twice: bool, tries: int) -> Trial:
     """Run a trial in a worker on any machine, and keep nothing but its result."""
-    with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
+    with tempfile.TemporaryDirectory(prefix=temporary_prefix(os.getpid())) as name:
         return _run_unkept(scenario, Path(name) / "run", limit_s, twice, tries)
 
 

@@ -3,8 +3,10 @@
 import json
 import re
 import socket
+import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from pathlib import Path
 from typing import Any, cast
@@ -14,7 +16,9 @@ import pytest
 import zenoh
 
 from emulator.records.disk import LARGEST_LOG_BYTES, log_is_full
+from tests.support.forked_commands import VNET, Command
 from tests.support.paths import ROOT
+from tests.system.by_hand import finish, line_of
 from tests.system.conftest import Finished, Vnet
 from vnet.transport.authority import issue_certificates
 
@@ -252,6 +256,29 @@ def test_programs_in_python_are_clients_of_their_vehicle_whatever_they_open(vnet
     delivered = Counter((row["receiver"], row["sender"]) for row in done.trace() if row["outcome"] == "delivered")
     assert 0 < heard(done, "v01")["v02"] <= delivered["v01", "v02"]
     assert 0 < heard(done, "v03")["v04"] <= delivered["v03", "v04"]
+
+
+def test_who_has_no_program_any_more_makes_the_run_unknown(tmp_path: Path) -> None:
+    """Others have started the program, so that nothing but its session tells that it has ended."""
+    path = scenario(tmp_path, *SHORT, ("vehicles = 4", "vehicles = 2"), ('"v02"], ["v03", "v04"]]', '"v02"]]'))
+    words = [*VNET, "emulator", path, "--listen", "tcp/127.0.0.1:0", "--out", str(tmp_path / "run")]
+    with Command(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as emulator:
+        line_of(emulator, "waiting for")
+        endpoints = json.loads((tmp_path / "run" / "endpoints.json").read_text())
+        ways = [{"mode": "client", "connect": {"endpoints": [at]}} for at in endpoints.values()]
+        talker, listener = (zenoh.open(zenoh.Config.from_json5(json.dumps(way))) for way in ways)
+        samples = listener.declare_subscriber("pose", zenoh.handlers.FifoChannel(1000))
+        while samples.try_recv() is None:
+            talker.put("pose", "here")
+            time.sleep(0.01)
+        listener.close()  # type: ignore[no-untyped-call]
+        while emulator.poll() is None:
+            talker.put("pose", "here")
+            time.sleep(0.01)
+        talker.close()  # type: ignore[no-untyped-call]
+        done = finish(emulator, tmp_path / "run")
+    assert [event["node"] for event in done.events_of("session_gone")] == ["v02"]
+    assert done.check("transport")["verdict"] == "unknown" and done.status == 3
 
 
 def test_a_program_that_never_connects_and_a_port_that_is_taken_are_named(vnet: Vnet, tmp_path: Path) -> None:

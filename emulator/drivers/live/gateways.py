@@ -96,6 +96,8 @@ class _Vehicle:
     receipts: wire.Receipts = field(default_factory=wire.Receipts)
     unicasts: int = 0
     is_due: bool = False
+    is_abandoned: bool = False
+    """True while no session is there of programs that others have started."""
 
     @property
     def nonce(self) -> bytes:
@@ -493,6 +495,7 @@ class Gateways:
         vehicle = self._vehicles.get(gateway.node_id)
         if vehicle is None or vehicle.gateway is not gateway:  # it is gone
             return
+        had_sessions = bool(gateway.sessions)
         if what == "report":
             self._take_report(vehicle, told)
         elif what == "note":
@@ -507,6 +510,7 @@ class Gateways:
             self._transmit(vehicle, message, arrived_ns)
         elif what == "session":
             self._look_at_sessions(vehicle)
+            self._look_for_programs(vehicle, had_sessions)
             if any(is_peer(who) for who in gateway.sessions - self._found):
                 self._seek_peers()
 
@@ -596,6 +600,17 @@ class Gateways:
                 which=", ".join(sorted(connected)),
             )
         self._changes.set()
+
+    def _look_for_programs(self, vehicle: _Vehicle, had_sessions: bool) -> None:
+        """Tell if the last session of programs that others have started is gone, or one is back."""
+        node, connected = vehicle.gateway.node_id, vehicle.gateway.sessions
+        if self._starts or not vehicle.on_air or had_sessions == bool(connected):
+            return
+        if not connected and self._emulation.ended_ns is None:
+            self._emulation.folder.event(self._now_ns(), EventKind.session_gone, node)
+        elif connected and vehicle.is_abandoned:
+            self._emulation.folder.event(self._now_ns(), EventKind.session_back, node)
+        vehicle.is_abandoned = not connected
 
     def _seek_peers(self) -> None:
         """Ask by multicast for peers, as those of other vehicles do: at once, and again after seconds."""

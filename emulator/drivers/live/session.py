@@ -156,6 +156,7 @@ class LiveSession:
         folder = self._emulation.folder
         started_s = time.monotonic()
         completed = interrupted = False
+        freezes = not gc.get_freeze_count()
 
         def tell_missing(nodes: Sequence[str]) -> None:
             self._status.awaits(nodes)
@@ -179,6 +180,8 @@ class LiveSession:
             folder.event(time_ns, EventKind.interrupted)
             self._emulation.finish(time_ns)
         finally:
+            if freezes:
+                gc.unfreeze()
             wall_s = time.monotonic() - started_s
             self._measure_cpu()
             interrupted |= await to_its_end(self._shut_down(completed))

@@ -131,11 +131,10 @@ def _add_way(path: Path, builder: RoadsBuilder, way: Way) -> None:
     if found is None:
         builder.note("ways not for cars")
         return
-    name = f"way {way.id}"
+    name, pieces = f"way {way.id}", _pieces(path, way)
     if len(way.nodes) < 2:
-        raise ScenarioError(f"{path}: {name}: {len(way.nodes)} nodes; a road needs two")
-    pieces = _pieces(path, way)
-    if len(pieces) != 1 or len(pieces[0]) != len(way.nodes):
+        builder.note("ways with less than two points")
+    elif len(pieces) != 1 or len(pieces[0]) != len(way.nodes):
         builder.note(CLIPPED)
     for points in pieces:
         if found.reversed:

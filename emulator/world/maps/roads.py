@@ -106,7 +106,8 @@ def street(tags: Mapping[str, str]) -> Street | None:
         return None
     lanes, is_reversed = _lanes(tags, name)
     lane_width_m = float(LANE_WIDTH_M[kind])
-    if MIN_LANE_WIDTH_M <= (width_m := _width_m(tags.get("width", "")) / sum(lanes)) <= MAX_LANE_WIDTH_M:
+    beside = sum(lanes) + (_count(tags.get("lanes:both_ways")) if all(lanes) else 0)
+    if MIN_LANE_WIDTH_M <= (width_m := _width_m(tags.get("width", "")) / beside) <= MAX_LANE_WIDTH_M:
         lane_width_m = width_m
     return Street(kind, lanes, lane_width_m, is_reversed)
 
@@ -135,6 +136,7 @@ def _lanes(tags: Mapping[str, str], name: str) -> tuple[tuple[int, int], bool]:
         total = total or _count(tags.get("lanes:backward" if is_reversed else "lanes:forward"))
         return (total or usual, 0), is_reversed
     forward, backward = _count(tags.get("lanes:forward")), _count(tags.get("lanes:backward"))
+    total = max(0, total - _count(tags.get("lanes:both_ways")))  # of which no vehicle drives on that between them
     if total:
         forward = forward or (max(1, total - backward) if backward else max(1, (total + 1) // 2))
         backward = backward or max(1, total - forward)

@@ -484,6 +484,24 @@ async def test_live(vnet_emulation):
     assert not list((pytester.path.parent / "basetemp").glob("**/vnet-1"))
 
 
+def test_a_live_run_leaves_the_garbage_of_its_process_to_the_collector(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(f"""
+import gc
+
+gc.unfreeze()  # what the tests' own server has frozen
+
+async def test_live(vnet_emulation):
+    async with vnet_emulation({str(BEACON)!r}, vehicles=2, duration=2, settle=0.5, live=True) as emu:
+        await emu.run_until(0.5)
+        assert gc.get_freeze_count()
+
+def test_then():
+    assert not gc.get_freeze_count()
+""")
+    done = session_of_its_own(pytester, "-p", "no:xdist")
+    assert done.returncode == 0, done.stdout
+
+
 def test_a_program_that_ends_the_process_late_does_not_make_it_a_success(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(f"""
 import atexit, os

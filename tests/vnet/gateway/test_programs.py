@@ -473,6 +473,26 @@ def test_child_processes_are_real_and_pools_of_processes_are_threads(drive: Driv
     assert lines == ["(9, True, False, True) 0.0", "b'own v01\\n' 0", "[0, 1, 4] [16]", "[25] [36]"]
 
 
+@pytest.mark.parametrize("way", ["get_context('spawn')", "get_context('forkserver')", "set_start_method('spawn')"])
+def test_queues_and_locks_are_of_the_start_method_that_a_program_chooses(drive: Drive, way: str) -> None:
+    run = drive(f"""
+        import multiprocessing
+        def put(queue, event, lock):
+            with lock:
+                queue.put(7)
+            event.set()
+        if __name__ == "__main__":
+            context = multiprocessing.{way} or multiprocessing
+            queue, event, lock = context.Queue(), context.Event(), context.Lock()
+            child = context.Process(target=put, args=(queue, event, lock))
+            child.start()
+            print(queue.get(), event.wait(), context.Value("i", 5).value)
+            child.join()
+            print(child.exitcode)
+        """)
+    assert log(run, "v01")[-3:-1] == ["7 True 5", "0"]
+
+
 @pytest.mark.parametrize("method", ["spawn", "fork"])
 def test_zenoh_of_a_child_process_opens_no_session_and_says_that_it_is_outside(drive: Drive, method: str) -> None:
     """It would be a peer of whatever is on the machine's network."""

@@ -522,22 +522,25 @@ class ProgramModules:
             return vars(self.load("multiprocessing.pool"))["Pool"](*args, **options)
 
         def get_context(method: str | None = None) -> Any:
-            context = copy(multiprocessing.get_context(method or chosen or None))
-            vars(context).update(Pool=new_pool, get_context=get_context)
-            return context
+            mine = copy(multiprocessing.get_context(method or chosen or None))
+            # What it makes asks it for locks: they are of its own method.
+            vars(mine).update(Pool=new_pool, get_context=lambda other=None: get_context(other) if other else mine)
+            return mine
 
         def set_start_method(method: str | None, force: bool = False) -> None:
             nonlocal chosen
             if chosen and not force:
                 raise RuntimeError("context has already been set")
             chosen = method or ""
-            vars(package)["Process"] = get_context().Process
+            context = get_context()
+            names = [name for name in multiprocessing.__all__ if hasattr(context, name) and name not in own]
+            vars(package).update({name: getattr(context, name) for name in names})
 
         def get_start_method(allow_none: bool = False) -> str | None:
             return chosen or (None if allow_none else multiprocessing.get_context().get_start_method())
 
-        own = get_context, set_start_method, get_start_method
-        vars(package).update({each.__name__: each for each in own}, Pool=new_pool)
+        own = {each.__name__: each for each in (get_context, set_start_method, get_start_method)}
+        vars(package).update(own, Pool=new_pool)
         return package
 
     def _uvloop(self) -> ModuleType:
