@@ -774,7 +774,10 @@ class Emulation:
         assert healed_ns <= time_ns <= self.duration_ns, (healed_ns, time_ns, self.duration_ns)
         run = self.scenario.run
         settle_s = min(run.settle_s, (time_ns - healed_ns) / NS_PER_S)
-        shorter = run.model_copy(update={"duration_s": time_ns / NS_PER_S, "settle_s": settle_s})
+        world_s = None if time_ns == self.duration_ns else self.scenario.world_ns / NS_PER_S
+        shorter = run.model_copy(
+            update={"duration_s": time_ns / NS_PER_S, "settle_s": settle_s, "world_s": world_s or run.world_s}
+        )
         self._rewrite(self.scenario.model_copy(update={"run": shorter}))
 
     def _change_plan(self) -> None:

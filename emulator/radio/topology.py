@@ -75,7 +75,7 @@ def component_links(scenario: Scenario, inputs: RadioInputs, position_m: Array) 
     """
     table = inputs.links
     if isinstance(table, LinkTable) and not scenario.network.moves:
-        return Links.of_pairs(position_m, *table.linked_before(scenario.duration_ns))
+        return Links.of_pairs(position_m, *table.linked_before(scenario.world_ns))
     return connectivity_of(scenario.radio, scenario.run.seed, inputs).links(position_m)
 
 

@@ -172,6 +172,8 @@ class Run(Section):
     """Seed of all random draws: the same seed, the same run."""
     duration_s: float = Field(30.0, ge=1e-9, le=DAY_S)
     """Length of the run, in emulated time."""
+    world_s: float | None = Field(None, ge=1e-9, le=DAY_S)
+    """Length for which the world is made, if that is longer, as where a test has ended its run."""
     settle_s: float = Field(5.0, ge=0, le=DAY_S)
     """Time without faults before the end (emulated time), so that the network is judged at rest."""
     pacing: Literal["lockstep", "realtime"] = "lockstep"
@@ -565,6 +567,11 @@ class Scenario(Section):
     def duration_ns(self) -> int:
         """Length of the run in nanoseconds."""
         return round(self.run.duration_s * NS_PER_S)
+
+    @property
+    def world_ns(self) -> int:
+        """Length in nanoseconds for which the world is made."""
+        return max(self.duration_ns, round((self.run.world_s or 0.0) * NS_PER_S))
 
     @property
     def period_ns(self) -> int:

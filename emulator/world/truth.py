@@ -433,8 +433,8 @@ def _stated_multipath(gnss: Gnss) -> tuple[float, float]:
 
 
 def periods_of(scenario: Scenario) -> int:
-    """Return the number of instants of truth of a run: the start of each period, and the end of the last."""
-    return math.ceil(scenario.duration_ns / scenario.period_ns) + 1
+    """Return the number of instants of truth of a world: the start of each period, and the end of the last."""
+    return math.ceil(scenario.world_ns / scenario.period_ns) + 1
 
 
 def _check_exceptions(scenario: Scenario, node_ids: tuple[str, ...]) -> None:

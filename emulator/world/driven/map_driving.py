@@ -21,6 +21,7 @@ from emulator.world.projection import CoordinateFrame
 from vnet.errors import ScenarioError, did_you_mean, first_names
 from vnet.roads.road_map import RoadMap, ranges
 from vnet.types import Array, Mask
+from vnet.units import NS_PER_S
 
 ROOM_M = 4.0
 """Distance from the edge of the widest road at a junction to the place at which turns begin."""
@@ -620,7 +621,7 @@ def start_on_map(scenario: Scenario) -> tuple[Start, RoadMap, CoordinateFrame | 
     source, roads = roads_of(network, section)
     links = RoadLinks(roads, driven.vehicle_width_m)
     paths = Paths(*((links, 1.0, 0.0) if section is None else (links, section.side, section.aside_m)))
-    reach_m = driven.max_speed_mps * scenario.run.duration_s
+    reach_m = driven.max_speed_mps * scenario.world_ns / NS_PER_S
     if scenario.world.ranging is not None:
         reach_m += scenario.world.ranging.range_m
     ways = _Ways(source, driven, paths, links, reach_m)

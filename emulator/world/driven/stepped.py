@@ -180,7 +180,7 @@ class DrivenWorld(SteppedWorld):
         node_ids = numbered_ids(scenario.network.vehicles)
         start, lanes, frame, notes = _start(scenario, len(node_ids))
         self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz), start)
-        self._furthest_m = start.along_m + scenario.driven.max_speed_mps * scenario.run.duration_s
+        self._furthest_m = start.along_m + scenario.driven.max_speed_mps * scenario.world_ns / NS_PER_S
         super().__init__(scenario, node_ids, lanes, notes, frame)
         if self.may_leave:
             end = f"they may come to the end of the road, after {self.vehicles.road.end_m.min():g} m"

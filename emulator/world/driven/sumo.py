@@ -186,12 +186,12 @@ def start_sumo(scenario: Scenario, path: Path, step_ns: int) -> tuple[SumoProces
     process, begun = _begin(scenario, path, step_ns)
     search = _Search(scenario.network)
     if not search.take(process.ask(Find(0), Found).vehicles):
-        left = (scenario.duration_ns - 1) // step_ns
+        left = (scenario.world_ns - 1) // step_ns
         while left > 0 and not search.take(process.ask(Find(min(left, STEPS)), Found).vehicles):
             left -= STEPS
         process.kill()
         process, begun = _begin(scenario, path, step_ns)
-    search.check(path, scenario.run.duration_s)
+    search.check(path, scenario.world_ns / NS_PER_S)
     process.timeout_s = scenario.run.stall_timeout_s
     return process, begun, search.found
 

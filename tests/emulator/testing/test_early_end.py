@@ -1,0 +1,57 @@
+"""A run that a test ends early replays from its folder, whatever its world is made of."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import emulator
+from emulator.testing.harness import RunHarness
+from emulator.testing.scenarios import make_scenario
+from vnet import Node
+
+pytestmark = pytest.mark.slow
+
+NETWORK = """
+def network(seed, vehicles, duration_s):
+    return {f"v{n}": [(0, 0, 10 * n), (duration_s, 100, 10 * n)] for n in range(1, vehicles + 1)}
+"""
+
+
+async def talks(node: Node) -> None:
+    async for fix in node.gnss:
+        node.report(fix.position_m)
+        await node.radio.broadcast(b"here")
+
+
+SAME = "trace_sha256", "metrics_sha256", "verdict", "emulated_s"
+GRADIENT = {"world.common_error.sigma_m": 3.0, "world.common_error.gradient_m_per_km": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("city", {"vehicles": 8}),
+        ("city", {"vehicles": 4, "network.kind": "driven", "network.driven.road": "map"}),
+        ("beacon", {"vehicles": 4, "network.kind": "crossing.py:network"}),
+        ("beacon", {"vehicles": 4, **GRADIENT}),
+    ],
+    ids=["trips", "driven", "own", "standing"],
+)
+def test_a_run_that_is_ended_early_replays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, changes: dict[str, Any]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "crossing.py").write_text(NETWORK)
+    scenario = make_scenario(name, {**changes, "duration": 6, "settle": 0, "program": f"{__name__}:talks"})
+
+    async def ends_early() -> None:
+        async with RunHarness(scenario, tmp_path / "run") as emu:
+            await emu.run_until(2.05)
+
+    asyncio.run(ends_early())
+    emulator.simulate(tmp_path / "run" / "scenario.toml", out=tmp_path / "again")
+    first, again = (json.loads((tmp_path / name / "verdict.json").read_text()) for name in ("run", "again"))
+    assert [first[key] for key in SAME] == [again[key] for key in SAME] and first["verdict"] == "valid"
