@@ -90,7 +90,7 @@ class Place:
 
 def modules_of(scenario: Scenario) -> tuple[str, ...]:
     """Return the sources of the programs, and the entries of own checks and own rules of a scenario."""
-    return (*sources_of(scenario), *scenario.program.checks, *rules_of(scenario))
+    return (*sources_of(scenario), *rules_of(scenario))
 
 
 def is_fit() -> bool:

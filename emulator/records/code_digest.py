@@ -49,13 +49,13 @@ def rule_digests(scenario: Scenario) -> dict[str, str]:
 
 
 def rules_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the entries of a scenario's rules, sensors and network of the user's own, sorted."""
+    """Return the entries of a scenario's rules, sensors, checks and network of the user's own, sorted."""
     from emulator.scenario.faults import OwnRule
 
     entries = {fault.rule for fault in scenario.fault if isinstance(fault, OwnRule)}
     network = scenario.network.function
     sensors = {sensor.model for sensor in scenario.world.sensor.values()}
-    return tuple(sorted(entries | sensors | ({network} if network else set())))
+    return tuple(sorted({*entries, *sensors, *scenario.program.checks, *([network] if network else [])}))
 
 
 def digests_of(entries: tuple[str, ...], folders: tuple[Path, ...] = ()) -> dict[str, str]:

@@ -461,9 +461,9 @@ def shrink_run(scenario: Scenario, still_fails: Fails, most: int) -> tuple[Scena
 
 
 def _fewer_vehicles(scenario: Scenario) -> Scenario | None:
-    """Return the run with half of the vehicles; None if they are not drawn, or faults may be of those that go."""
+    """Return the run with half of the vehicles; None if they are not drawn."""
     network = scenario.network
-    if network.kind != "generated" or network.vehicles < 2 or scenario.fault:
+    if network.kind != "generated" or network.vehicles < 2:
         return None
     return _changed(scenario, "vehicles", (network.vehicles + 1) // 2 if network.vehicles > 2 else 1)
 

@@ -13,7 +13,8 @@ from rich.console import Console
 from emulator.records.tape import tape_lines
 from emulator.testing.campaign import FAILURE_PAGE, PARTING_FILE, TEST_FILE, run_campaign
 from emulator.testing.campaign_plan import Plan
-from emulator.testing.trial import fewest, order_text
+from emulator.testing.scenarios import make_scenario
+from emulator.testing.trial import fewest, order_text, shrink_run
 from tests.emulator.testing.test_campaign import planted, said_by_pytest
 from vnet.transport.wire import Deviation
 
@@ -50,6 +51,13 @@ def test_no_more_is_tried_than_is_allowed() -> None:
 
     _, steps = fewest(range(1000), fails, most=7)
     assert len(tried) == steps == 7
+
+
+def test_vehicles_that_no_fault_needs_are_left_out() -> None:
+    kill = {"kind": "kill", "at_s": 0.5, "duration_s": 1.0, "nodes": ["v02"]}
+    scenario = make_scenario("beacon", {"vehicles": 8, "duration": 4, "settle": 1, "faults": [kill]})
+    least, steps = shrink_run(scenario, lambda smaller: smaller.network.vehicles >= 3, most=20)
+    assert least.network.vehicles == 4 and steps > 2
 
 
 def test_an_order_is_a_phrase() -> None:
