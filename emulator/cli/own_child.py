@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from vnet.runtime import interrupts, running_node
-from vnet.runtime.die_with_parent import adoption, signal_at_parent_death
+from vnet.runtime.die_with_parent import adoption, end_left, signal_at_parent_death, started_processes
 from vnet.runtime.running_node import LOOK_S, Patience
 
 LONGEST_PATH = 4096
@@ -54,6 +54,7 @@ class OwnChild:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may ignore it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, handled)
         adoption.begin()
+        others = {*started_processes(os.getpid())}  # of whoever has become this command, as a shell by exec
         child = os.fork()
         if child == 0:
             if not in_foreground:  # what is sent to the parent's group would reach it twice
@@ -90,10 +91,7 @@ class OwnChild:
                 if not in_foreground or told.si_code != FROM_TERMINAL:
                     os.kill(child, signal.SIGINT)  # SIGTERM in it is one that a program sends itself
         forwarded |= signal.sigpending() & set(heeded)
-        if any(file.read_bytes() for file in Path("/proc/self/task").glob("*/children")):
-            from emulator.drivers.local import end_started  # slow to import, and few children leave any
-
-            end_started(set())
+        end_left(started_processes(os.getpid(), others))
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
         ended = os.waitstatus_to_exitcode(waited[1])
         # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short. Once

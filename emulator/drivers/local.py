@@ -47,7 +47,7 @@ from vnet.node import Node
 from vnet.runtime import interrupts, running_node
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.die_with_parent import adoption, end_left, signal_at_parent_death
+from vnet.runtime.die_with_parent import adoption, end_left, signal_at_parent_death, started_processes
 from vnet.runtime.error_text import NOT_THE_PROGRAM, error_line
 from vnet.runtime.host import Disks, Host, is_discarding
 from vnet.runtime.outside_loop import caught, collected_by_schedule, present_node
@@ -318,14 +318,14 @@ def process_kept() -> Iterator[None]:
     """
     folder, variables, modules = Path.cwd(), dict(os.environ), list(sys.path)
     is_alone = _is_alone()
-    others, finalizers = {*_started_processes(os.getpid())}, {*_finalizers()}
+    others, finalizers = {*started_processes(os.getpid())}, {*_finalizers()}
     try:
         with imports_noted(lambda: present_node() is not None):
             yield
     finally:
         if is_alone:
             _end_pools(finalizers)
-            end_started(others)
+            end_left(started_processes(os.getpid(), others))
         os.chdir(folder)
         sys.path[:] = modules
         if os.environ != variables:
@@ -336,13 +336,13 @@ def process_kept() -> Iterator[None]:
 @contextmanager
 def orphans_ended() -> Iterator[None]:
     """End what processes of programs that end within the block leave, unless another thread may have started it."""
-    is_alone, others = _is_alone(), {*_started_processes(os.getpid())}
+    is_alone, others = _is_alone(), {*started_processes(os.getpid())}
     adopts = is_alone and adoption.begin()
     try:
         yield
     finally:
         if is_alone:
-            end_started(others)
+            end_left(started_processes(os.getpid(), others))
         if adopts:
             adoption.end()
 
@@ -361,26 +361,11 @@ def _end_pools(others: set[Any]) -> None:
                 finalizer()
 
 
-def end_started(others: set[int]) -> None:
-    """End the processes that this one has started or adopted, but for those that were there."""
-    end_left({*_started_processes(os.getpid())} - others)
-
-
 def _finalizers() -> dict[Any, Callable[[], object]]:
     """Return what multiprocessing does first at the end of a process: it ends pools and managers."""
     registry = getattr(sys.modules.get("multiprocessing.util"), "_finalizer_registry", {})
     first = [key for key in registry if key[0] is not None and key[0] >= 0]
     return {key: registry[key] for key in sorted(first, reverse=True)}
-
-
-def _started_processes(by: int) -> Iterator[int]:
-    """Yield the processes of this session that one has started, and that these have; none if no file tells."""
-    for file in Path(f"/proc/{by}/task").glob("*/children"):
-        with suppress(OSError):
-            for process in map(int, file.read_text().split()):
-                with suppress(ProcessLookupError):
-                    if os.getsid(process) == os.getsid(0):
-                        yield from (process, *_started_processes(process))
 
 
 # What simulated programs print goes to the terminal, and to `logs/NODE.log` as in a run of many processes.

@@ -111,7 +111,8 @@ def styled() -> Iterator[None]:
         return
     from matplotlib import rc_context
 
-    with rc_context(STYLED):
+    with rc_context(STYLED), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph ")  # fonts of a page show what matplotlib's lack
         yield
 
 
@@ -262,9 +263,7 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def to_svg(figure: Figure, key: str, label: str) -> Markup:
     """Return the figure as an `<svg>` element; `key` makes its ids unique on a page, `label` describes it."""
     file = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph ")  # the page's fonts show the text, not matplotlib's
-        figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     root = ElementTree.fromstring(_NOT_XML.sub("\ufffd", file.getvalue().decode()))
     numbers = count()
     names = {name: f"{key}-{next(numbers)}" for element in root.iter() for name in _references(element)}

@@ -166,5 +166,5 @@ def _events(source: Source) -> list[str]:
 
 def _line(event: Event) -> str:
     who = event.node or event.details.get("fault", "")
-    said = event.what if event.has(SAID) else event.said
+    said = " ".join((event.what if event.has(SAID) else event.said).splitlines())
     return f"{event.time_ns / 1e9:8.2f} s   {event.kind}   {who}   {said}"

@@ -182,7 +182,7 @@ def key_figures(record: Record) -> dict[str, str]:
     if (delivered := record.packet_delivery_ratio) is not None:
         found["packet delivery ratio"] = f"{delivered:.2%}"
     if record.in_range:
-        found["attempted receptions"] = f"{record.in_range:,}"
+        found["receptions in range"] = f"{record.in_range:,}"
     if record.driving:
         found["collisions"] = f"{record.driving.get('collisions') or 0:g}"
     if record.backbone:

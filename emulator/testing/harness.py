@@ -158,7 +158,7 @@ class RunHarness:
         while self._run.started and not self._run.stands.done():  # another step, which was cancelled, goes on
             await self._wait(self._run.stands)
         self._must_be_on("run_until")
-        time_ns = round(time_s * NS_PER_S)
+        time_ns = round(time_s * NS_PER_S) if math.isfinite(time_s) else round(DAY_S * NS_PER_S) + 1
         if time_ns < self._now_ns:
             raise VnetError(f"run_until({time_s:g}): it is {self.now_s:g} s already")
         if time_ns > self._emulation.duration_ns:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -120,6 +121,15 @@ def test_what_a_program_has_started_ends_with_the_simulation(
     begins = f"__import__('subprocess').Popen(['sh', '-c', 'sleep 1000; true']); {end}"
     words = [*command(tmp_path, begins), "--set", "run.stall_timeout_s=0.5"]
     ended([*words, "--processes", processes], tmp_path, status)
+
+
+def test_what_was_there_before_the_command_lives_on(tmp_path: Path) -> None:
+    """A shell keeps its background jobs, and what reads its output, when it becomes a command by `exec`."""
+    words = shlex.join([*command(tmp_path, FAULT), "--quiet"])
+    script = f"sleep 1000 >/dev/null 2>&1 & echo $! >sleeps; exec {words} >out.txt 2>&1"
+    subprocess.run(["sh", "-c", script], cwd=tmp_path, timeout=TIMEOUT_S, check=False)
+    assert died(tmp_path / "run") == {"v02"}
+    os.kill(int((tmp_path / "sleeps").read_text()), signal.SIGKILL)
 
 
 LATER = """

@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Set
 from pathlib import Path
 
 PR_SET_PDEATHSIG = 1
@@ -76,9 +76,22 @@ adoption = Adoption()
 """That of this process."""
 
 
+def started_processes(by: int, others: Set[int] = frozenset()) -> Iterator[int]:
+    """Yield the processes of this session that one has started, and that these have, but for `others` and theirs.
+
+    Nothing if no file tells.
+    """
+    for file in Path(f"/proc/{by}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            for process in {*map(int, file.read_text().split())} - others:
+                with contextlib.suppress(ProcessLookupError):
+                    if os.getsid(process) == os.getsid(0):
+                        yield from (process, *started_processes(process, others))
+
+
 def end_left(processes: Iterable[int]) -> None:
     """Kill what programs have left, but for Python's tracker, which ends once it has removed what others left."""
-    for process in processes:
+    for process in list(processes):
         with contextlib.suppress(OSError):  # it has ended meanwhile
             if b"resource_tracker" not in Path(f"/proc/{process}/cmdline").read_bytes():
                 os.kill(process, signal.SIGKILL)

@@ -10,6 +10,8 @@ Options: `brakes`, the vehicle that brakes, and `at_s`, when.
 from __future__ import annotations
 
 import math
+import re
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -221,9 +223,14 @@ def _change(now: float | None, before: float | None) -> float:
     return 0.0 if now is None or before is None else now - before
 
 
+def station_of(name: str) -> int:
+    """Return the number of a station of this name: of `v07` 7, of others a checksum."""
+    return int(name[1:]) if re.fullmatch("v[0-9]+", name) else zlib.crc32(name.encode())
+
+
 async def main(node: Node) -> None:
     """Send CAMs, brake and warn if it is one's turn, and count what is heard."""
-    station, rules = int(node.id[1:]), CamRules()
+    station, rules = station_of(node.id), CamRules()
     brakes, at_s = node.options.get("brakes"), node.options.get("at_s", 2.0)
     known: set[int] = set()
     warned = sent = 0

@@ -13,7 +13,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from docs.examples.its2.standard_messages import PROFILE, Message, Seen, Xy, decode_cpm, encode_cpm, schema
+from docs.examples.its2.standard_messages import (
+    PROFILE,
+    Message,
+    Seen,
+    Xy,
+    decode_cpm,
+    encode_cpm,
+    schema,
+    station_of,
+)
 from vnet import Fix, Node
 from vnet.types import Array
 
@@ -117,7 +126,7 @@ def sensed(fix: Fix) -> tuple[Seen, ...]:
 async def main(node: Node) -> None:
     """Send a CPM at every other fix, and report where others are."""
     types = schema(node.options.get("asn1", PROFILE), "CollectivePerceptionMessage")
-    station, apart_s = int(node.id[1:]), float(node.rng.uniform(0.0, APART_S))
+    station, apart_s = station_of(node.id), float(node.rng.uniform(0.0, APART_S))
     heard: dict[int, tuple[Message, Xy]] = {}
     async for fix in node.gnss:
         for packet in node.radio.drain():

@@ -7,7 +7,7 @@ Options: `asn1`, the file or folder of your copy of SAE's schema.
 
 from __future__ import annotations
 
-from docs.examples.its2.standard_messages import Message, decode_bsm, encode_bsm, schema
+from docs.examples.its2.standard_messages import Message, decode_bsm, encode_bsm, schema, station_of
 from vnet import Node
 from vnet.errors import VnetError
 
@@ -16,7 +16,7 @@ async def main(node: Node) -> None:
     """Send ten BSMs a second, and report the number of others."""
     if "asn1" not in node.options:
         raise VnetError("program.options.asn1: the file or folder of your copy of J2735's ASN.1 is needed")
-    types, station = schema(node.options["asn1"], "BasicSafetyMessage", "MessageFrame"), int(node.id[1:])
+    types, station = schema(node.options["asn1"], "BasicSafetyMessage", "MessageFrame"), station_of(node.id)
     others: set[int] = set()
     count = 0
     async for fix in node.gnss:

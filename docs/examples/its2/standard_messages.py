@@ -7,6 +7,8 @@ CPM and VAM; ETSI's own modules may stand in its place. The schema of J2735 is S
 from __future__ import annotations
 
 import math
+import re
+import zlib
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -82,6 +84,11 @@ class Message:
     heading_rad: float | None = None
     speed_m_s: float | None = None
     objects: tuple[Seen, ...] = ()
+
+
+def station_of(name: str) -> int:
+    """Return the number of a station of this name: of `v07` 7, of others a checksum."""
+    return int(name[1:]) if re.fullmatch("v[0-9]+", name) else zlib.crc32(name.encode())
 
 
 def encode_cpm(message: Message, types: Any) -> bytes:

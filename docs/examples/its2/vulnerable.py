@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from docs.examples.its2.standard_messages import PROFILE, Message, decode_vam, encode_vam, schema
+from docs.examples.its2.standard_messages import PROFILE, Message, decode_vam, encode_vam, schema, station_of
 from vnet import Fix, Node
 
 POSITION_M, SPEED_M_S, HEADING_RAD, LONGEST_S = 4.0, 0.5, math.radians(4), 5.0
@@ -55,7 +55,7 @@ async def main(node: Node) -> None:
             cyclist = decode_vam(packet.payload, types, fix.time_ns) or cyclist
         if node.id == node.options.get("cyclist") and is_due(fix, sent):
             here_m = float(fix.position_m[0]), float(fix.position_m[1])
-            told = Message(int(node.id[1:]), fix.time_ns, here_m, fix.heading_rad, fix.speed_m_s)
+            told = Message(station_of(node.id), fix.time_ns, here_m, fix.heading_rad, fix.speed_m_s)
             await node.radio.broadcast(encode_vam(told, types))
             sent, vams = fix, vams + 1
         if cyclist is not None and node.options.get("listens", True):

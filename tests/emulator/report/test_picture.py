@@ -81,7 +81,7 @@ def test_charts_that_do_not_fit_are_counted(run: Path, monkeypatch: pytest.Monke
 
 def test_a_heading_ends_with_a_whole_figure(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("emulator.report.picture.LONGEST_HEADING", 60)
-    assert _heading(Source(run))[1] == "packet delivery ratio 80.00% · attempted receptions 60 · …"
+    assert _heading(Source(run))[1] == "packet delivery ratio 80.00% · receptions in range 60 · …"
 
 
 def test_zeros_are_gaps_on_a_logarithmic_axis() -> None:

@@ -1,7 +1,8 @@
-"""A run that a test ends early replays from its folder, whatever its world is made of."""
+"""Runs that a test ends early replay from their folders, whatever their worlds are made of."""
 
 import asyncio
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import emulator
 from emulator.testing.harness import RunHarness
 from emulator.testing.scenarios import make_scenario
 from vnet import Node
+from vnet.errors import VnetError
 
 pytestmark = pytest.mark.slow
 
@@ -55,3 +57,13 @@ def test_a_run_that_is_ended_early_replays(
     emulator.simulate(tmp_path / "run" / "scenario.toml", out=tmp_path / "again")
     first, again = (json.loads((tmp_path / name / "verdict.json").read_text()) for name in ("run", "again"))
     assert [first[key] for key in SAME] == [again[key] for key in SAME] and first["verdict"] == "valid"
+
+
+@pytest.mark.parametrize("time_s", [math.inf, math.nan, 7.0])
+def test_a_time_that_the_run_does_not_have_is_refused(time_s: float, tmp_path: Path) -> None:
+    async def waits() -> None:
+        async with RunHarness(make_scenario("beacon", {"vehicles": 1, "duration": 6}), tmp_path / "run") as emu:
+            with pytest.raises(VnetError, match=r"the run takes 6 s"):
+                await emu.run_until(time_s)
+
+    asyncio.run(waits())
