@@ -41,7 +41,8 @@ FOLDER = {
     "reproduces the run",
     "manifest.json": "SHA-256 of each file above, of `logs/` but for `programs.txt`, and of `files/`, by its path; "
     "[`vnet check`](../checks.md#the-files-of-a-run) compares them",
-    "logs/": "output and log of each vehicle: `v01.log`, …; further incarnations append. `programs.txt`: standard "
+    "logs/": "output and log of each vehicle: `v01.log`, … (live, of each process: its first vehicle's); further "
+    "incarnations append. `programs.txt`: standard "
     "output of programs of a simulation with `--quiet`, `--log-format json` or in a campaign; `calls/`: frames and "
     "reports of each vehicle with their lines of code, with `--check-determinism`",
     "files/": "the disk of each vehicle, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` each. Only "
