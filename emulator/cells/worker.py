@@ -23,7 +23,7 @@ import tempfile
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.machinery import ModuleSpec, PathFinder
@@ -37,7 +37,7 @@ from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ProgramError, ScenarioError, VnetError, shown
 from vnet.runtime import running_node
-from vnet.runtime.die_with_parent import end_left
+from vnet.runtime.die_with_parent import end_left, rest_of_groups
 from vnet.runtime.environment import SAME_ARITHMETIC, has_same_arithmetic
 from vnet.runtime.own_packages import INSTALLED, OWN
 from vnet.runtime.programs import Program, path_without_programs
@@ -237,19 +237,11 @@ class Worker:
 def _end(process: subprocess.Popen[bytes], connection: Connection, errors: IO[bytes]) -> None:
     process.kill()
     process.wait()
-    end_left(_rest_of_group(process.pid))
+    end_left(rest_of_groups({process.pid}))
     connection.close()  # afterwards: a thread that waits for an answer sees the end of the process
     errors.close()
     for left in Path(tempfile.gettempdir()).glob(f"{temporary_prefix(process.pid)}*"):
         shutil.rmtree(left, ignore_errors=True)
-
-
-def _rest_of_group(group: int) -> Iterator[int]:
-    """Yield the processes that programs have started in a worker of this group, which has ended."""
-    for pid in {int(entry.name) for entry in os.scandir("/proc") if entry.name.isdigit()} - {group}:
-        with suppress(OSError):  # it has ended meanwhile
-            if os.getpgid(pid) == group:
-                yield pid
 
 
 def temporary_prefix(pid: int) -> str:

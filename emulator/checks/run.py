@@ -64,12 +64,15 @@ def _without_a_program(recorded: RecordedRun) -> list[dict[str, Any]]:
     """Return the times at which a vehicle whose programs others have started had none, and what arrived in them."""
     since_ns: dict[str, int] = {}
     times = []
-    for event in [*recorded.event(EventKind.session_gone, EventKind.session_back, EventKind.ended)]:
+    ends = EventKind.session_back, EventKind.restarted, EventKind.entered, EventKind.ended
+    for event in recorded.event(EventKind.session_gone, *ends):
         if event.kind == EventKind.session_gone:
             since_ns[event.node or ""] = event.time_ns
         else:
             back = [event.node] if event.node else list(since_ns)
             times += [(node, since_ns.pop(node), event.time_ns) for node in back if node in since_ns]
+    if not times:
+        return []
     delivered = recorded.trace.filter(recorded.outcome_is("delivered"))
     receiver, arrival_ns = delivered["receiver"].cast(pa.string()), delivered["arrival_ns"]
     rows = []

@@ -67,10 +67,11 @@ class OwnChild:
             return None
         forwarded: set[int] = set()
         insists, terminated_s = False, 0.0
-        patience = Patience(running_node.running, stall_limit_s)
-        while not (waited := os.waitpid(child, os.WNOHANG))[0]:
-            told = signal.sigtimedwait(handled, LOOK_S)
+        patience, look_s = Patience(running_node.running, stall_limit_s), time.monotonic() + LOOK_S
+        while (status := _ended(child)) is None:
+            told = signal.sigtimedwait(handled, max(0.0, look_s - time.monotonic()))
             if told is None:
+                look_s = time.monotonic() + LOOK_S
                 if not patience.is_over(child):
                     continue
                 if forwarded and not insists:
@@ -92,8 +93,9 @@ class OwnChild:
                     os.kill(child, signal.SIGINT)  # SIGTERM in it is one that a program sends itself
         forwarded |= signal.sigpending() & set(heeded)
         end_left(started_processes(os.getpid(), others))
+        adoption.end()
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
-        ended = os.waitstatus_to_exitcode(waited[1])
+        ended = os.waitstatus_to_exitcode(status)
         # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short. Once
         # all files are written, a fatal signal while no vehicle's code runs takes nothing from the run.
         is_over = not vehicle and ended < 0 and (Path(folder) / MANIFEST_FILE).exists()
@@ -115,6 +117,14 @@ class OwnChild:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {-ended})
             os.kill(os.getpid(), -ended)
         return interrupts.exit_now(ended)
+
+
+def _ended(child: int) -> int | None:
+    """Forget children that have ended, orphans of programs among them; return the status of `child` if it has."""
+    while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+        if ended[0] == child:
+            return ended[1]
+    return None
 
 
 _leaving: list[OwnChild] = []

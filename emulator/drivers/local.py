@@ -44,10 +44,10 @@ from emulator.records.events import EventKind
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.node import Node
-from vnet.runtime import interrupts, running_node
+from vnet.runtime import running_node
 from vnet.runtime.arrivals import Mail
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.die_with_parent import adoption, end_left, signal_at_parent_death, started_processes
+from vnet.runtime.die_with_parent import end_left, rest_of_groups, signal_at_parent_death, started_processes
 from vnet.runtime.error_text import NOT_THE_PROGRAM, error_line
 from vnet.runtime.host import Disks, Host, is_discarding
 from vnet.runtime.outside_loop import caught, collected_by_schedule, present_node
@@ -331,20 +331,6 @@ def process_kept() -> Iterator[None]:
         if os.environ != variables:
             os.environ.clear()
             os.environ.update(variables)
-
-
-@contextmanager
-def orphans_ended() -> Iterator[None]:
-    """End what processes of programs that end within the block leave, unless another thread may have started it."""
-    is_alone, others = _is_alone(), {*started_processes(os.getpid())}
-    adopts = is_alone and adoption.begin()
-    try:
-        yield
-    finally:
-        if is_alone:
-            end_left(started_processes(os.getpid(), others))
-        if adopts:
-            adoption.end()
 
 
 def _is_alone() -> bool:
@@ -676,7 +662,6 @@ class Pipes(LocalProcesses):
         died, self._died = self._died, {}
         return died
 
-    @orphans_ended()
     def run(self, course: Coroutine[Any, Any, None]) -> None:
         """Fork the processes, and run the loop of the pacing, which waits for them. Raises KeyboardInterrupt."""
         processes = self._processes
@@ -703,6 +688,7 @@ class Pipes(LocalProcesses):
             course.close()
             for process in processes.values():
                 process.close()
+            end_left(rest_of_groups({process.pid for process in processes.values()}))
 
     def _end(self) -> None:
         """End all processes but those that are in the midst of a window, and take what they have left to say."""
@@ -739,8 +725,8 @@ def _be(
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        if not interrupts.is_in_foreground():  # nothing that ends the parent's group is a program's end
-            os.setpgid(0, 0)
+        os.setpgid(0, 0)  # by it what programs have started is found, and nothing that ends the parent's ends it
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)  # a group in the background does not read from the terminal
         signal.signal(signal.SIGUSR1, partial(_tell_stack, connection, os.getpid()))
         signal_at_parent_death(signal.SIGKILL)
         detach()

@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import pairwise
-from statistics import median
+from statistics import fmean
 
 import numpy as np
 
@@ -46,7 +46,7 @@ REPEAT_SLOTS = 15
 UNUSED = 3
 """Reservations in succession that a sender may leave unused before it gives them up (sl-ReselectAfter)."""
 INTERVALS = 8
-"""Intervals between frames from whose median a period is learned."""
+"""Intervals between frames from whose mean a period is learned, without one that is longer than all others."""
 INSTANT_NS = NS_PER_MS
 """Time within which frames of a sender are of one instant, as programs in real time send them."""
 MOST_FLOWS = {LteMode4: 2, NrMode2: 16}
@@ -346,8 +346,10 @@ class Sidelink(Mac):
         times_ns = flow.sent_ns
         intervals_ns = [later - ns for ns, later in pairwise(times_ns) if later >= ns + INSTANT_NS]
         if intervals_ns and not frame.period_ms:
-            usual_ms = median(intervals_ns) / NS_PER_MS  # of whoever was silent for a while the mean is long
-            period_ms = min(self._mac.periods_ms, key=lambda each: (abs(each - usual_ms), each))
+            *others, longest = sorted(intervals_ns)
+            is_silence = len(others) > 1 and longest > sum(others)
+            mean_ms = fmean(others if is_silence else intervals_ns) / NS_PER_MS
+            period_ms = min(self._mac.periods_ms, key=lambda each: (abs(each - mean_ms), each))
         return period_ms * NS_PER_MS // self._slot_ns
 
     def _reserve(self, flow: _Flow) -> None:

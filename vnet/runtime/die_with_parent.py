@@ -89,6 +89,14 @@ def started_processes(by: int, others: Set[int] = frozenset()) -> Iterator[int]:
                         yield from (process, *started_processes(process, others))
 
 
+def rest_of_groups(groups: Set[int]) -> Iterator[int]:
+    """Yield the processes that are left of groups whose first processes have ended."""
+    for pid in {int(entry.name) for entry in os.scandir("/proc") if entry.name.isdigit()} - groups:
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            if os.getpgid(pid) in groups:
+                yield pid
+
+
 def end_left(processes: Iterable[int]) -> None:
     """Kill what programs have left, but for Python's tracker, which ends once it has removed what others left."""
     for process in list(processes):

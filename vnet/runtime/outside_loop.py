@@ -49,6 +49,7 @@ _process = os.getpid()
 _is_programs_own = False
 _before_death: list[Callable[[], None]] = []
 _status_late = 0
+_FROZEN_AT_START = gc.get_freeze_count()
 _importing: set[int] = set()
 """Threads that import a module of the user's."""
 
@@ -131,10 +132,15 @@ def _others_have_frozen() -> bool:
     """Return True if objects are frozen before a block, which are counted only now and then once there are some."""
     global _found_frozen
     if _found_frozen % BLOCKS_FROZEN == 0:
-        _found_frozen = int(gc.get_freeze_count() > 0)
+        _found_frozen = int(is_frozen())
     else:
         _found_frozen += 1
     return _found_frozen > 0
+
+
+def is_frozen() -> bool:
+    """Return whether somebody has frozen objects: Python 3.12 has itself, some at its start."""
+    return gc.get_freeze_count() > _FROZEN_AT_START
 
 
 def _freeze() -> None:

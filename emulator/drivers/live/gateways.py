@@ -64,6 +64,8 @@ _ESTABLISHED = "01"
 """State of a connection in proc_net(5)."""
 CLOSE_S = 1.0
 """Time for which the routers of all vehicles are awaited to close, so that they open together."""
+RETRY_S = 5.0
+"""Time after which programs are connected again to a router that is back: Zenoh's clients wait for up to 4 s."""
 SWITCH_S = 0.001
 """Time after which a thread lets another one run, Python's 5 ms else: what programs put and hear is on others."""
 TURNS_S = 0.1
@@ -362,6 +364,7 @@ class Gateways:
             self._tell("ended", node, Exit(1, str(error)))
         if self._vehicles.get(node) is not vehicle:  # or meanwhile
             await vehicle.gateway.close()
+        self._loop.call_later(RETRY_S, self._look_for_programs, vehicle)
 
     async def close(self) -> None:
         """Close all gateways, and wait for what was told to end."""
@@ -443,6 +446,7 @@ class Gateways:
     def _go_on_air(self, vehicle: _Vehicle, turn_s: float) -> None:
         """Begin to send what the programs put; in its turn also what they have put, and what is told regularly."""
         vehicle.on_air = True
+        self._look_for_programs(vehicle)
         self._loop.call_later(turn_s, self._take_turn, vehicle)
 
     def _take_turn(self, vehicle: _Vehicle) -> None:
@@ -510,7 +514,8 @@ class Gateways:
             self._transmit(vehicle, message, arrived_ns)
         elif what == "session":
             self._look_at_sessions(vehicle)
-            self._look_for_programs(vehicle, had_sessions)
+            if had_sessions != bool(gateway.sessions):  # and not of a router that vnet has closed
+                self._look_for_programs(vehicle)
             if any(is_peer(who) for who in gateway.sessions - self._found):
                 self._seek_peers()
 
@@ -601,16 +606,15 @@ class Gateways:
             )
         self._changes.set()
 
-    def _look_for_programs(self, vehicle: _Vehicle, had_sessions: bool) -> None:
+    def _look_for_programs(self, vehicle: _Vehicle) -> None:
         """Tell if the last session of programs that others have started is gone, or one is back."""
-        node, connected = vehicle.gateway.node_id, vehicle.gateway.sessions
-        if self._starts or not vehicle.on_air or had_sessions == bool(connected):
+        node, is_abandoned = vehicle.gateway.node_id, not vehicle.gateway.sessions
+        if self._starts or not self._is_there(vehicle) or is_abandoned == vehicle.is_abandoned:
             return
-        if not connected and self._emulation.ended_ns is None:
-            self._emulation.folder.event(self._now_ns(), EventKind.session_gone, node)
-        elif connected and vehicle.is_abandoned:
-            self._emulation.folder.event(self._now_ns(), EventKind.session_back, node)
-        vehicle.is_abandoned = not connected
+        if self._emulation.ended_ns is None:
+            kind = EventKind.session_gone if is_abandoned else EventKind.session_back
+            self._emulation.folder.event(self._now_ns(), kind, node)
+        vehicle.is_abandoned = is_abandoned
 
     def _seek_peers(self) -> None:
         """Ask by multicast for peers, as those of other vehicles do: at once, and again after seconds."""

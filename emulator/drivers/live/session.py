@@ -35,6 +35,7 @@ from emulator.records.code_digest import entries_of
 from emulator.records.events import EventKind
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
+from vnet.runtime.outside_loop import is_frozen
 from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, preempting_nobody, set_time_slice
 
 PATIENCE_S = 0.5
@@ -156,7 +157,7 @@ class LiveSession:
         folder = self._emulation.folder
         started_s = time.monotonic()
         completed = interrupted = False
-        freezes = not gc.get_freeze_count()
+        freezes = not is_frozen()
 
         def tell_missing(nodes: Sequence[str]) -> None:
             self._status.awaits(nodes)
