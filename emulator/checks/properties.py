@@ -94,9 +94,12 @@ def moments(run: Run, at: str = PERIOD) -> list[Moment]:
 
 
 def _periods(run: Run) -> Iterator[Moment]:
-    for row in run.states.to_pylist():
+    rows = run.states.to_pylist()
+    # Of what has no column, numbers are lists of one.
+    lists = {name for row in rows for name, value in row.get("values") or () if len(value) != 1}
+    for row in rows:
         if not np.isnan(row["position_m"]).any():
-            more = {name: one[0] if len(one) == 1 else one for name, one in row.get("values") or ()}
+            more = {name: value if name in lists else value[0] for name, value in row.get("values") or ()}
             yield Moment(row["time_ns"], row["node"], values=more | row)
 
 

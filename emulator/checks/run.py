@@ -200,9 +200,10 @@ def check_progress(recorded: RecordedRun) -> Finding:
     if len(recorded.metrics) != due or len(recorded.states) != due * len(recorded.node_ids):
         text = f"{counted(len(recorded.metrics), 'period')} kept, {due} due"
         return unknown(text, periods=len(recorded.metrics), due=due)
-    rest_s = (recorded.scenario.duration_ns - due * recorded.scenario.period_ns) / NS_PER_S
-    rest = f", of which the last {rest_s:g} s are no whole period, so that reports in them are not kept"
-    return valid(f"{recorded.scenario.run.duration_s:g} s emulated to the end{rest if rest_s else ''}")
+    rest_ns = recorded.scenario.duration_ns - due * recorded.scenario.period_ns
+    rest = f", of which the last {rest_ns / NS_PER_S:g} s are no whole period, so that reports in them are not kept"
+    is_rounding = rest_ns <= due  # of periods as of 30 Hz
+    return valid(f"{recorded.scenario.run.duration_s:g} s emulated to the end{'' if is_rounding else rest}")
 
 
 def check_finite(recorded: RecordedRun) -> Finding:

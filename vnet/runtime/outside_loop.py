@@ -408,7 +408,7 @@ def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
                 call_first()
             _end_as_death(node, call, status)
         if threading.get_ident() in _importing:
-            raise SystemExit(args[0] if name == "_exit" and args else 0)
+            raise SystemExit([*args, options.get("status", 0)][0] if name == "_exit" else 0)
         if not _end_takers or (node is None and not threading.current_thread().name.startswith(f"{JOBS}_")):
             if _status_late and (name != "_exit" or not args or args[0] == 0):
                 sys.stderr.write(f"vnet: {call} ended the process of the tests\n")

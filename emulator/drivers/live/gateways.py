@@ -99,7 +99,7 @@ class _Vehicle:
     unicasts: int = 0
     is_due: bool = False
     is_abandoned: bool = False
-    """True while no session is there of programs that others have started."""
+    """True since it was told that no session is there of programs that others have started."""
 
     @property
     def nonce(self) -> bytes:

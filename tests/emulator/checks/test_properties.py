@@ -396,6 +396,7 @@ def test_events_that_were_left_out_leave_unknown_what_they_could_change(at: str)
     assert never(out, "disaster", named("disaster"), at=at).verdict == "unknown"
     assert never(out, "ask", named("ask"), at=at).verdict == "invalid", "whatever else there was"
     assert eventually(out, "answer", named("answer"), 0.5, at=at).verdict == "unknown"
+    assert eventually(out, "answer", named("answer"), 0.1, at=at).verdict == "invalid", "before any was left out"
     assert leads_to(out, "answers", named("ask"), named("answer"), 0.5, at=at).verdict == "unknown"
     assert leads_to(out, "answers", named("tick"), named("ask"), 0.5, at=at).verdict == "unknown", "other ticks"
     soon = leads_to(out, "answers", named("tick"), named("answer"), 0.05, at=at)
@@ -433,7 +434,9 @@ def test_causes_near_the_end_of_a_run_that_ends_within_a_period() -> None:
 
 
 def test_a_property_sees_lists_and_names_without_a_column() -> None:
-    run = made(rows={"v01": [{"values": [("vec", [1.0, 2.0]), ("n63", [3.0])]}] * 10})
+    rows = [{"values": [("vec", [1.0, 2.0]), ("n63", [3.0]), ("some", [1.0] * (n % 3))]} for n in range(10)]
+    run = made(rows={"v01": rows})
+    assert always(run, "some", lambda m: len(m["some"]) < 3).verdict == "valid"
     assert always(run, "vec", lambda m: m["vec"] == [1.0, 2.0]).verdict == "valid"
     assert always(run, "n63", lambda m: m["n63"] == 3.0).verdict == "valid"
 
