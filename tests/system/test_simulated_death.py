@@ -123,6 +123,13 @@ def test_what_a_program_has_started_ends_with_the_simulation(
     ended([*words, "--processes", processes], tmp_path, status)
 
 
+def test_a_stall_is_seen_while_orphans_of_programs_end(tmp_path: Path) -> None:
+    orphans = "threading.Thread(target=lambda: [os.system('true &') for _ in iter(int, 1)], daemon=True).start()"
+    words = [*command(tmp_path, f"{orphans}; {STALL}"), "--set", "run.stall_timeout_s=0.5"]
+    ended(words, tmp_path, 3)
+    assert "v02" in {event["node"] for event in events(tmp_path / "run") if event["kind"] == "stalled"}
+
+
 def test_what_was_there_before_the_command_lives_on(tmp_path: Path) -> None:
     """A shell keeps its background jobs, and what reads its output, when it becomes a command by `exec`."""
     words = shlex.join([*command(tmp_path, FAULT), "--quiet"])
