@@ -134,7 +134,7 @@ class RunFolder:
             self.put_scenario(scenario)
             self._events_file = (self.path / EVENTS_FILE).absolute()
             self._events_file.write_text("".join(event.line() for event in self.events))
-            if self._has_own_number:
+            if self._has_own_number or (self.path.parent == RUNS and not self.path.is_symlink()):
                 _point_latest_to(self.path)
 
     @property
