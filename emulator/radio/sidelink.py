@@ -538,6 +538,9 @@ class Sidelink(Mac):
                     self._give_up(booking)
         else:
             grant.unused += 1
+            if is_due and grant.slot + grant.period > flow.queue[0][0] + self._t2_slots:
+                ready, sent, _ = flow.queue.popleft()
+                self._send_alone(flow, sent, ready)
         grant.slot += grant.period
         if grant.counter > 0 and grant.unused < UNUSED:
             self._book(self._use_of(flow))
