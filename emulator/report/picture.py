@@ -75,11 +75,13 @@ def _picture(source: Source) -> Figure:
     charts = list(_packed(_drawn(program_charts(source), MAP_PX // COLUMNS, problems)))
     events = [line[:LONGEST_LINE] for line in (*_events(source), *problems)]
     left_px = (TITLE_PX + chart[1].shape[0] if chart else 0) + (TITLE_PX + LINE_PX * len(events))
-    own = [one for one in charts if one.end_px <= right_px - left_px - 2 * LINE_PX]
+    room_px = right_px - left_px - 2 * LINE_PX
+    own = [one for one in charts if not one.begin_px or one.end_px <= room_px]  # the first ones in any case
     if more := len(charts) - len(own):
         events.append(f"and {counted(more, 'chart')} more of the program: see report.html")
         left_px += LINE_PX
-    height_px = HEADING_PX + max(left_px, right_px) + MARGIN_PX
+    own_px = max((LINE_PX + one.end_px for one in own), default=0)
+    height_px = HEADING_PX + max(left_px + own_px, right_px) + MARGIN_PX
     width_px = 3 * MARGIN_PX + MAP_PX + COLUMNS * CURVE_PX
     figure = Figure(figsize=(width_px / DPI, height_px / DPI), dpi=DPI)
 

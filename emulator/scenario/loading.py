@@ -353,7 +353,7 @@ def scenario_from(
         raise wrong_value(path, first_problem(error, Scenario), overrides) from None
     except ValueError as error:
         raise wrong_value(path, str(error), overrides) from None
-    scenario = _with_absolute_paths(scenario, path)
+    scenario = with_absolute_paths(scenario, path)
     try:
         scenario = with_own_modules(scenario, path.parent, checks, str(path))
     except ScenarioError as error:
@@ -442,14 +442,14 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _with_absolute_paths(section: AnySection, scenario_path: Path, key: str = "") -> AnySection:
+def with_absolute_paths(section: AnySection, scenario_path: Path, key: str = "") -> AnySection:
     """Return a section in which the paths of files are absolute, those of the sections within it, too."""
     absolute: dict[str, Any] = {}
     for name, value in section:
         if isinstance(value, Path):
             absolute[name] = _absolute(value, f"{key}{name}", scenario_path)
         elif isinstance(value, Section):
-            absolute[name] = _with_absolute_paths(value, scenario_path, f"{key}{name}.")
+            absolute[name] = with_absolute_paths(value, scenario_path, f"{key}{name}.")
     return section.model_copy(update=absolute)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from emulator.cells.worker import with_folder_of
-from emulator.scenario.loading import find_scenario, load_scenario, with_own_modules
+from emulator.scenario.loading import find_scenario, load_scenario, with_absolute_paths, with_own_modules
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from vnet.errors import ScenarioError
@@ -49,6 +49,8 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
             table = table.setdefault(section, {})
         table[key] = _plain(value)
     changed = _validated(data)
+    if not isinstance(source, Scenario):  # whose files are known
+        changed = with_absolute_paths(changed, Path("scenario"))
     return with_folder_of(None, with_own_modules(changed, base))
 
 

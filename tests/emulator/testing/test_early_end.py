@@ -67,3 +67,10 @@ def test_a_time_that_the_run_does_not_have_is_refused(time_s: float, tmp_path: P
                 await emu.run_until(time_s)
 
     asyncio.run(waits())
+
+
+def test_files_that_a_dict_names_are_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "here.csv").write_text("x_m,y_m\n0,0\n50,0\n")
+    made = make_scenario({"network": {"kind": "file", "path": "here.csv"}}, {})
+    assert made.network.path == tmp_path / "here.csv"
