@@ -291,6 +291,11 @@ class Driving:
             moved = True
         return moved
 
+    def end_at(self, time_ns: int) -> None:
+        """Let nobody drive from this time on, with which the run ends."""
+        if self._world is not None:
+            self._world.ends_ns = time_ns
+
     def close(self) -> None:
         """Let go of what moves the vehicles; the run is over."""
         if self._world is not None:
@@ -774,6 +779,7 @@ class Emulation:
         assert healed_ns <= time_ns <= self.duration_ns, (healed_ns, time_ns, self.duration_ns)
         run = self.scenario.run
         settle_s = min(run.settle_s, (time_ns - healed_ns) / NS_PER_S)
+        self.driving.end_at(time_ns)
         world_s = None if time_ns == self.duration_ns else self.scenario.world_ns / NS_PER_S
         shorter = run.model_copy(
             update={"duration_s": time_ns / NS_PER_S, "settle_s": settle_s, "world_s": world_s or run.world_s}

@@ -68,7 +68,8 @@ class SteppedWorld(World):
     ) -> None:
         self._count, periods = len(node_ids), periods_of(scenario)
         self._units_m = [unit.position_m for unit in scenario.roadside]
-        self._duration_ns = scenario.duration_ns
+        self.ends_ns = scenario.duration_ns
+        """Time at which the run ends: at it nobody drives any more."""
         self._known = 1  # periods whose truth is known
         self._changed: list[int] = []  # periods with which vehicles enter or leave
         position_m, heading_rad = self.vehicles.place()
@@ -126,7 +127,7 @@ class SteppedWorld(World):
     def next_control_ns(self) -> int | None:
         """Return the next control instant within the run, or None."""
         next_ns = self.vehicles.now_ns + self.vehicles.step_ns
-        return next_ns if next_ns < self._duration_ns else None
+        return next_ns if next_ns < self.ends_ns else None
 
     def advance(self) -> list[Happening]:
         """Let all drive to the next control instant; returns what happens."""

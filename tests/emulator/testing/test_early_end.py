@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 import emulator
@@ -28,10 +29,11 @@ async def talks(node: Node) -> None:
         await node.radio.broadcast(b"here")
 
 
-SAME = "trace_sha256", "metrics_sha256", "verdict", "emulated_s"
+SAME = "trace_sha256", "metrics_sha256", "verdict", "emulated_s", "driving"
 GRADIENT = {"world.common_error.sigma_m": 3.0, "world.common_error.gradient_m_per_km": 1.0}
 
 
+@pytest.mark.parametrize("until_s", [2.0, 2.05])  # the first one is a control instant, too
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
@@ -43,7 +45,7 @@ GRADIENT = {"world.common_error.sigma_m": 3.0, "world.common_error.gradient_m_pe
     ids=["trips", "driven", "own", "standing"],
 )
 def test_a_run_that_is_ended_early_replays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, changes: dict[str, Any]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, changes: dict[str, Any], until_s: float
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "crossing.py").write_text(NETWORK)
@@ -51,12 +53,15 @@ def test_a_run_that_is_ended_early_replays(
 
     async def ends_early() -> None:
         async with RunHarness(scenario, tmp_path / "run") as emu:
-            await emu.run_until(2.05)
+            await emu.run_until(until_s)
 
     asyncio.run(ends_early())
     emulator.simulate(tmp_path / "run" / "scenario.toml", out=tmp_path / "again")
     first, again = (json.loads((tmp_path / name / "verdict.json").read_text()) for name in ("run", "again"))
     assert [first[key] for key in SAME] == [again[key] for key in SAME] and first["verdict"] == "valid"
+    driven = [pq.read_table(file) for file in sorted(tmp_path.glob("*/driven.parquet"))]
+    assert len(driven) == (2 if "network.driven.road" in changes else 0)
+    assert len({len(table) for table in driven}) <= 1
 
 
 @pytest.mark.parametrize("time_s", [math.inf, math.nan, 7.0])
