@@ -200,7 +200,8 @@ _NUMBERS = re.compile(r"(\.py:\d+)|\b0x[0-9a-f]+\b|\d+(?:[.,]\d+)*|'[^']*'")
 """Parts of a text that differ from run to run: numbers, names of vehicles, and what is quoted; lines do not."""
 ALPHA = 0.05
 """Probability of error, both of the bound of the rate and of as many green runs by chance."""
-TEST_FILE = "test_failure.py"
+TEST_FILE = "test_failure_{}.py"
+"""Name of a failure's test, by the name of its folder: pytest takes modules of one name for one."""
 TEXT = '''"""Failure {number} of a campaign: {checks}. Written by vnet; `pytest {file}` runs it."""
 
 from pathlib import Path
@@ -361,7 +362,12 @@ def regression_test(number: str, checks: Sequence[str], limit_s: float) -> str:
     name = "".join(character if character.isalnum() else "_" for character in number)
     twice = ", twice=True" if REPLAY in checks else ""
     return TEXT.format(
-        number=number, name=name, checks=", ".join(checks), file=TEST_FILE, limit_s=limit_s, twice=twice
+        number=number,
+        name=name,
+        checks=", ".join(checks),
+        file=TEST_FILE.format(number),
+        limit_s=limit_s,
+        twice=twice,
     )
 
 
@@ -625,7 +631,7 @@ class Campaign:
                 write_atomically(folder / SCENARIO_FILE, dump_scenario(shrunk))
             write_atomically(folder / "drawn.toml", schedule_toml(outcome.scenario.fault) + "\n")
             test = regression_test(folder.name, sorted(outcome.trial.failed), self._plan.limit_s)
-            write_atomically(folder / TEST_FILE, test)
+            write_atomically(folder / TEST_FILE.format(folder.name), test)
         return outcome
 
     def _explained(self, outcome: CampaignRun) -> CampaignRun:
@@ -720,7 +726,7 @@ class Campaign:
 def _reproduction(folder: Path, failed: Sequence[str]) -> str:
     """Return the command that shows a failure again: the test if it is of growth, for which nothing else looks."""
     if GROWTH in failed:
-        return f"pytest {shlex.quote(str(folder / TEST_FILE))}"
+        return f"pytest {shlex.quote(str(folder / TEST_FILE.format(folder.name)))}"
     command = f"vnet simulate {shlex.quote(str(folder / SCENARIO_FILE))}"
     return f"{command} --check-determinism" if REPLAY in failed else command
 

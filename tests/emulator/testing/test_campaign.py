@@ -115,7 +115,7 @@ def test_a_campaign_finds_a_nondeterministic_program_if_asked(tmp_path: Path) ->
     row = failure_of(plan, folder)
     assert list(row["failed"]) == ["replay"]
     assert "programs.py:" in row["failed"]["replay"]
-    test = (Path(row["folder"]) / TEST_FILE).read_text()
+    test = kept_test(row).read_text()
     assert "twice=True" in test
     assert list(failures(Path(row["folder"]) / "scenario.toml", tmp_path / "again", 60, twice=True)) == ["replay"]
     assert "--check-determinism" in (folder / "campaign.html").read_text()
@@ -244,7 +244,13 @@ def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path, pytester:
     row = failure_of(plan, tmp_path / "campaign")
     assert row["failed"] == {"hung": "not over within 1 s of wall clock; logs/stacks.txt says where it stood"}
     assert load_scenario(Path(row["folder"]) / "scenario.toml").fault
-    assert "hung" in said_by_pytest(Path(row["folder"]) / TEST_FILE, pytester)
+    assert "hung" in said_by_pytest(kept_test(row), pytester)
+
+
+def kept_test(row: dict[str, Any]) -> Path:
+    """The test of a failure, in the folder that a row of the campaign's results names."""
+    folder = Path(row["folder"])
+    return folder / TEST_FILE.format(folder.name)
 
 
 def said_by_pytest(test: Path, pytester: pytest.Pytester) -> str:
@@ -266,7 +272,7 @@ def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path, pytester:
     row = failure_of(Plan.of(planted("growing"), "loss", 1, seed=1, shrink_steps=2), tmp_path / "growing")
     assert list(row["failed"]) == ["growth"]
     assert row["shrunk"] == "", "it grows without any fault"
-    assert "growth" in said_by_pytest(test := Path(row["folder"]) / TEST_FILE, pytester)
+    assert "growth" in said_by_pytest(test := kept_test(row), pytester)
     page = (tmp_path / "growing" / "campaign.html").read_text()
     assert f"<pre>pytest {test}</pre>" in page, "no other command looks for growth"
 

@@ -89,5 +89,5 @@ def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(
     assert f"This run {parts}" in failure and 'id="timeline-data"' in failure and "crashed: " in failure
     assert page.count('<a href="failures/001/failure.html">') == 1
     assert [row["parting"]["differences"][0]["first"] for row in failed] == ["decision"] * len(failed)
-    test = folder / "failures" / "001" / TEST_FILE
+    test = folder / "failures" / "001" / TEST_FILE.format("001")
     assert "agents_alive" in said_by_pytest(test, pytester)
