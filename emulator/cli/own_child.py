@@ -53,7 +53,7 @@ class OwnChild:
         handled = (*heeded, signal.SIGCHLD)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may ignore it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, handled)
-        adoption.begin()
+        adopts = adoption.begin()
         others = {*started_processes(os.getpid())}  # of whoever has become this command, as a shell by exec
         child = os.fork()
         if child == 0:
@@ -93,7 +93,8 @@ class OwnChild:
                     os.kill(child, signal.SIGINT)  # SIGTERM in it is one that a program sends itself
         forwarded |= signal.sigpending() & set(heeded)
         end_left(started_processes(os.getpid(), others))
-        adoption.end()
+        if adopts:
+            adoption.end()
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
         ended = os.waitstatus_to_exitcode(status)
         # With its folder still noted, it has not left by `leave`. SIGKILL is the system's if memory is short. Once

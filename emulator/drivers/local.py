@@ -726,7 +726,12 @@ def _be(
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.setpgid(0, 0)  # by it what programs have started is found, and nothing that ends the parent's ends it
-        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)  # a group in the background does not read from the terminal
+        # A group in the background does not read from the terminal, and is not stopped for that it writes there.
+        null = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(null, 0)
+        os.close(null)
+        for number in (signal.SIGTTIN, signal.SIGTTOU):
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGUSR1, partial(_tell_stack, connection, os.getpid()))
         signal_at_parent_death(signal.SIGKILL)
         detach()

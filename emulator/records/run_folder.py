@@ -134,7 +134,7 @@ class RunFolder:
             self.put_scenario(scenario)
             self._events_file = (self.path / EVENTS_FILE).absolute()
             self._events_file.write_text("".join(event.line() for event in self.events))
-            if self._has_own_number or (self.path.parent == RUNS and not self.path.is_symlink()):
+            if self._has_own_number or self.path.absolute().parent == RUNS.absolute():
                 _point_latest_to(self.path)
 
     @property
@@ -251,6 +251,8 @@ def _claim(path: Path) -> Path:
 
 def _point_latest_to(path: Path) -> None:
     link = path.parent / "latest"
+    if link.is_dir() and not link.is_symlink():  # somebody's own
+        return
     fresh = path.parent / f".latest-{os.getpid()}"
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(path.name)

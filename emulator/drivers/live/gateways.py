@@ -98,6 +98,8 @@ class _Vehicle:
     receipts: wire.Receipts = field(default_factory=wire.Receipts)
     unicasts: int = 0
     is_due: bool = False
+    opened_s: float = -math.inf
+    """The loop's time at which its router was opened again; infinite while it is closed."""
     is_abandoned: bool = False
     """True since it was told that no session is there of programs that others have started."""
 
@@ -339,6 +341,8 @@ class Gateways:
         self._down_until_s = max(self._down_until_s, self._loop.time() + down_s)
         async with self._restarting:  # a router that is being opened cannot be closed
             there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
+            for vehicle in there.values():
+                vehicle.opened_s = math.inf
             self._down |= there  # not those whose programs are starting: these do not wait for one
             await self._all_but_slow(vehicle.gateway.close() for vehicle in there.values())
         while (left_s := self._down_until_s - self._loop.time()) > 0:  # another restart may last longer
@@ -364,6 +368,7 @@ class Gateways:
             self._tell("ended", node, Exit(1, str(error)))
         if self._vehicles.get(node) is not vehicle:  # or meanwhile
             await vehicle.gateway.close()
+        vehicle.opened_s = self._loop.time()
         self._loop.call_later(RETRY_S, self._look_for_programs, vehicle)
 
     async def close(self) -> None:
@@ -611,6 +616,8 @@ class Gateways:
         node, is_abandoned = vehicle.gateway.node_id, not vehicle.gateway.sessions
         if self._starts or not self._is_there(vehicle) or is_abandoned == vehicle.is_abandoned:
             return
+        if is_abandoned and self._loop.time() < vehicle.opened_s + RETRY_S:
+            return  # they may connect again
         if self._emulation.ended_ns is None:
             kind = EventKind.session_gone if is_abandoned else EventKind.session_back
             self._emulation.folder.event(self._now_ns(), kind, node)

@@ -72,11 +72,23 @@ def test_a_folder_holds_its_scenario_from_the_start(tmp_path: Path) -> None:
     assert folder.logs.is_dir()
 
 
-def test_out_may_be_new_or_empty_and_is_not_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_out_may_be_new_or_empty_and_is_latest_in_runs_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "empty").mkdir(parents=True)
     assert RunFolder.create(tmp_path / "runs" / "empty", Scenario()).path == tmp_path / "runs" / "empty"
-    assert not (tmp_path / "runs" / "latest").exists()
+    assert RunFolder.create(tmp_path / "elsewhere" / "new", Scenario()).path.exists()
+    assert (tmp_path / "runs" / "latest").readlink() == Path("empty")
+    assert not (tmp_path / "elsewhere" / "latest").exists()
+
+
+def test_a_folder_of_the_name_latest_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("latest", "other"):
+        RunFolder.create(Path("runs") / name, Scenario())
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["latest", "other"]
+    assert not Path("runs/latest").is_symlink()
 
 
 @pytest.mark.parametrize("what", ["a file", "a folder with a file", "a folder with a hidden file", "a run"])
