@@ -33,7 +33,7 @@ from emulator.radio.medium import SLICE_NS
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.radio.topology import connectivity_of
 from emulator.records.costs import Costs
-from emulator.records.events import KINDS, MOST_EVENTS, EventKind
+from emulator.records.events import KINDS, EventKind
 from emulator.records.metrics import Metrics
 from emulator.records.run_folder import RunFolder
 from emulator.records.samples import SampleRecorder
@@ -351,6 +351,8 @@ MOST_EXCEPTIONS = 20
 """Unhandled exceptions of a node that are written down, with their tracebacks; further ones are counted."""
 MOST_NOTES = 1000
 """Log lines of a node that are written down; further ones are counted."""
+MOST_EVENTS = 10_000
+"""Events of a node that are written down; further ones are counted."""
 MOST = {"exception": MOST_EXCEPTIONS, "log": MOST_NOTES, "event": MOST_EVENTS}
 LONGEST_TEXT = 4000
 """Characters of a text that are written down."""
@@ -780,9 +782,9 @@ class Emulation:
         run = self.scenario.run
         settle_s = min(run.settle_s, (time_ns - healed_ns) / NS_PER_S)
         self.driving.end_at(time_ns)
-        world_s = None if time_ns == self.duration_ns else self.scenario.world_ns / NS_PER_S
+        world_s = run.world_s if time_ns == self.duration_ns else self.scenario.world_ns / NS_PER_S
         shorter = run.model_copy(
-            update={"duration_s": time_ns / NS_PER_S, "settle_s": settle_s, "world_s": world_s or run.world_s}
+            update={"duration_s": time_ns / NS_PER_S, "settle_s": settle_s, "world_s": world_s}
         )
         self._rewrite(self.scenario.model_copy(update={"run": shorter}))
 

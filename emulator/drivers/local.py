@@ -317,7 +317,10 @@ def process_kept() -> Iterator[None]:
     The processes that they have started are ended, as by a live vehicle's end, unless another thread may have.
     """
     folder, variables, modules = Path.cwd(), dict(os.environ), list(sys.path)
-    is_alone = _is_alone()
+    here = threading.current_thread()
+    is_alone = here is threading.main_thread() and all(
+        each.daemon or each is here for each in threading.enumerate()
+    )
     others, finalizers = {*started_processes(os.getpid())}, {*_finalizers()}
     try:
         with imports_noted(lambda: present_node() is not None):
@@ -331,12 +334,6 @@ def process_kept() -> Iterator[None]:
         if os.environ != variables:
             os.environ.clear()
             os.environ.update(variables)
-
-
-def _is_alone() -> bool:
-    """Return whether no other thread is at work in this process."""
-    here = threading.current_thread()
-    return here is threading.main_thread() and all(each.daemon or each is here for each in threading.enumerate())
 
 
 def _end_pools(others: set[Any]) -> None:

@@ -70,10 +70,6 @@ def _if_any(details: Details) -> Level:
     return WARNING if details.get("count") else NOTE
 
 
-MOST_EVENTS = 10_000
-"""Events of a vehicle's program that are written down; further ones are counted."""
-
-
 class EventKind(StrEnum):
     """A kind of event. Its value is the `kind` of a line of `events.jsonl`.
 

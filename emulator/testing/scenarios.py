@@ -49,7 +49,7 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
             table = table.setdefault(section, {})
         table[key] = _plain(value)
     changed = _validated(data)
-    if given or not isinstance(source, Scenario):  # whose files are known
+    if given or not isinstance(source, Scenario):  # as it is, whose files are known
         changed = with_absolute_paths(changed, Path("scenario"))
     return with_folder_of(None, with_own_modules(changed, base))
 

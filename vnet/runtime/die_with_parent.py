@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Set
-from pathlib import Path
+from io import FileIO
 
 PR_SET_PDEATHSIG = 1
 PR_SET_CHILD_SUBREAPER = 36
@@ -81,12 +81,19 @@ def started_processes(by: int, others: Set[int] = frozenset()) -> Iterator[int]:
 
     Nothing if no file tells.
     """
-    for file in Path(f"/proc/{by}/task").glob("*/children"):
-        with contextlib.suppress(OSError):
-            for process in {*map(int, file.read_text().split())} - others:
-                with contextlib.suppress(ProcessLookupError):
-                    if os.getsid(process) == os.getsid(0):
-                        yield from (process, *started_processes(process, others))
+    for process in _children(by) - others:
+        with contextlib.suppress(ProcessLookupError):
+            if os.getsid(process) == os.getsid(0):
+                yield from (process, *started_processes(process, others))
+
+
+def _children(of: int) -> set[int]:
+    found: set[int] = set()
+    with contextlib.suppress(OSError):  # it has ended meanwhile
+        for task in os.scandir(f"/proc/{of}/task"):
+            with contextlib.suppress(OSError):  # or this thread of it
+                found.update(map(int, _read(f"{task.path}/children").split()))
+    return found
 
 
 def rest_of_groups(groups: Set[int]) -> Iterator[int]:
@@ -101,8 +108,13 @@ def end_left(processes: Iterable[int]) -> None:
     """Kill what programs have left, but for Python's tracker, which ends once it has removed what others left."""
     for process in list(processes):
         with contextlib.suppress(OSError):  # it has ended meanwhile
-            if b"resource_tracker" not in Path(f"/proc/{process}/cmdline").read_bytes():
+            if b"resource_tracker" not in _read(f"/proc/{process}/cmdline"):
                 os.kill(process, signal.SIGKILL)
+
+
+def _read(file: str) -> bytes:
+    with FileIO(file) as content:  # `pathlib` would be a third of the time that `TIED` takes
+        return content.read()
 
 
 def _watch(parent: int, number: signal.Signals) -> None:

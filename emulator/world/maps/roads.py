@@ -136,7 +136,7 @@ def _lanes(tags: Mapping[str, str], name: str) -> tuple[tuple[int, int], bool]:
         total = total or _count(tags.get("lanes:backward" if is_reversed else "lanes:forward"))
         return (total or usual, 0), is_reversed
     forward, backward = _count(tags.get("lanes:forward")), _count(tags.get("lanes:backward"))
-    total = max(0, total - _count(tags.get("lanes:both_ways")))  # of which no vehicle drives on that between them
+    total = max(0, total - _count(tags.get("lanes:both_ways")))  # a lane between both is for turns
     if total:
         forward = forward or (max(1, total - backward) if backward else max(1, (total + 1) // 2))
         backward = backward or max(1, total - forward)
