@@ -198,7 +198,8 @@ def parse_values(key: str, text: str) -> list[Any]:
 
 
 def _value(text: str) -> Any:
-    """A value in TOML's syntax, or a bare word."""
+    """A value in TOML's syntax, a number such as .5, or a bare word."""
+    text = re.sub(r"^(\s*-?)(\.\d+\s*)$", r"\g<1>0\2", text)
     try:
         (value,) = parse_toml(f"value = {text}").values()  # not what further lines would set
         return value
@@ -323,6 +324,8 @@ def load_scenario(path: Path, overrides: Sequence[str] = (), checks: Sequence[st
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
+        if path.suffix == ".py":
+            raise ScenarioError(f"{path}: a program; a scenario is needed, and --program {path}") from None
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
     if "inputs" in data:  # a run has recorded it
         data = with_new_names(data)

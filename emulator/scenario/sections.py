@@ -125,6 +125,8 @@ def first_problem(error: ValidationError, of: type[Any]) -> str:
         tag = problem["ctx"]["tag"]
         return f"{before}kind = {shown(tag)}{did_you_mean(tag, kinds)}: must be one of {', '.join(kinds)}"
     message = _worded(problem)
+    if isinstance(problem["input"], dict) and message == "a list is needed":
+        return f"{key}: a list of tables is needed: write [[{key}]] in place of [{key}]"
     if problem["type"] == "missing":
         return f"{key}: {message}"
     if _is_long(problem["input"]):  # a whole section is wrong, or is not a section's kind of value

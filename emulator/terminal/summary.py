@@ -67,7 +67,7 @@ def print_summary(
     console.print(f"files        {folder.path}", highlight=False, soft_wrap=True)
     path = folder.path.absolute() if str(folder.path).startswith("-") else folder.path
     quoted = shlex.quote(str(path))
-    following = {verdict["reproduce"]: "the same run again", f"vnet check {quoted}": "judge it again"}
+    following = {verdict["reproduce"]: "run it again", f"vnet check {quoted}": "judge it again"}
     following[f"vnet report {quoted} --open"] = f"read {folder.path / REPORT}" if report else "have a report of it"
     if (recording := path / RECORDING).exists():
         following[f"vnet view {quoted}"] = "look at it"

@@ -36,7 +36,7 @@ from emulator.scenario.faults import Fault, OwnRule, parse_fault, refuse_router_
 from emulator.scenario.loading import with_modules
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import DAY_S
-from vnet.errors import ScenarioError, VnetError
+from vnet.errors import ScenarioError, VnetError, did_you_mean
 from vnet.units import NS_PER_S
 
 CRASHES = "agents_alive", "no_exceptions", "progress", "own_rules"
@@ -379,7 +379,10 @@ class RunHarness:
         names = tuple(PREFIX + name if PREFIX + name in {*known, *left_out} else name for name in names)
         for name in names:
             if name not in known and name not in left_out:
-                raise VnetError(f"no check is called {name!r}; there are: {', '.join([*known, *left_out])}")
+                there = [*known, *left_out]
+                raise VnetError(
+                    f"no check is called {name!r}{did_you_mean(name, there)}; there are: {', '.join(there)}"
+                )
         chosen = [check for check in judgement.checks if check.name in names or not names]
         self._named |= {check.name for check in chosen}
         failed = [check for check in chosen if _fails(check, allow_unknown)]

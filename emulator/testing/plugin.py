@@ -106,6 +106,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     report = yield
     runs = item.stash.get(_runs, [])
     if report.failed and runs:
-        lines = [f"files  {run.folder}" for run in runs[-3:]] + [f"again  {runs[-1].reproduce}"]
+        begun = [run for run in runs if (run.folder / "scenario.toml").exists()]
+        lines = [f"files  {run.folder}" for run in begun[-3:]] + [f"again  {run.reproduce}" for run in begun[-1:]]
         report.sections.append(("vnet", "\n".join(lines)))
     return report

@@ -12,7 +12,7 @@ from emulator.cells.worker import with_folder_of
 from emulator.scenario.loading import find_scenario, load_scenario, with_absolute_paths, with_own_modules
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, did_you_mean
 
 Source = str | Path | Mapping[str, Any] | Scenario
 
@@ -43,7 +43,8 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
     for name, value in given.items():
         *sections, key = NAMES.get(name, name).split(".")
         if not sections and name != "faults":
-            raise ScenarioError(f"{name}: unknown; write section.key, or one of {', '.join(NAMES)}")
+            meant = did_you_mean(name, NAMES)
+            raise ScenarioError(f"{name}: unknown{meant}; write section.key, or one of {', '.join(NAMES)}")
         table = data
         for section in sections:
             table = table.setdefault(section, {})

@@ -50,12 +50,13 @@ def check_row_count(path: Path, rows: int) -> None:
 
 
 def check_columns(path: Path, reader: csv.DictReader[str], columns: Sequence[str]) -> None:
-    """Raise ScenarioError unless each of these columns is there once."""
-    names = list(reader.fieldnames or [])
+    """Take the blanks off the names of columns. Raise ScenarioError unless each of `columns` is there once."""
+    reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
     for column in columns:
         if names.count(column) != 1:
             problem = "two columns" if column in names else "no column"
-            raise ScenarioError(f"{path}: {problem} {column!r}; needed are {', '.join(columns)}")
+            there = f"; there are {printable(', '.join(names), 200)}" if names else ""
+            raise ScenarioError(f"{path}: {problem} {column!r}; needed are {', '.join(columns)}{there}")
 
 
 def number_of(text: str | None) -> float:

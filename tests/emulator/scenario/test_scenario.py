@@ -51,7 +51,7 @@ def test_what_is_no_toml_or_much_too_large_is_one_line(tmp_path: Path, text: str
 
 def test_overrides_win_the_last_of_two_and_bare_words_are_strings(tmp_path: Path) -> None:
     path = write(tmp_path, "[radio]\nloss = 0.1")
-    scenario = load_scenario(path, ["radio.loss=0.3", "program.options.fusion=random", "run.seed=2", "run.seed=7"])
+    scenario = load_scenario(path, ["radio.loss=.3", "program.options.fusion=random", "run.seed=2", "run.seed=7"])
     assert scenario.radio.loss == 0.3
     assert scenario.program.options == {"fusion": "random"}
     assert scenario.run.seed == 7

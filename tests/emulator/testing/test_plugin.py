@@ -163,7 +163,8 @@ async def test_raises(vnet_emulation):
 WRONG_STEPS = {
     "await emu.__aenter__()": "*VnetError: an emulation can be entered once*",
     "emu.check('peer_cap')": "*peer_cap is unknown: not exercised: *",
-    "emu.check('speed')": "*VnetError: no check is called 'speed'; there are: conservation, *",
+    "emu.check('sped')": "*VnetError: no check is called 'sped'; there are: conservation, *",
+    "emu.check('progres')": "*VnetError: no check is called 'progres' (did you mean progress?); there are: *",
     "emu.check('conservation', within_s=1)": "*none of these checks measured a recovery",
     "await emu.run_until(3)": "*run_until(3): the run takes 2 s; give it a longer duration=",
     "await emu.run_until(1); await emu.run_until(0.5)": "*run_until(0.5): it is 1 s already",
@@ -175,7 +176,7 @@ WRONG_STEPS = {
     "await emu.run_until(1)\n        with emu.fault('partition'): pass": "*all have healed by 1 s, *",
 }
 WRONG_SCENARIOS = {
-    "BEACON, speed=3": "*ScenarioError: speed: unknown; write section.key, or one of vehicles, *",
+    "BEACON, durations=3": "*ScenarioError: durations: unknown (did you mean duration?); write section.key, or *",
     "BEACON, **{'radio.lost': 1}": "*ScenarioError: radio.lost: unknown key (did you mean loss?); allowed here:*",
     "BEACON, **{'run.pacing': 'realtime'}": "*a test steps a run in lockstep*",
     "{'network': {'vehicles': 0}}": "*ScenarioError: network.vehicles = 0:*",
