@@ -103,7 +103,7 @@ def _winner_b1_db(model: WinnerB1, distance_m: Array, here_m: Array | float, the
 
     WINNER+ D5.3, table 4-1, as 3GPP TR 36.885 and Gonzalez-Martin et al. (2019) take it: at least 3 m.
     """
-    far_m = np.maximum(distance_m, WINNER_NEAREST_M)
+    far_m = np.maximum(np.hypot(distance_m, here_m - there_m), WINNER_NEAREST_M)
     here_m, there_m = (np.maximum(height_m - model.environment_m, 0.1) for height_m in (here_m, there_m))
     break_m = 4 * here_m * there_m * model.frequency_ghz * 1e9 / LIGHT_M_S
     log_ghz = np.log10(model.frequency_ghz)

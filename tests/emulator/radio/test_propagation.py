@@ -143,6 +143,7 @@ MODELS = [
     {"kind": "log_distance", "exponent": 2.7},
     {"kind": "dual_slope", "break_m": 50.0},
     {"kind": "two_ray"},
+    {"kind": "winner_b1"},
 ]
 
 
@@ -174,6 +175,12 @@ def test_height_counts_by_the_slant_distance_and_power_where_it_is_sent(section:
     assert power[0, 2] == pytest.approx(received, abs=1e-6)
     assert power[2, 0] == pytest.approx(received + 13.0, abs=1e-6)
     assert power[2, 2] == 33.0
+
+
+def test_above_a_vehicle_a_mast_of_winner_b1_is_as_far_as_it_is_high() -> None:
+    model = path_loss({"kind": "winner_b1"})
+    above = loss_db(model, np.array([0.0, 30.0]), (np.array(1.5), np.array(41.5)))
+    assert above == pytest.approx(loss_db(model, np.array([40.0, 50.0])))
 
 
 def test_two_rays_meet_from_both_heights() -> None:
