@@ -99,6 +99,8 @@ class Gateway(RadioSide[zenoh.Query]):
         self.is_paused = False
         self._session: zenoh.Session | None = None
         self._closing: asyncio.Future[None] | None = None
+        self._stamped: zenoh.Timestamp | None = None
+        """The latest stamp that was given here."""
         self._watches: list[Any] = []
         self._declared: dict[str, zenoh.LivelinessToken] = {}
         """Tokens of other vehicles, which are declared at this one's programs.
@@ -170,8 +172,11 @@ class Gateway(RadioSide[zenoh.Query]):
     def _put(self, number: int, sample: zenoh.Sample) -> None:
         key = sample.key_expr
         if self._is_first(number, key) and self.crosses(str(key)) and self._session is not None:
-            # A delete has none, and the routers of receivers would give it theirs.
-            stamp = sample.timestamp or self._session.new_timestamp()
+            # The router stamps what is put, as it arrives. A delete has no stamp until now, when what was put after
+            # it has one already; routers of receivers would give it theirs.
+            stamp, after = sample.timestamp, self._stamped
+            if stamp is None or (after and stamp <= after and bytes(stamp.get_id()) == bytes(after.get_id())):
+                stamp = self._stamped = self._session.new_timestamp()
             _keep_publisher(sample)
             self._tell("message", crossing_sample(sample, stamp))
 

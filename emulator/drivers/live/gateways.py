@@ -223,11 +223,10 @@ class Gateways:
         self._say_hello(vehicle)
 
     def _listen(self, node: str) -> str:
-        """Return the endpoint of a vehicle: that which it has had, or its place in the range of ports."""
-        if node in self.endpoints:
-            return self.endpoints[node]
+        """Return where a vehicle listens: at the port that it has had, or at its place in the range of ports."""
         address, _, port = self._settings.listen.rpartition(":")
-        return f"{address}:{int(port) and int(port) + self._emulation.number[node]}"
+        had = self.endpoints.get(node, "").rpartition(":")[2]  # its address is one of those of 0.0.0.0
+        return f"{address}:{had or (int(port) and int(port) + self._emulation.number[node])}"
 
     def _tell_endpoints(self) -> None:
         """Write the endpoints of all vehicles, once they listen, and tell them to whoever starts the programs."""
@@ -363,7 +362,7 @@ class Gateways:
             return
         try:
             await vehicle.gateway.close()  # which may last
-            await _opened(vehicle.gateway, self.endpoints[node])
+            await _opened(vehicle.gateway, self._listen(node))
         except VnetError as error:
             self._tell("ended", node, Exit(1, str(error)))
         if self._vehicles.get(node) is not vehicle:  # or meanwhile

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from datetime import datetime
 from functools import partial
 from ipaddress import ip_address
+from itertools import pairwise
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -199,6 +200,20 @@ async def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody
     assert vehicles[1].frames == []
     assert [(await own.get()).kind for _ in range(4)] == [each.kind for each in samples]
     assert own.empty()  # past the radio, and not again by it
+
+
+@two_vehicles()
+async def test_stamps_of_puts_and_deletes_are_in_their_order(
+    vehicles: list[Vehicle], sessions: list[zenoh.Session]
+) -> None:
+    heard = listen(sessions[1], "**")
+    for number in range(100):
+        sessions[0].put("car", str(number))
+        sessions[0].delete("car")
+    samples = [await heard.get() for _ in range(200)]
+    assert [sample.payload.to_string() for sample in samples[::2]] == [str(number) for number in range(100)]
+    stamps = [sample.timestamp for sample in samples if sample.timestamp is not None]
+    assert len(stamps) == 200 and not any(later <= earlier for earlier, later in pairwise(stamps))
 
 
 @two_vehicles(max_payload=300)

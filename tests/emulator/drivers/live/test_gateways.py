@@ -31,6 +31,7 @@ class Rig:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, vehicles: int, radio: dict[str, Any]) -> None:
         self.routers: dict[str, Gateway] = {}
+        self.listened: list[str] = []
         self.noted: list[wire.Note] = []
         self.told: asyncio.Queue[tuple[str, str, Any]] = asyncio.Queue()
         monkeypatch.setattr(Gateway, "open", lambda gateway, listen: self._open_none(gateway, listen))
@@ -50,7 +51,8 @@ class Rig:
 
     def _open_none(self, gateway: Gateway, listen: str) -> str:
         self.routers[gateway.node_id] = gateway
-        return listen
+        self.listened.append(listen)
+        return "tcp/192.0.2.1:7000"
 
     def _tell(self, *item: Any) -> None:
         self.told.put_nowait(item)
@@ -96,6 +98,18 @@ async def test_frames_are_sent_as_of_the_instants_of_their_own_samples(monkeypat
     for arrived_ns in (8, 9):
         rig.put("v01", SAMPLE, arrived_ns)
     assert await rig.sent(2) == [([SAMPLE], 8), ([SAMPLE], 9)]
+    await rig.gateways.close()
+
+
+@on_a_loop
+async def test_an_endpoint_is_there_again_at_its_port_and_at_all_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(monkeypatch, 1, {})
+    await rig.welcome("v01")
+    await asyncio.to_thread(rig.gateways.detach("v01"), 1.0)
+    rig.gateways.start_agents("", Access.create("fake", []), [["v01"]])
+    while len(rig.listened) < 2:
+        await asyncio.sleep(0)
+    assert rig.listened == ["tcp/127.0.0.1:0", "tcp/127.0.0.1:7000"]
     await rig.gateways.close()
 
 
