@@ -99,8 +99,6 @@ class Gateway(RadioSide[zenoh.Query]):
         self.is_paused = False
         self._session: zenoh.Session | None = None
         self._closing: asyncio.Future[None] | None = None
-        self._stamped: zenoh.Timestamp | None = None
-        """The latest stamp that was given here."""
         self._watches: list[Any] = []
         self._declared: dict[str, zenoh.LivelinessToken] = {}
         """Tokens of other vehicles, which are declared at this one's programs.
@@ -154,8 +152,13 @@ class Gateway(RadioSide[zenoh.Query]):
     def _tell(self, what: str, item: Any) -> None:
         self._tell_run("gateway", what, (self, item))
 
-    def _telling(self, take: Callable[[T], None]) -> Callable[[T], None]:
-        """Return a callback for Zenoh that tells of its own exceptions."""
+    def _telling(self, take: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
+        """Return a callback for Zenoh that tells of its own exceptions.
+
+        It is called on the thread that receives for the router. With a thread for each callback, Zenoh's default, the
+        order of samples of different keys would change, that of samples, queries and tokens, and that of stamps: a
+        put has one when it is routed, a delete when it is told.
+        """
 
         def told(item: T) -> None:
             try:
@@ -163,7 +166,7 @@ class Gateway(RadioSide[zenoh.Query]):
             except Exception as error:
                 self._tell("bug", error)
 
-        return told
+        return zenoh.handlers.Callback(told, indirect=False)
 
     def _is_first(self, number: int, key: zenoh.KeyExpr) -> bool:
         """Tell whether no expression before that of this number matches a key: Zenoh asks each."""
@@ -172,11 +175,8 @@ class Gateway(RadioSide[zenoh.Query]):
     def _put(self, number: int, sample: zenoh.Sample) -> None:
         key = sample.key_expr
         if self._is_first(number, key) and self.crosses(str(key)) and self._session is not None:
-            # The router stamps what is put, as it arrives. A delete has no stamp until now, when what was put after
-            # it has one already; routers of receivers would give it theirs.
-            stamp, after = sample.timestamp, self._stamped
-            if stamp is None or (after and stamp <= after and bytes(stamp.get_id()) == bytes(after.get_id())):
-                stamp = self._stamped = self._session.new_timestamp()
+            # A delete has none, and the routers of receivers would give it theirs.
+            stamp = sample.timestamp or self._session.new_timestamp()
             _keep_publisher(sample)
             self._tell("message", crossing_sample(sample, stamp))
 

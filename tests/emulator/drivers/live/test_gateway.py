@@ -202,14 +202,14 @@ async def test_a_sample_crosses_the_radio_as_it_was_put_and_comes_back_to_nobody
     assert own.empty()  # past the radio, and not again by it
 
 
-@two_vehicles()
-async def test_stamps_of_puts_and_deletes_are_in_their_order(
+@two_vehicles(keys=("car/a", "car/b"))
+async def test_samples_and_stamps_are_in_their_order_of_whatever_keys(
     vehicles: list[Vehicle], sessions: list[zenoh.Session]
 ) -> None:
     heard = listen(sessions[1], "**")
     for number in range(100):
-        sessions[0].put("car", str(number))
-        sessions[0].delete("car")
+        sessions[0].put(f"car/{'ab'[number % 2]}", str(number))
+        sessions[0].delete("car/a")
     samples = [await heard.get() for _ in range(200)]
     assert [sample.payload.to_string() for sample in samples[::2]] == [str(number) for number in range(100)]
     stamps = [sample.timestamp for sample in samples if sample.timestamp is not None]
