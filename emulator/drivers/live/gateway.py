@@ -155,7 +155,7 @@ class Gateway(RadioSide[zenoh.Query]):
     def _telling(self, take: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
         """Return a callback for Zenoh that tells of its own exceptions.
 
-        It is called on the thread that receives for the router. With a thread for each callback, Zenoh's default, the
+        It is called on the thread that receives for the router. With a thread for each callback, as by default, the
         order of samples of different keys would change, that of samples, queries and tokens, and that of stamps: a
         put has one when it is routed, a delete when it is told.
         """
