@@ -68,6 +68,8 @@ RETRY_S = 5.0
 """Time after which programs are connected again to a router that is back: Zenoh's clients wait for up to 4 s."""
 SWITCH_S = 0.001
 """Time after which a thread lets another one run, Python's 5 ms else: what programs put and hear is on others."""
+TOKENS_S = 0.02
+"""Least time between two messages with tokens that change."""
 TURNS_S = 0.1
 """Seconds over which vehicles begin, one after another, what all of them do: at one instant it would be late."""
 
@@ -100,6 +102,8 @@ class _Vehicle:
     is_due: bool = False
     opened_s: float = -math.inf
     """The loop's time at which its router was opened again; infinite while it is closed."""
+    more_tokens: bool | None = None
+    """Whether tokens have changed since they were sent, less than `TOKENS_S` ago; None if that is longer."""
     is_abandoned: bool = False
     """True since it was told that no session is there of programs that others have started."""
 
@@ -296,6 +300,7 @@ class Gateways:
         elif not vehicle.commands and not vehicle.is_ready:
             self._say_hello(vehicle, failure=f"its commands have ended before they had connected: {HOW}")
         elif not vehicle.commands:
+            self._enqueue_more_tokens(vehicle)
             vehicle.outbox.endings.append(wire.Ending(node, "finished", time_ns=self._now_ns()))
             self._flush_soon(vehicle)
         return True
@@ -474,6 +479,24 @@ class Gateways:
     def _tell_clock(self, vehicle: _Vehicle) -> None:
         vehicle.gateway.show_clock(min(self._now_ns(), self._emulation.duration_ns))  # it stands at the end
 
+    def _tell_tokens(self, vehicle: _Vehicle, arrived_ns: int) -> None:
+        """Send the tokens, unless they were just sent: a message for each of many would have all others, too."""
+        has_told, vehicle.more_tokens = vehicle.more_tokens is not None, True
+        if not has_told:
+            self._enqueue_more_tokens(vehicle)
+            self._flush(vehicle, arrived_ns)
+            self._loop.call_later(TOKENS_S, self._tell_more_tokens, vehicle)
+
+    def _tell_more_tokens(self, vehicle: _Vehicle) -> None:
+        more, vehicle.more_tokens = vehicle.more_tokens, None
+        if more and self._is_there(vehicle):
+            self._tell_tokens(vehicle, time.monotonic_ns())
+
+    def _enqueue_more_tokens(self, vehicle: _Vehicle) -> None:
+        if vehicle.more_tokens:
+            vehicle.more_tokens = False
+            self._enqueue(vehicle, vehicle.gateway.tokens() or CrossingTokens(()))
+
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
         if vehicle.gateway.is_paused:
             return
@@ -514,8 +537,8 @@ class Gateways:
             vehicle.early[key] = what, told
             if vehicle.on_air:
                 self._flush(vehicle, arrived_ns)
-        elif (message := gateway.take(what, told)) is not None and vehicle.on_air:
-            self._transmit(vehicle, message, arrived_ns)
+        elif gateway.take(what, told) is not None and vehicle.on_air:
+            self._tell_tokens(vehicle, arrived_ns)
         elif what == "session":
             self._look_at_sessions(vehicle)
             if had_sessions != bool(gateway.sessions):  # and not of a router that vnet has closed

@@ -58,6 +58,26 @@ def test_what_one_program_puts_arrives_in_that_order(drive: Drive) -> None:
     assert log(run, "v02")[: len(expected)] == expected
 
 
+def test_many_tokens_of_one_instant_are_two_messages(drive: Drive) -> None:
+    """And all are gone at once if their program ends: a message for each would fill the queue."""
+    text = """
+        import sys, time, zenoh
+        session = zenoh.open(zenoh.Config())
+        session.liveliness().declare_subscriber("alive/**", lambda s: print(s.key_expr, s.kind))
+        if sys.argv[1] == "v01":
+            time.sleep(0.1)
+            tokens = [session.liveliness().declare_token(f"alive/{n}") for n in range(50)]
+            time.sleep(0.1)
+            session.close()
+        else:
+            time.sleep(0.9)
+        """
+    run = drive(text, vehicles=2)
+    told = [f"alive/{n} SampleKind.{kind}" for kind in ("PUT", "DELETE") for n in range(50)]
+    assert sorted(log(run, "v02")) == sorted(told)
+    assert len(run.trace) <= 8
+
+
 def test_what_crosses_has_a_timestamp_of_its_vehicles_router(drive: Drive) -> None:
     """Also a delete, which has none in its own vehicle: the routers of receivers would give it theirs."""
     text = """
@@ -359,10 +379,14 @@ def test_tokens_are_those_of_the_latest_word_whatever_overtakes_it(drive: Drive)
         watch = session.liveliness().declare_subscriber("alive/*", tell)
         time.sleep(0.5)
         if sys.argv[1] == "v01":
-            tokens = [session.liveliness().declare_token(f"alive/{number}") for number in range(6)]
+            tokens = []
+            for number in range(6):
+                tokens.append(session.liveliness().declare_token(f"alive/{number}"))
+                time.sleep(0.001)
             time.sleep(1.0)
             for token in tokens:
                 token.undeclare()
+                time.sleep(0.001)
         time.sleep(5)
         """
     lines = log(drive(text, vehicles=2, duration_s=2.5, radio={"jitter_ms": 20.0}), "v02")

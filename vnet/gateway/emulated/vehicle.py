@@ -78,6 +78,8 @@ class Vehicle(RadioSide[Asking]):
         self._entities: defaultdict[str, list[Entity]] = defaultdict(list)
         """Declarations of its sessions by kind."""
         self._has_tokens = asyncio.Event()
+        self._more_tokens: bool | None = None
+        """Whether more tokens have changed since those of this instant were sent; None if none were."""
         self._subscribers_of = lru_cache(MOST_KEYS)(self._find_subscribers)
         self._session_numbers = count(1)
         self._stamped_ns = 0
@@ -278,9 +280,20 @@ class Vehicle(RadioSide[Asking]):
 
     def _token_changed(self, key: zenoh.KeyExpr, alive: bool) -> None:
         if self.crosses(str(key)):
-            self._send_tokens()
+            if self._more_tokens is None:
+                self._more_tokens = False
+                self._send_tokens()
+                self._loop.call_soon(self._send_more_tokens)
+            else:
+                self._more_tokens = True
             self._has_tokens.set()
         self._tell_watchers(key, alive)
+
+    def _send_more_tokens(self) -> None:
+        """Send the tokens if more than one has changed at this instant: a message each would have all of them."""
+        more, self._more_tokens = self._more_tokens, None
+        if more:
+            self._send_tokens()
 
     def _tell_watchers(self, key: zenoh.KeyExpr, alive: bool) -> None:
         text = str(key)

@@ -114,6 +114,26 @@ async def test_an_endpoint_is_there_again_at_its_port_and_at_all_addresses(monke
 
 
 @on_a_loop
+async def test_many_tokens_within_a_moment_are_two_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if their program ends within it."""
+    rig = Rig(monkeypatch, 1, {})
+    monkeypatch.setattr(Gateway, "_is_alive", lambda gateway, key: True)
+    await rig.welcome("v01")
+    rig.gateways.send("v01", wire.Batch([], 0, origin_ns=0))
+    assert (await rig.told.get())[0] == "frames", "it is on the air, and acknowledges"
+    router: Any = rig.routers["v01"]
+    router._session = SimpleNamespace(close=lambda: None)
+    (vehicle,) = rig.gateways._vehicles.values()
+    vehicle.is_ready, vehicle.commands = True, {"v01": "talk"}
+    for key in "abc":
+        rig.gateways.take("token", (router, (key, True)), 5)
+    assert await rig.sent(1) == [([CrossingTokens(("a",))], 5)]
+    assert rig.gateways.takes_end("v01", Exit(0, ""))
+    assert [told for told, _ in await rig.sent(1)] == [[CrossingTokens(("a", "b", "c"))]]
+    await rig.gateways.close()
+
+
+@on_a_loop
 async def test_what_programs_put_before_the_start_goes_out_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that puts more before its turn sends both, in their order, and the latest sample of each key alone."""
     monkeypatch.setattr("emulator.drivers.live.gateways.TURNS_S", 1e6)
