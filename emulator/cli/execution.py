@@ -224,10 +224,11 @@ def _run_live(session: Session, request: Request, create: Callable[[], str] = la
             if line := create():
                 progress.state(line)
             request.output.keep_in(folder.logs)
+            send_again()
 
         if record is not None and record.serve is not None:
             progress.state(record.serve.announcement())
-        with signals_ignored():  # a second Ctrl-C must not lose the records
+        with signals_ignored() as send_again:  # a second Ctrl-C must not lose the records
             with calls_recorded(folder.path, request.check_determinism is not None):
                 session.run(on_state=progress.state, on_missing=progress.awaits, on_open=on_open)
             _finish(session, progress, request)

@@ -93,7 +93,16 @@ def tell_from_handler(tell: Callable[[], None]) -> None:
 
 
 @contextmanager
-def signals_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C and SIGTERM within the block, but where a run in it handles them: records are kept."""
-    with signals_handled(signal.SIG_IGN, *ENDING):
-        yield
+def signals_ignored() -> Iterator[Callable[[], None]]:
+    """Ignore Ctrl-C and SIGTERM within the block, but where a run in it handles them: records are kept.
+
+    The block gets a function for the run to call as soon as it does: it sends the first one of before again.
+    """
+    came: list[int] = []
+
+    def send_again() -> None:
+        for number in came[:1]:
+            signal.raise_signal(number)
+
+    with signals_handled(lambda number, frame: came.append(number), *ENDING):
+        yield send_again

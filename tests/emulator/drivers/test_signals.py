@@ -4,7 +4,7 @@ import asyncio
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -34,11 +34,24 @@ def before(request: pytest.FixtureRequest) -> Iterator[object]:
 
 def test_handlers_are_restored_however_the_block_is_left(before: object) -> None:
     with signals_ignored():
-        assert [signal.getsignal(number) for number in ENDING] == [signal.SIG_IGN] * 2
+        for number in ENDING:
+            os.kill(os.getpid(), number)
     assert [signal.getsignal(number) for number in ENDING] == [before] * 2
     with pytest.raises(ZeroDivisionError), signals_ignored():
         raise ZeroDivisionError
     assert [signal.getsignal(number) for number in ENDING] == [before] * 2
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_signal_of_before_the_run_ends_the_run(number: signal.Signals) -> None:
+    async def work(send_again: Callable[[], None]) -> None:
+        async with cancelled_by_signals():
+            send_again()
+            await asyncio.sleep(60)
+
+    with signals_ignored() as send_again, pytest.raises(asyncio.CancelledError):
+        os.kill(os.getpid(), number)
+        asyncio.run(work(send_again))
 
 
 @pytest.mark.parametrize("number", ENDING)

@@ -93,7 +93,8 @@ def test_winner_b1_is_the_published_formula() -> None:
     expected = np.maximum(np.where(far_m < 177.4, near, beyond), free)
     assert loss_db(model, far_m) == pytest.approx(expected)
     high = loss_db(model, np.array([300.0]), (np.array([6.0]), np.array([1.5])))
-    assert high == pytest.approx(22.7 * np.log10(300) + 27 + 20 * np.log10(5.91)), "beyond the breakpoint"
+    slant_m = np.hypot(300, 4.5)
+    assert high == pytest.approx(22.7 * np.log10(slant_m) + 27 + 20 * np.log10(5.91)), "before the breakpoint"
 
 
 @pytest.mark.parametrize(("scs_khz", "most"), [(15, 4), (30, 5), (60, 9)])
