@@ -113,12 +113,11 @@ def _broken(entry: str) -> str:
 
 def _unknown(entry: str, error: BaseException) -> CheckResult:
     """Say how a function failed, and where in its own module."""
-    if isinstance(error, VnetError) and not isinstance(error, _NonsenseError):
-        said = str(error)
-    else:
-        said = str(error) if isinstance(error, _NonsenseError) else f"raises {in_words(error)}"
+    if isinstance(error, _NonsenseError):
+        return named(_broken(entry), unknown(str(error)))
+    said = str(error) if isinstance(error, VnetError) else f"raises {in_words(error)}"
     frames = outside(error, __file__)
-    if frames is None or isinstance(error, _NonsenseError):
+    if frames is None:
         return named(_broken(entry), unknown(said))
     where = "".join(traceback.format_exception(error.with_traceback(frames)))
     return named(_broken(entry), unknown(f"{said} ({line_of(frames)})", where=where))
