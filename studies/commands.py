@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -158,19 +157,12 @@ def attackers(
         _show(study.report(results, duration), folder / "attackers.md")
 
 
-class Study(StrEnum):
-    """Studies of `vnet experiment compare`."""
-
-    ABLATION = "ablation"
-    ABLATION_FULL = "ablation-full"
-    BASELINES = "baselines"
-    RECEIVERS = "receivers"
-    CHURN = "churn"
-
-
 @app.command()
 def compare(
-    study: Annotated[Study, typer.Argument(help="What the cooperative program is compared with.")],
+    study: Annotated[
+        Literal["ablation", "ablation-full", "baselines", "receivers", "churn"],
+        typer.Argument(help="What the cooperative program is compared with."),
+    ],
     networks: NetworksOption = None,
     seeds: SeedsOption = 10,
     duration: Annotated[
@@ -187,15 +179,15 @@ def compare(
     from studies import comparisons
 
     with one_line_errors():
-        folder = _folder(out, study.value)
-        duration_s = duration or (comparisons.CHURN_S if study is Study.CHURN else paper.DEFAULT_S)
+        folder = _folder(out, study)
+        duration_s = duration or (comparisons.CHURN_S if study == "churn" else paper.DEFAULT_S)
         world = {} if common is None else comparisons.recorded_common(common)
         sections = paper.network_sections(networks)
-        cells = comparisons.comparison_cells(study.value, sections, range(1, seeds + 1), duration_s, world)
-        results = _run(cells, folder, study.value, only)
+        cells = comparisons.comparison_cells(study, sections, range(1, seeds + 1), duration_s, world)
+        results = _run(cells, folder, study, only)
         for picture in comparisons.draw(cells, folder):
             print(picture)
-        _show(comparisons.report(study.value, results, duration_s), folder / f"{study.value}.md")
+        _show(comparisons.report(study, results, duration_s), folder / f"{study}.md")
 
 
 @app.command()

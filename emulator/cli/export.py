@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal, get_args
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -31,6 +30,7 @@ from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.live import SafeConsole
 from vnet.errors import VnetError
 
+Format = Literal["pcapng", "mcap", "csv", "links"]
 WORST_LINKS = 10
 FIGURES = {
     "latency": "latency_mean_ms",
@@ -49,21 +49,6 @@ LINK_COLUMNS = {
     "age": "age_mean_ms",
     "oldest": "age_peak_ms",
 }
-
-
-class Format(StrEnum):
-    """File formats to which a run can be exported."""
-
-    PCAPNG = "pcapng"
-    MCAP = "mcap"
-    CSV = "csv"
-    LINKS = "links"
-
-
-class Payloads(StrEnum):
-    """Kinds of payloads for which a capture has headers of its own."""
-
-    ITS = "its"
 
 
 def radio(
@@ -143,7 +128,7 @@ def export(
         typer.Option(help="File, or for csv folder, that does not exist yet; by default in the run's folder."),
     ] = None,
     payloads: Annotated[
-        Payloads | None,
+        Literal["its"] | None,
         typer.Option(help="Of pcapng: its for CAM and DENM, which then have headers of GeoNetworking and BTP."),
     ] = None,
     every_s: Annotated[
@@ -160,30 +145,30 @@ def export(
     """Write a run in a format that other tools read."""
     with one_line_errors():
         chosen = _format(to, out)
-        if every_s is not None and chosen is not Format.LINKS:
-            raise VnetError(f"--every {every_s:g}: of links, and not of {chosen.value}")
-        if payloads is not None and chosen is not Format.PCAPNG:
-            raise VnetError(f"--payloads {payloads.value}: of pcapng, and not of {chosen.value}")
-        if definitions is not None and chosen is not Format.MCAP:
-            raise VnetError(f"--definitions {definitions}: of mcap, and not of {chosen.value}")
+        if every_s is not None and chosen != "links":
+            raise VnetError(f"--every {every_s:g}: of links, and not of {chosen}")
+        if payloads is not None and chosen != "pcapng":
+            raise VnetError(f"--payloads {payloads}: of pcapng, and not of {chosen}")
+        if definitions is not None and chosen != "mcap":
+            raise VnetError(f"--definitions {definitions}: of mcap, and not of {chosen}")
         check_is_run(run)
         recorded = RecordedRun.open(run)
         for problem in _damage(run):
             tell(f"{run}: {problem}; vnet check says more")
         match chosen:
-            case Format.PCAPNG:
+            case "pcapng":
                 path = out or run / "frames.pcapng"
                 writer = partial(write_pcapng, as_its=payloads is not None)
                 print(f"{_write(path, recorded, writer):,} packets in {path}")
-            case Format.MCAP:
+            case "mcap":
                 path = out or run / "run.mcap"
                 writer = partial(write_mcap, definitions=definitions, tell=partial(print, file=sys.stderr))
                 print(f"{_write(path, recorded, writer):,} messages in {path}")
-            case Format.LINKS:
+            case "links":
                 path = out or run / "links.csv"
                 links = partial(write_links, every_s=1.0 if every_s is None else every_s)
                 print(f"{_write(path, recorded, links):,} rows in {path}")
-            case Format.CSV:
+            case "csv":
                 path = out or run / "csv"
                 print(f"{', '.join(_write_folder(path, recorded))} in {path}")
 
@@ -201,14 +186,14 @@ def _damage(run: Path) -> list[str]:
 def _format(to: Format | None, out: Path | None) -> Format:
     """Return the format that was asked for by name or by the end of the file's name; refuse two at once."""
     suffix = "" if out is None else out.suffix.lower().removeprefix(".")
-    of_suffix = Format(suffix) if suffix in list(Format) else None
-    if to is Format.LINKS and suffix == "csv":
+    of_suffix = next((each for each in get_args(Format) if each == suffix), None)
+    if to == "links" and suffix == "csv":
         return to
     if to is not None and of_suffix not in (to, None):
-        raise VnetError(f"--out {out}: ends like a file of {suffix}, and --to is {to.value}")
+        raise VnetError(f"--out {out}: ends like a file of {suffix}, and --to is {to}")
     if suffix in ("pcap", "cap"):
         raise VnetError(f"--out {out}: of captures pcapng is written; let it end with .pcapng")
-    return to or of_suffix or Format.CSV
+    return to or of_suffix or "csv"
 
 
 def _write(path: Path, recorded: OpenedRun, writer: Callable[[OpenedRun, BinaryIO], int]) -> int:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -34,13 +33,6 @@ RULES = Rules(fastest_mps=70.0, longest_gap_s=10.0, hardest_mps2=10.0)
 """Cleaning of recorded trips for a calibration: the defaults of [network], and no jump is driven."""
 
 
-class DriveOn(StrEnum):
-    """The side of the road."""
-
-    RIGHT = "right"
-    LEFT = "left"
-
-
 app = group("Look at maps, and convert them.")
 
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="OSM XML or PBF, SUMO .net.xml, GeoJSON or NPZ.")]
@@ -48,6 +40,7 @@ OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="A file: .geojs
 OriginOption = Annotated[
     str | None, typer.Option(metavar="LAT,LON", help="Where the map's metres start; else in its middle.")
 ]
+DriveOnOption = Annotated[Literal["right", "left"], typer.Option(help="On which side people drive.")]
 
 
 @app.command()
@@ -109,7 +102,7 @@ def trips(
     duration: Annotated[float, typer.Option(min=1, max=86_400, metavar="SECONDS", help="For how long.")] = 300.0,
     rate_hz: Annotated[float, typer.Option(min=0.1, max=100, metavar="HZ", help="Samples a second.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Another seed, other trips.")] = 1,
-    drive_on: Annotated[DriveOn, typer.Option(help="On which side people drive.")] = DriveOn.RIGHT,
+    drive_on: DriveOnOption = "right",
 ) -> None:
     """Generate trips along a map: a file for network.kind = "trips", in the map's metres."""
     with one_line_errors():
@@ -122,7 +115,7 @@ def trips(
             seed,
             periods,
             round(1e9 / rate_hz),
-            LEFT if drive_on is DriveOn.LEFT else RIGHT,
+            LEFT if drive_on == "left" else RIGHT,
         )
         count = write_trips(motion, out, rate_hz)
         print(f"wrote {out}: {len(motion.node_ids)} vehicles, {count:,} samples")
@@ -133,7 +126,7 @@ def datum(
     map_file: MapArgument,
     trips_file: Annotated[Path, typer.Argument(metavar="TRIPS", help="*.csv, *.parquet, *.npz or SUMO's FCD.")],
     origin: OriginOption = None,
-    drive_on: Annotated[DriveOn, typer.Option(help="On which side people drive.")] = DriveOn.RIGHT,
+    drive_on: DriveOnOption = "right",
     others: Annotated[
         Path | None,
         typer.Option(
@@ -148,7 +141,7 @@ def datum(
             _refuse_input(others, "--others ", trips_file, map_file)
         motion = whole_motion(trips_file, pair("--origin", origin), RATE_HZ, RULES)
         roads = read_roads(map_file, pair("--origin", origin) or motion.origin_deg)
-        lanes = roads.lane_map(drive_on.value)
+        lanes = roads.lane_map(drive_on)
         used = np.ones(len(motion.node_ids), dtype=np.bool_)
         if others is not None:
             used[1::2] = False

@@ -8,11 +8,10 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
-from enum import StrEnum
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -26,6 +25,8 @@ from vnet.runtime.debug_target import DebugTarget, resolve
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 LATEST = Path("runs/latest")
+Pacing = Literal["lockstep", "realtime"]
+Order = Literal["fifo", "shuffle", "pct"]
 
 
 def path_of(text: str | Path) -> Path:
@@ -37,14 +38,6 @@ def path_of(text: str | Path) -> Path:
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", text):
         raise typer.BadParameter(f"{printable(text)!r}: a path of this machine is needed, not a URL")
     return Path(text)
-
-
-class Order(StrEnum):
-    """The orders of simultaneous events."""
-
-    FIFO = "fifo"
-    SHUFFLE = "shuffle"
-    PCT = "pct"
 
 
 def pair(option: str, text: str | None) -> tuple[float, float] | None:
@@ -60,13 +53,6 @@ def pair(option: str, text: str | None) -> tuple[float, float] | None:
     if option == "--origin" and not (abs(first) <= 90 and abs(second) <= 180):
         raise ScenarioError(f"{option} {text}: latitudes are within ±90, longitudes within ±180")
     return first, second
-
-
-class Pacing(StrEnum):
-    """The pacings of a run."""
-
-    LOCKSTEP = "lockstep"
-    REALTIME = "realtime"
 
 
 ScenarioArgument = Annotated[
@@ -130,15 +116,8 @@ RerunOption = Annotated[
 ]
 
 
-class Compared(StrEnum):
-    """Values of `--check-determinism`."""
-
-    LAYOUTS = "layouts"
-    PORTABLE = "portable"
-
-
 DeterminismOption = Annotated[
-    Compared | None,
+    Literal["layouts", "portable"] | None,
     typer.Option(
         "--check-determinism",
         metavar="[=portable]",
@@ -296,10 +275,10 @@ def load(
     """Load a scenario as the options of a command change it. Raises VnetError."""
     options = {
         "program.entry": ("--program", program and json.dumps(from_here(program))),
-        "run.pacing": ("--pacing", pacing and f'"{pacing.value}"'),
+        "run.pacing": ("--pacing", pacing and f'"{pacing}"'),
         "run.seed": ("--seed", seed),
         "run.duration_s": ("--duration", duration),
-        "run.order": ("--order", order and f'"{order.value}"'),
+        "run.order": ("--order", order and f'"{order}"'),
         "run.order_seed": ("--order-seed", order_seed),
         "run.tape": ("--tape", tape and json.dumps(str(tape.absolute()))),
     }
@@ -342,7 +321,7 @@ def debug_target(text: str | None, scenario: Scenario, only_the_result: bool) ->
     target = resolve(DebugTarget.parse(text), scenario.program.folders, scenario.program.kind == "zenoh")
     if only_the_result:
         raise VnetError(f"--debug {target.node}: cannot be combined with --quiet or --log-format json")
-    if scenario.run.pacing != Pacing.LOCKSTEP.value:
+    if scenario.run.pacing != "lockstep":
         raise VnetError(f"--debug {target.node}: real time cannot be stopped; use --pacing lockstep")
     if not _at_a_terminal():
         raise VnetError(f"--debug {target.node}: needs a terminal on standard input and output")

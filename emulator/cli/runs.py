@@ -5,9 +5,8 @@ What runs it is imported once it has been read, and the user told so: that takes
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -20,7 +19,6 @@ from emulator.cli.options import (
     HostsOption,
     LiveOptions,
     OutOption,
-    Pacing,
     ProcessesOption,
     RunOptions,
     debug_target,
@@ -38,20 +36,14 @@ from vnet.extras import require
 from vnet.runtime.interrupts import ended_at_once
 
 
-class RouterKind(StrEnum):
-    """Router of a run that `vnet run` starts."""
-
-    EMBEDDED = "embedded"
-    SEPARATE = "separate"
-
-
 @spread
 def run(
     asked: LiveOptions,
     check_determinism: DeterminismOption = None,
     router: Annotated[
-        RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
-    ] = RouterKind.EMBEDDED,
+        Literal["embedded", "separate"],
+        typer.Option(help="The emulator is the router itself, or starts one as a separate process."),
+    ] = "embedded",
     hosts: Annotated[
         int | None,
         typer.Option(
@@ -64,9 +56,9 @@ def run(
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
     with one_line_errors(asked.log_format), result_only(asked.only_the_result) as stdout:
         loaded = asked.load(asked.pacing)
-        if check_determinism is not None and loaded.run.pacing == Pacing.REALTIME.value:
+        if check_determinism is not None and loaded.run.pacing == "realtime":
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
-        if router is not RouterKind.SEPARATE and not loaded.has_gateways:
+        if router != "separate" and not loaded.has_gateways:
             refuse_router_restart(loaded.fault)
         sinks = choose_sinks(asked.rerun or (), asked.rerun_bind, asked.rerun_port, asked.rerun_vehicle)
         _refuse_hosts_of_gateways(loaded, hosts)
@@ -81,7 +73,7 @@ def run(
 
         request = Request(loaded, asked, sinks, stdout, check_determinism, target)
         own_hosts = [str(1 + number) for number in range(hosts or 0)]
-        run_with_processes(request, router is RouterKind.SEPARATE, own_hosts, agent)
+        run_with_processes(request, router == "separate", own_hosts, agent)
 
 
 @spread
@@ -93,7 +85,7 @@ def simulate(
 ) -> None:
     """Run a scenario without Zenoh, in lockstep, in one process or in a few: the same trace, faster."""
     with one_line_errors(asked.log_format), result_only(asked.only_the_result) as stdout:
-        loaded = asked.load(Pacing.LOCKSTEP)
+        loaded = asked.load("lockstep")
         sinks = choose_sinks(asked.rerun or (), vehicle=asked.rerun_vehicle, live=False)
         if debug is not None and processes != "1":
             raise VnetError("--debug and --processes exclude each other")

@@ -10,11 +10,9 @@ import typer
 
 from emulator.cli.options import (
     ChecksOption,
-    Compared,
     DeterminismOption,
     DurationOption,
     OrderOption,
-    Pacing,
     ProgramOption,
     ProgramOptionsOption,
     ScenarioArgument,
@@ -87,7 +85,7 @@ def sweep(
     with one_line_errors():
         if program is not None and "," in program:
             vary, program = [f"{PROGRAM}={program}", *(vary or ())], None
-        plain = load(scenario, overrides, program, Pacing.LOCKSTEP, None, duration, option, checks)
+        plain = load(scenario, overrides, program, "lockstep", None, duration, option, checks)
         plan = SweepPlan.of(plain, _all_varied(vary or ()), range(1, seeds + 1))
         cells = plan.cells if shard is None else plan.shard(*parse_shard(shard))
         folder = out or default_folder(plan)
@@ -202,8 +200,8 @@ def campaign(
     from emulator.testing.campaign_plan import Plan, parse_ranges
 
     with one_line_errors(), result_only(True):
-        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, order)
-        if check_determinism is Compared.PORTABLE:
+        loaded = load(scenario, overrides, program, "lockstep", seed, duration, option, checks, order)
+        if check_determinism == "portable":
             raise VnetError("--check-determinism=portable: is for vnet run and vnet simulate")
         jobs = jobs or (RUNS_ON_DASK if executor else None)
         options = {
