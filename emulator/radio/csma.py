@@ -35,7 +35,7 @@ approach (a table), and the adaptive approach, which is LIMERIC (Bansal, Kenney 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import NamedTuple, Protocol
@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.frames import BROADCAST, CopyNumbers, Receptions, Transmission
-from emulator.radio.mac import Mac, ThrottledQueue
+from emulator.radio.mac import ThrottledMac
 from emulator.radio.medium import SLICE_NS, WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
 from emulator.radio.reception import BACKOFF, JITTER, NEXT_BACKOFF, Signals, Threshold, milliwatts, sender_draw
@@ -277,7 +277,7 @@ def edca_parameters(mac: Edca) -> EdcaParameters:
     return EdcaParameters(SIFS_NS + aifsn * SLOT_NS, window, MAX_WINDOW[mac.access_category])
 
 
-class Csma(Mac):
+class Csma(ThrottledMac):
     """MAC of `count` vehicles that share one medium; see the module's docstring.
 
     It asks the `topology` who is up, notes acknowledgements in the `trace`, numbers retries among `copies`, and
@@ -318,22 +318,12 @@ class Csma(Mac):
         listener = self._congestion.observe if self._congestion is not None else None
         carrier_sense_mw = milliwatts(mac.carrier_sense_dbm)
         self._medium = Medium(self._count, carrier_sense_mw, threshold, remembered_ns, listener)
-        self._throttle = ThrottledQueue()
         self._events: list[_Event] = []
         self._stations: dict[int, _Station] = {}
         self._counting: dict[int, _Station] = {}
         """Stations that count down or hold a backoff."""
         self._now_ns = 0
         self._ended_ack: Transmission | None = None
-
-    def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
-        """Throttle exactly these senders from now on: their frames reach the MAC at these bitrates."""
-        self._throttle.set(bitrate_mbps)
-
-    def enqueue(self, transmissions: Sequence[Transmission]) -> None:
-        """Take frames; each is ready after its access jitter, and not before the sender's earlier frames."""
-        for sent in transmissions:
-            self._take(sent)
 
     def _take(self, sent: Transmission) -> None:
         frame = sent.frame
@@ -344,8 +334,8 @@ class Csma(Mac):
         ready_ns = frame.sent_ns
         if self._jitter_ns:
             ready_ns += int(self._jitter_ns * sender_draw(sent, JITTER))
-        if self._throttle.slows(frame.sender):
-            slow_ns = self._throttle.put(frame, ready_ns, self._limit)
+        if self._slows(frame.sender):
+            slow_ns = self._put_slowly(frame, ready_ns, self._limit)
             if slow_ns is None:
                 self._leave(sent, Outcome.queue_full, frame.sent_ns)
             else:

@@ -159,23 +159,32 @@ class TransmitQueue(Mac):
         return backlog.take(frame.sent_ns + jitter_ns, airtime)
 
 
-class ThrottledQueue:
-    """A slow queue before a MAC of fixed bitrate, through which throttled senders' frames pass."""
+class ThrottledMac(Mac):
+    """A MAC of fixed bitrate with a slow queue before it, through which throttled senders' frames pass."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._slow: dict[int, tuple[float, _Backlog]] = {}
 
-    def set(self, bitrate_mbps: Mapping[int, float]) -> None:
+    def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
         """Throttle exactly these senders from now on; the times of waiting frames do not change."""
         kept = {sender: backlog for sender, (_, backlog) in self._slow.items()}
         self._slow = {sender: (mbps, kept.get(sender, _Backlog())) for sender, mbps in bitrate_mbps.items()}
 
-    def slows(self, sender: int) -> bool:
+    def enqueue(self, transmissions: Sequence[Transmission]) -> None:
+        """Take frames; each is ready after its access jitter, and not before the sender's earlier frames."""
+        for sent in transmissions:
+            self._take(sent)
+
+    def _take(self, sent: Transmission) -> None:
+        raise NotImplementedError
+
+    def _slows(self, sender: int) -> bool:
         """Return true if a sender is throttled now."""
         return sender in self._slow
 
-    def put(self, frame: Frame, ready_ns: int, limit: int) -> int | None:
-        """Return the time at which a frame reaches the MAC; None if `limit` others wait before it."""
+    def _put_slowly(self, frame: Frame, ready_ns: int, limit: int) -> int | None:
+        """Return the time at which a throttled sender's frame is ready; None if `limit` others wait before it."""
         bitrate_mbps, backlog = self._slow[frame.sender]
         if not backlog.room(frame.sent_ns, limit):
             return None

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import pairwise
@@ -31,7 +31,7 @@ import numpy as np
 
 from emulator.radio.frames import Frame, InSlot, Receptions, Signal, Transmission
 from emulator.radio.grid import BusyMeter, Candidates, Heard, Places, SensedGrid, Wanted
-from emulator.radio.mac import Mac, ThrottledQueue
+from emulator.radio.mac import ThrottledMac
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.reception import JITTER, Signals, milliwatts, reception_draws, sender_draw
@@ -185,7 +185,7 @@ _Event = tuple[int, int, int, int, Transmission | _Booking | None]
 """An event: its time in ns, kind, sender, number of the event, and what it is about."""
 
 
-class Sidelink(Mac):
+class Sidelink(ThrottledMac):
     """MAC of vehicles that share a resource grid; see the module's docstring."""
 
     shares_medium = True
@@ -209,7 +209,6 @@ class Sidelink(Mac):
         self._checks_again = isinstance(mac, NrMode2) and mac.re_evaluation
         self._most_flows = MOST_FLOWS[type(mac)]
         self._one_shot = isinstance(mac, LteMode4) and mac.one_shot
-        self._throttle = ThrottledQueue()
         self._stations: dict[int, _Station] = {}
         self._booked: dict[int, list[_Booking]] = {}
         self._on_air: list[tuple[int, list[_Booking]]] = []
@@ -219,15 +218,6 @@ class Sidelink(Mac):
         self._now_ns = 0
 
     # Frames that are enqueued, and events.
-
-    def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
-        """Throttle exactly these senders from now on: their frames reach the MAC at these bitrates."""
-        self._throttle.set(bitrate_mbps)
-
-    def enqueue(self, transmissions: Sequence[Transmission]) -> None:
-        """Take frames; each is ready after its access jitter, and not before the sender's earlier frames."""
-        for sent in transmissions:
-            self._take(sent)
 
     def _take(self, sent: Transmission) -> None:
         frame = sent.frame
@@ -239,9 +229,9 @@ class Sidelink(Mac):
         ready_ns = frame.sent_ns
         if self._jitter_ns:
             ready_ns += int(self._jitter_ns * sender_draw(sent, JITTER))
-        if self._throttle.slows(frame.sender):
+        if self._slows(frame.sender):
             flow.sent_ns.append(frame.sent_ns)  # later ones may be ready before it
-            slow_ns = self._throttle.put(frame, max(ready_ns, station.ready_ns), self._limit)
+            slow_ns = self._put_slowly(frame, max(ready_ns, station.ready_ns), self._limit)
             if slow_ns is None:
                 self._leave(sent, Outcome.queue_full, frame.sent_ns)
             else:
