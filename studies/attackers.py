@@ -16,9 +16,8 @@ from emulator.cells.cells import Cell
 from emulator.scenario.scenario import Scenario
 from emulator.world.neighbours import links_within
 from emulator.world.world import build_world
-from studies.comparisons import COOPERATIVE
 from studies.measure import study_cell
-from studies.paper import PAPER_RANGE_M, Labels
+from studies.paper import COOPERATIVE, PAPER_RANGE_M, Labels, default_scenario
 from studies.reports import (
     MISSING,
     Result,
@@ -109,15 +108,7 @@ def _scenario(
     ]
     always = {"at_s": 0.0, "duration_s": duration_s, "nodes": {"ids": [best[0]]}}
     faults = [] if attack.fault is None else [{**always, **attack.fault}]
-    return Scenario.model_validate(
-        {
-            "run": {"name": "cell", "seed": seed, "duration_s": duration_s, "settle_s": min(5.0, duration_s / 2)},
-            "network": dict(network),
-            "radio": {"range_m": PAPER_RANGE_M, "loss": 0.1},
-            "program": {"entry": COOPERATIVE, "options": options, "exceptions": exceptions},
-            "fault": faults,
-        }
-    )
+    return default_scenario(network, seed, options, duration_s, faults, exceptions=exceptions)
 
 
 HEADER = ["false", "c of the others [m]", "relative to none", "ANEES of c", "position [m]", "diverged"]

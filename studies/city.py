@@ -15,17 +15,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from pydantic import ValidationError
 
 from emulator.cells.cells import Cell, has_states, read_states
+from emulator.scenario.loading import checked_scenario
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
 from studies.figures import ERROR_COLUMNS, against_time, save, series_of, styled
 from studies.measure import study_cell
 from studies.paper import PAPER_RANGE_M, SETTLED_S, everybody
 from studies.reports import MISSING, Result, column, in_seeds, markdown_table, mean_and_error, select, unique
-from vnet.errors import ScenarioError, VnetError
+from vnet.errors import VnetError
 from vnet.types import Array
 
 LOSS = 0.1
@@ -96,7 +95,7 @@ def city_cells(place: Mapping[str, Any], seeds: Sequence[int], duration_s: float
 def notes(place: Mapping[str, Any], duration_s: float) -> tuple[str, ...]:
     """Lines for the user about the trips that are omitted, with the reason. Raises ScenarioError for a bad file."""
     data = {"run": {"duration_s": duration_s, "settle_s": 0.0}, **place}
-    return build_world(_checked(data)).notes
+    return build_world(checked_scenario(data)).notes
 
 
 def city_scenario(place: Mapping[str, Any], seed: int, mechanism: str, duration_s: float) -> Scenario:
@@ -108,17 +107,10 @@ def city_scenario(place: Mapping[str, Any], seed: int, mechanism: str, duration_
         "program": {"entry": "agents.cooperative:main", "options": MECHANISMS.get(mechanism, {})},
     }
     if mechanism == "centralized":
-        count = len(build_world(_checked(data)).node_ids)
+        count = len(build_world(checked_scenario(data)).node_ids)
         data["radio"] = everybody(np.ones((count, count)))
         data["program"] = {"entry": "agents.centralized:main", "options": {"particles": CENTRALIZED_PARTICLES}}
-    return _checked(data)
-
-
-def _checked(data: dict[str, Any]) -> Scenario:
-    try:
-        return Scenario.model_validate(data)
-    except ValidationError as error:
-        raise ScenarioError(first_problem(error, Scenario)) from None
+    return checked_scenario(data)
 
 
 def report(results: Sequence[Result], duration_s: float) -> str:

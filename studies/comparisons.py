@@ -17,10 +17,9 @@ import pyarrow as pa
 
 from emulator.cells.cells import Cell
 from emulator.scenario.loading import scenario_of
-from emulator.scenario.scenario import Scenario
 from studies.figures import ERROR_COLUMNS, against_time, series_of
 from studies.measure import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS, study_cell
-from studies.paper import BOUND, BOUND_POSITION, PAPER_RANGE_M, Labels, counted_from
+from studies.paper import BOUND, BOUND_POSITION, COOPERATIVE, Labels, counted_from, default_scenario
 from studies.reports import (
     MISSING,
     Result,
@@ -34,7 +33,7 @@ from studies.reports import (
 )
 from vnet.errors import VnetError, counted
 
-COOPERATIVE, BASELINES = "agents.cooperative:main", "agents.baselines:main"
+BASELINES = "agents.baselines:main"
 REFERENCE_OPTIONS: dict[str, Any] = {"exchange": "information", "particles": 1000}
 """Options of the first variant of each study."""
 EQUAL_RIDGE_M2 = 1e6
@@ -158,7 +157,8 @@ def comparison_cells(
                 labels: Labels = {"network": network, "mechanism": name, "seed": seed}
                 start = {"world.common_error.start_s": COMMON_APART_S * (seed - 1)} if world else {}
                 faults = list(_churn(duration_s)) if study == "churn" else []
-                scenario = _scenario(section, seed, variant, duration_s, {**(world or {}), **start}, faults)
+                plain = default_scenario(section, seed, variant.options, duration_s, faults, entry=variant.entry)
+                scenario = scenario_of(plain, {**(world or {}), **start, **variant.keys})
                 cells.append(study_cell(labels, scenario, counted_from(duration_s)))
     return cells
 
@@ -171,24 +171,6 @@ def recorded_common(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise VnetError(f"--common {path}: no such file")
     return {"world.common_error.kind": "file", "world.common_error.path": str(path.resolve())}
-
-
-def _scenario(
-    network: Mapping[str, Any],
-    seed: int,
-    variant: Variant,
-    duration_s: float,
-    world: Mapping[str, Any],
-    faults: list[dict[str, Any]],
-) -> Scenario:
-    data = {
-        "run": {"name": "cell", "seed": seed, "duration_s": duration_s, "settle_s": min(5.0, duration_s / 2)},
-        "network": dict(network),
-        "radio": {"range_m": PAPER_RANGE_M, "loss": 0.1},
-        "program": {"entry": variant.entry, "options": dict(variant.options)},
-        "fault": faults,
-    }
-    return scenario_of(Scenario.model_validate(data), {**world, **variant.keys})
 
 
 def _churn(duration_s: float) -> Iterator[dict[str, Any]]:

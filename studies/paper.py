@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from emulator.world.world import build_world
 from studies.measure import REFERENCE, study_cell
 from vnet.errors import VnetError
 
+COOPERATIVE = "agents.cooperative:main"
 _VALUES = "agents.cooperative.declared"
 PAPER_RMSE_M: dict[str, dict[str, float]] = load_entry(f"{_VALUES}:PAPER_RMSE_M")
 PAPER_VEHICLES: dict[str, int] = load_entry(f"{_VALUES}:PAPER_VEHICLES")
@@ -131,15 +132,21 @@ def counted_from(duration_s: float) -> float:
 
 
 def default_scenario(
-    network: dict[str, Any], seed: int, options: dict[str, Any], duration_s: float = DEFAULT_S
+    network: Mapping[str, Any],
+    seed: int,
+    options: Mapping[str, Any],
+    duration_s: float = DEFAULT_S,
+    faults: Sequence[Mapping[str, Any]] = (),
+    **program: Any,
 ) -> Scenario:
-    """A cooperative run in the default world, 10 % loss."""
+    """A cooperative run in the default world, 10 % loss; `program` has other keys of its section."""
     return Scenario.model_validate(
         {
-            "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
+            "run": {"name": "cell", "seed": seed, "duration_s": duration_s, "settle_s": min(5.0, duration_s / 2)},
             "network": network,
             "radio": {"range_m": PAPER_RANGE_M, "loss": 0.1},
-            "program": {"entry": "agents.cooperative:main", "options": options},
+            "program": {"entry": COOPERATIVE, "options": options, **program},
+            "fault": faults,
         }
     )
 

@@ -511,6 +511,14 @@ def _with_new_selectors(fault: Any) -> Any:
     }
 
 
+def checked_scenario(data: Mapping[str, Any]) -> Scenario:
+    """Return data as a scenario. Raises ScenarioError, which names the first problem."""
+    try:
+        return Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(first_problem(error, Scenario)) from None
+
+
 def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str] = ()) -> Scenario:
     """Return the scenario of a source with `changes`, values by `section.key`, and with `checks` after its own.
 

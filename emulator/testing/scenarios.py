@@ -6,15 +6,19 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from emulator.cells.worker import with_folder_of
-from emulator.scenario.loading import find_scenario, load_scenario, with_absolute_paths, with_own_modules
+from emulator.scenario.loading import (
+    Source,
+    checked_scenario,
+    find_scenario,
+    load_scenario,
+    with_absolute_paths,
+    with_own_modules,
+)
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.sections import first_problem
 from vnet.errors import ScenarioError, did_you_mean
-
-Source = str | Path | Mapping[str, Any] | Scenario
 
 NAMES = {
     "vehicles": "network.vehicles",
@@ -49,7 +53,7 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
         for section in sections:
             table = table.setdefault(section, {})
         table[key] = _plain(value)
-    changed = _validated(data)
+    changed = checked_scenario(data)
     if given or not isinstance(source, Scenario):  # as it is, whose files are known
         changed = with_absolute_paths(changed, Path("scenario"))
     return with_folder_of(None, with_own_modules(changed, base))
@@ -60,17 +64,10 @@ def _loaded(source: Source, folders: Iterable[Path]) -> tuple[Scenario, Path | N
     if isinstance(source, Scenario):
         return source, None
     if isinstance(source, Mapping):
-        return _validated(source), None
+        return checked_scenario(source), None
     found = [path for path in (Path(source), *(folder / source for folder in folders)) if path.is_file()]
     path = found[0] if found else find_scenario(source)
     return load_scenario(path), path.parent
-
-
-def _validated(data: Mapping[str, Any]) -> Scenario:
-    try:
-        return Scenario.model_validate(data)
-    except ValidationError as error:
-        raise ScenarioError(first_problem(error, Scenario)) from None
 
 
 def _plain(value: Any) -> Any:

@@ -7,8 +7,9 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from emulator.scenario.faults import Fault
+from emulator.scenario.loading import Source
 from emulator.testing.campaign_plan import ScheduleConstraints, draw_fault, known_kinds
-from emulator.testing.scenarios import Source, make_scenario
+from emulator.testing.scenarios import make_scenario
 from vnet.extras import require
 
 if TYPE_CHECKING:
