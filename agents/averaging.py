@@ -69,7 +69,8 @@ class Averager:
 
     def __init__(self, node_id: str, rule: str, value: Array) -> None:
         self.value = value
-        self.consensus: Consensus = _consensus(short_name(node_id), rule)
+        name = short_name(node_id)
+        self.consensus: Consensus = RatioConsensus(name) if rule == "ratio" else AveragingConsensus(name, rule)
         self.rejected = 0
         self._newest_ns: dict[str, int] = {}
 
@@ -87,10 +88,6 @@ class Averager:
             else:
                 self._newest_ns[sender] = packet.sent_ns
         return encode(self.consensus.round(self.value, shares))
-
-
-def _consensus(name: str, rule: str) -> Consensus:
-    return RatioConsensus(name) if rule == "ratio" else AveragingConsensus(name, rule)
 
 
 def encode(share: Share) -> bytes:

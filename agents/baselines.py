@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -57,11 +56,6 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Correlation time of the common error, as the vehicle assumes it."""
     smoothing_s: Positive = 1.0
     """Time over which `differential` averages."""
-
-    @classmethod
-    def parse(cls, options: Mapping[str, Any]) -> Options:
-        """Convert the options of a scenario. Raises ProgramError with the key, the value and what is allowed."""
-        return parsing.parse(options, cls)
 
 
 class BaselineFrame(msgspec.Struct, array_like=True):
@@ -163,7 +157,7 @@ class Differential:
 
 async def main(node: Node) -> None:
     """Estimate until the run ends."""
-    options = Options.parse(node.options)
+    options = parsing.parse(node.options, Options)
     estimator = (Differential if options.method == "differential" else Filtering)(options, node)
     async for fix in node.gnss:
         own, heard, size = estimator.observe(fix), {}, 0

@@ -105,7 +105,7 @@ class Attachment:
         self.inbox: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._set_aside: deque[Item] = deque()
         self.on_message: Callable[[bytes], None] = no_wake
-        self.time_ns: Callable[[], int | None] = no_time
+        self.time_ns: Callable[[], int | None] = lambda: None  # in real time, and before the first grant
         self.hello_ns = 0
         """Instant (monotonic ns) of its last hello: at the latest then it was ready."""
         self.frames_seq: int | None = None
@@ -315,11 +315,6 @@ class Attachment:
     def orphaned(self, patience_s: float) -> str:
         """The one line of an agent that has lost its emulator for so long."""
         return f"{self.nodes[0]}: the emulator has been gone for {patience_s:.3g} s; ending"
-
-
-def no_time() -> int | None:
-    """In real time, and before the first grant, there is no instant to tell of."""
-    return None
 
 
 def no_wake(payload: bytes) -> None:

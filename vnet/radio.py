@@ -187,11 +187,6 @@ NO_ABILITIES = RadioAbilities()
 """A radio with which nothing can be chosen."""
 
 
-def _can_be_name(to: object) -> bool:
-    """Return whether it is a text that can be sent: UTF-8 has no lone surrogates."""
-    return isinstance(to, str) and to.encode(errors="ignore").decode() == to
-
-
 class Radio:
     """The vehicle's radio: sends broadcasts to all nodes in range or frames to one, and receives theirs.
 
@@ -258,7 +253,8 @@ class Radio:
             raise ValueError(
                 f"send({shown(to)}, …): only with [radio.mac] of 802.11p a frame is acknowledged; use broadcast()"
             )
-        if not _can_be_name(to) or to == self._node_id:
+        is_text = isinstance(to, str) and to.encode(errors="ignore").decode() == to  # UTF-8: no lone surrogates
+        if not is_text or to == self._node_id:
             raise ValueError(f"send({shown(to)}, …): the name of another vehicle is expected")
         content = self._checked_payload("send", payload)
         power_dbm, rate_mbps = self._checked_power("send", power_dbm), self._checked_rate("send", rate_mbps)

@@ -225,16 +225,8 @@ def begun(recorded: RecordedRun, is_meant: Callable[[Fault], bool]) -> list[Plan
     return [p for p in recorded.plan if p.start_ns < recorded.closed_ns and is_meant(p.fault)]
 
 
-def _cuts(fault: Fault) -> bool:
-    return fault.cuts
-
-
 def _loses(fault: Fault) -> bool:
     return isinstance(fault, LossFault)
-
-
-def _pauses(fault: Fault) -> bool:
-    return isinstance(fault, ProcessFault) and not fault.ends
 
 
 def check_causes(recorded: RecordedRun) -> Finding:
@@ -299,7 +291,7 @@ def _(fault: CustomSender, recorded: RecordedRun) -> Mask:
 
 def check_partition_respected(recorded: RecordedRun) -> Finding:
     """Check that nothing sent across a cut (partition, block, range, swizzle) passed it."""
-    cuts = begun(recorded, _cuts)
+    cuts = begun(recorded, lambda fault: fault.cuts)
     if not cuts:
         return not_exercised("no fault cuts links" if recorded.plan else NO_FAULTS)
     across = np.zeros(len(recorded.trace), dtype=bool)
@@ -314,11 +306,6 @@ def check_partition_respected(recorded: RecordedRun) -> Finding:
     return result(count, text, broken_text, recorded.rows(passed), across=int(across.sum()), passed=count)
 
 
-def _left_ns(recorded: RecordedRun) -> NDArray[np.int64]:
-    """Return when the frames of all rows ended on air, or were dropped."""
-    return recorded.sent_ns if recorded.scenario.radio.mac is None else recorded.column("left_ns")
-
-
 def check_down_respected(recorded: RecordedRun) -> Finding:
     """Check that a node that is down neither sends, reports nor receives: arrivals there are `receiver_down`."""
     if not recorded.down:
@@ -330,8 +317,9 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
         judged &= recorded.due_ns < recorded.closed_ns
     receiver_down = recorded.is_down(recorded.receiver, recorded.due_ns)
     hearing = judged & receiver_down & recorded.outcome_is("delivered")
-    # A frame to one vehicle is not received either where its radio is down as the frame ends.
-    excused = receiver_down | ((recorded.attempt > 0) & recorded.is_down(recorded.receiver, _left_ns(recorded)))
+    # A frame to one vehicle is not received either where its radio is down as the frame ends on air, or is dropped.
+    left_ns = recorded.sent_ns if recorded.scenario.radio.mac is None else recorded.column("left_ns")
+    excused = receiver_down | ((recorded.attempt > 0) & recorded.is_down(recorded.receiver, left_ns))
     missing = judged & ~excused & recorded.outcome_is("receiver_down")
     # A node may report and end by itself at one instant; a fault acts before anything else does.
     spans = [(span.node, span.start_ns + (not span.planned), span.end_ns) for span in recorded.down]
@@ -352,7 +340,7 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
 
 def check_pause_respected(recorded: RecordedRun) -> Finding:
     """Check that a paused node sends nothing and reports nothing."""
-    pauses = begun(recorded, _pauses)
+    pauses = begun(recorded, lambda fault: isinstance(fault, ProcessFault) and not fault.ends)
     if not pauses:
         return not_exercised("no node was paused" if recorded.plan else NO_FAULTS)
     speaking = np.zeros(len(recorded.trace), dtype=bool)

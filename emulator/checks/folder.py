@@ -276,6 +276,7 @@ def _wrong_busy_ratios(recorded: RecordedRun, engine: Engine) -> list[dict[str, 
 
 def _why_not_decided_again(recorded: OpenedRun) -> str:
     run, faults = recorded.scenario.run, [planned.fault for planned in recorded.plan]
+    payload_bytes = np.maximum(recorded.column("size_bytes")[_originals(recorded)], 0).sum()
     reasons = {
         "no frame was sent": not len(recorded.trace),
         "in real time the machine has a part in it": run.pacing == "realtime",
@@ -283,7 +284,7 @@ def _why_not_decided_again(recorded: OpenedRun) -> str:
         "the order of events was not FIFO": run.order != "fifo" or run.tape is not None,
         "the run was cut short": bool(recorded.event(*kinds_with(CUTS_RUN), EventKind.spun, EventKind.died)),
         f"receptions: more than {MOST_RECEPTIONS:,}": len(recorded.trace) > MOST_RECEPTIONS,
-        f"more than {MOST_BYTES:,} bytes": _payload_bytes(recorded) > MOST_BYTES,
+        f"more than {MOST_BYTES:,} bytes": payload_bytes > MOST_BYTES,
         "programs send to single vehicles": bool((recorded.attempt > 0).any()),
         "programs choose power or bit rate": "gain_db" in recorded.trace.column_names,
         "a rule of your own changes frames": any(isinstance(fault, OwnRule) for fault in faults),
@@ -299,10 +300,6 @@ def _originals(recorded: RecordedRun) -> NDArray[np.intp]:
     first = np.unique(recorded.emission[recorded.copy == 0], return_index=True)[1]
     rows = np.flatnonzero(recorded.copy == 0)[first]
     return np.asarray(rows[np.lexsort((recorded.seq[rows], recorded.sender[rows], recorded.sent_ns[rows]))])
-
-
-def _payload_bytes(recorded: RecordedRun) -> int:
-    return int(np.maximum(recorded.column("size_bytes")[_originals(recorded)], 0).sum())
 
 
 def _unseen(recorded: OpenedRun) -> int:

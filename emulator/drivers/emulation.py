@@ -40,7 +40,7 @@ from emulator.records.samples import SampleRecorder
 from emulator.records.tables import PayloadRecorder, background_table, driven_table
 from emulator.records.tape import MediumOrder, TapeEntry, first_left, parse_tape, read_tape
 from emulator.scenario.faults import Fault, Infrastructure, OwnRule, ProcessFault
-from emulator.scenario.program import Program, RoadsideUnit
+from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario, least_transit_ns
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
@@ -541,7 +541,8 @@ class Emulation:
         scenario = self.scenario
         incarnation = self.incarnation[node]
         program = scenario.program.of(node)
-        abilities = abilities_of(scenario.radio, self._unit_of(node))
+        unit = next((each for each in scenario.roadside if each.id == node), None)
+        abilities = abilities_of(scenario.radio, unit)
         return wire.Welcome(
             node,
             nonce,
@@ -566,9 +567,6 @@ class Emulation:
             self.backbone.abilities(node),
             abilities.periods_ms,
         )
-
-    def _unit_of(self, node: str) -> RoadsideUnit | None:
-        return next((unit for unit in self.scenario.roadside if unit.id == node), None)
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
         """Take what nodes enqueue at `time_ns`: frames to the engine in node order, reports, endings.

@@ -332,7 +332,7 @@ class Kind:
     @property
     def when(self) -> str:
         """The instant, or that of the first one."""
-        instant = f"at {shown_s(self.first.time_ns)}"
+        instant = f"at {round(self.first.time_ns / 1e9, 3)} s"
         if self.first.kind == EventKind.exception:
             return instant if len(self.events) == 1 else f"first {instant}"
         return instant if len({event.time_ns for event in self.events}) == 1 else f"first {instant}"
@@ -348,11 +348,6 @@ class Kind:
             return f"{self.untimed}, {self.when}"
         comma = "," if self.when.startswith("first") else ""
         return f"{self.who} {self.first.kind}{comma} {self.when}: {self.first.why}"
-
-
-def shown_s(time_ns: int) -> str:
-    """Return an instant in seconds, to the millisecond, without zeros that say nothing."""
-    return f"{round(time_ns / 1e9, 3)} s"
 
 
 def in_words(kinds: Sequence[Kind], most: int = 5) -> str:

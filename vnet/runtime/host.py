@@ -827,7 +827,8 @@ class NodeLogHandler(logging.Handler):
                 last.handle(record)
         else:
             try:
-                self._write(node, level_name(record.levelno), f"{record.name}: {self.format(record)}")
+                level = next((name for least, name in _NAMES if record.levelno >= least), "debug")
+                self._write(node, level, f"{record.name}: {self.format(record)}")
             except Exception:
                 self.handleError(record)
 
@@ -856,11 +857,6 @@ _NAMES = (
     (logging.WARNING, "warning"),
     (logging.INFO, "info"),
 )
-
-
-def level_name(number: int) -> str:
-    """Return the level that `Node.log` has for one of `logging`."""
-    return next((name for least, name in _NAMES if number >= least), "debug")
 
 
 def _awaits_emulator(node: Node) -> bool:

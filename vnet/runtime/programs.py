@@ -80,7 +80,8 @@ def load_program(entry: str) -> Program:
     program = getattr(module, name, None)
     if program is None:
         found = f"module {module_name} ({_origin(module)})"
-        raise _load_error(entry, f"{found} has no {name!r}{did_you_mean(name, _programs_of(module))}", module_name)
+        programs = [each for each, value in vars(module).items() if inspect.iscoroutinefunction(value)]
+        raise _load_error(entry, f"{found} has no {name!r}{did_you_mean(name, programs)}", module_name)
     if not inspect.iscoroutinefunction(program):
         raise _load_error(entry, f"is not an async function: async def {name}(node)", module_name)
     try:
@@ -181,11 +182,6 @@ def _origin(module: ModuleType) -> str:
     if file is None:
         return "built into Python" if module.__name__ in sys.builtin_module_names else "a folder without code"
     return os.path.relpath(file) if Path(file).is_relative_to(Path.cwd()) else str(file)
-
-
-def _programs_of(module: ModuleType) -> list[str]:
-    """Names of the functions of a module that could be programs."""
-    return [name for name, value in vars(module).items() if inspect.iscoroutinefunction(value)]
 
 
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:

@@ -165,11 +165,6 @@ def relative_to_most(shares: list[float], silent: int = 0) -> list[float]:
     return shares if middle >= 1 else [min(1.0, share / max(middle, _TINY)) for share in shares]
 
 
-def _sum_gate(count: float, gate_of_many: float) -> float:
-    """Return the largest squared deviation of a sum of so many increments."""
-    return INCREMENT_GATE + (gate_of_many - INCREMENT_GATE) * min(1.0, count / MANY)
-
-
 def _in_common(sums: Sequence[Sums], off: tuple[float, float], most: float) -> tuple[float, float] | None:
     """Return by what (x, y) most `sums` deviate, in deviations of the belief, found from `off` on.
 
@@ -293,7 +288,7 @@ class Origins:
                 in_sum *= self._most / (n_a + n_d)
             gate = gate_of_many
             if not -gate < in_sum < gate:
-                gate = _sum_gate(count, gate)
+                gate = INCREMENT_GATE + (gate - INCREMENT_GATE) * min(1.0, count / MANY)
             if -INCREMENT_GATE < alone < INCREMENT_GATE and -gate < in_sum < gate:
                 shares.append(1.0)
             else:
