@@ -24,7 +24,6 @@ from vnet.roads.road_map import RoadMap
 
 Figures = dict[str, float]
 ROOT = Path(__file__).parents[1]
-FIFTY = ["--set", "network.vehicles=50"]
 
 
 def vnet(command: str, scenario: str, *options: str, watch: Callable[[int], None] | None = None) -> dict[str, Any]:
@@ -60,116 +59,10 @@ def event(result: dict[str, Any], kind: str) -> dict[str, Any]:
     return [e for e in result["events"] if e["kind"] == kind][-1]
 
 
-def agents_uss_mb(parent: int) -> list[float]:
-    """Unique set size of the agent processes that `parent` has started, in MB."""
-    sizes = []
-    for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-        private = [int(line.split()[1]) for line in lines if line.startswith("Private_")]
-        sizes.append(sum(private) / 1024)
-    return sizes
-
-
-def bench_lockstep() -> Figures:
-    """50 processes, 10 Hz, 200 particles, in lockstep."""
-    sizes: list[float] = []
-
-    def watch(pid: int) -> None:
-        while Path(f"/proc/{pid}").exists():
-            time.sleep(2)
-            try:
-                sizes[:] = agents_uss_mb(pid) or sizes
-            except OSError:
-                return
-
-    result = vnet("run", "scenarios/quickstart.toml", *FIFTY, "--duration", "30", watch=watch)
-    return {
-        "real_time_factor": result["real_time_factor"],
-        "start_up_s": event(result, "started")["start_up_s"],
-        "agent_uss_mb": statistics.median(sizes),
-        "common_error_rmse_m": result["figures"]["common_error_rmse_m"],
-    }
-
-
 def bench_demo() -> Figures:
     """The quickstart as `make demo` runs it, from the command to the prompt."""
     result = vnet("run", "scenarios/quickstart.toml", "--rerun", "save")
     return {"total_s": result["total_s"], "start_up_s": event(result, "started")["start_up_s"]}
-
-
-def bench_simulate() -> Figures:
-    """The same 50-vehicle run in one process."""
-    result = vnet("simulate", "scenarios/quickstart.toml", *FIFTY, "--duration", "30")
-    return {"real_time_factor": result["real_time_factor"]}
-
-
-REALTIME_RUNS = 5
-STALL_S = 0.03
-
-
-class StallWatch:
-    """Pauses of the machine itself: a thread that sleeps a millisecond and finds far more gone.
-
-    On a shared virtual machine such stalls, which are not ours, decide the tail of any latency.
-    """
-
-    def __init__(self) -> None:
-        self.stalled_s = 0.0
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._watch)
-
-    def _watch(self) -> None:
-        last = time.monotonic()
-        while not self._over.is_set():
-            time.sleep(0.001)
-            now = time.monotonic()
-            if now - last > STALL_S:
-                self.stalled_s += now - last
-            last = now
-
-    def __enter__(self) -> "StallWatch":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-
-def bench_realtime() -> Figures:
-    """50 beacons × 10 Hz × 30 peers × 300 B for 30 s on the wall clock: five runs, median and worst."""
-    runs = [_realtime_run() for _ in range(REALTIME_RUNS)]
-    figures = {name: statistics.median(run[name] for run in runs) for name in runs[0]}
-    worst = {f"{name}_worst": max(run[name] for run in runs) for name in ("added_latency_p99_ms", "transport_gaps")}
-    return figures | worst
-
-
-def _realtime_run() -> Figures:
-    options = ["--program", "benchmarks.programs:steady_beacon", "--pacing", "realtime", "--duration", "30"]
-    options += [*FIFTY, "--set", "radio.range_m=100000", "--set", "radio.loss=0.0"]
-    with StallWatch() as machine:
-        result = vnet("run", "scenarios/beacon.toml", *options)
-    late = event(result, "late_deliveries")
-    gaps = [e["count"] for e in result["events"] if e["kind"] == "transport_gap"]
-    return {
-        "transport_gaps": sum(gaps),
-        "lost_in_transport": result["frames_by_outcome"]["transport"],
-        "delivered": result["frames_by_outcome"]["delivered"],
-        "added_latency_p50_ms": late["p50_ms"],
-        "added_latency_p99_ms": late["p99_ms"],
-        "over_20_ms_share": late["count"] / late["total"],
-        "machine_stalled_s": machine.stalled_s,
-    }
-
-
-def bench_awaiting() -> Figures:
-    """A program that always awaits packets: 50 nodes × 10 Hz × 13 peers, with and without a delivery tick."""
-    options = ["--program", "benchmarks.programs:always_awaits", "--duration", "5", *FIFTY]
-    figures = {}
-    for tick_us in (0, 1000, 5000):
-        result = vnet("run", "scenarios/beacon.toml", *options, "--set", f"radio.delivery_tick_us={tick_us}")
-        figures[f"real_time_factor_tick_{tick_us}_us"] = result["real_time_factor"]
-    return figures
 
 
 def bench_rbpf(particles: int = 500, vehicles: int = 10, steps: int = 400) -> Figures:
@@ -302,13 +195,9 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "dashboard": bench_dashboard,
     "estimators": bench_estimators,
     "quadratic_programs": bench_quadratic_programs,
-    "simulate": bench_simulate,
-    "lockstep": bench_lockstep,
     "driving": bench_driving,
     "sumo": bench_sumo,
     "demo": bench_demo,
-    "realtime": bench_realtime,
-    "awaiting": bench_awaiting,
     "observer": bench_observer,
     "zenoh": bench_zenoh,
 }
