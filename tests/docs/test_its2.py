@@ -190,6 +190,16 @@ def test_what_a_cpm_cannot_say_is_left_out() -> None:
         np.testing.assert_allclose(seen.position_m, told.position_m, atol=0.03)
 
 
+@pytest.mark.parametrize("missing", range(2))
+def test_a_cpm_of_a_roadside_unit_or_of_one_who_sees_nothing_is_read(missing: int) -> None:
+    message = Message(1, 0, (0.0, 0.0), 1.0, objects=(Seen((10.0, 0.0), (1.0, 0.0)),))
+    value = schema().decode("CollectivePerceptionMessage", encode_cpm(message, schema()))
+    del value["payload"]["cpmContainers"][missing]
+    decoded = decode_cpm(schema().encode("CollectivePerceptionMessage", value), schema())
+    assert decoded is not None
+    assert ((decoded.heading_rad is None), len(decoded.objects)) == [(True, 1), (False, 0)][missing]
+
+
 NOWHERE = {"latitude": 900_000_001, "longitude": 1_800_000_001}
 """A position of which the sender knows nothing."""
 

@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 
 import emulator
+from emulator.checks.replay import check_replay
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.verdicts import NotExercised
 from tests.support.paths import ROOT
 from vnet import Node
 from vnet.errors import ProgramError, ScenarioError, VnetError
@@ -156,6 +158,8 @@ def test_a_function_that_no_command_can_import_runs_here_and_replay_is_not_warra
     assert reason.startswith("not warranted: the program is test_a_function")
     assert "which no command can import, and this process has not PYTHONHASHSEED=0" in reason
     assert run.reproduce.endswith("scenario.toml --program MODULE:FUNCTION")
+    said = check_replay(tmp_path / "run")
+    assert isinstance(said, NotExercised) and said.reason == reason, "vnet check says it again"
 
 
 @pytest.mark.slow

@@ -151,8 +151,12 @@ def decode_cpm(payload: bytes, types: Any) -> Message | None:
     try:
         value = types.decode("CollectivePerceptionMessage", payload)
         of = {each["containerId"]: each["containerData"] for each in value["payload"]["cpmContainers"]}
-        heading = types.decode("OriginatingVehicleContainer", of[VEHICLE_CONTAINER])["orientationAngle"]["value"]
-        found = types.decode("PerceivedObjectContainer", of[OBJECT_CONTAINER])["perceivedObjects"]
+        heading, found = UNKNOWN_HEADING, []
+        if VEHICLE_CONTAINER in of:
+            vehicle = types.decode("OriginatingVehicleContainer", of[VEHICLE_CONTAINER])
+            heading = vehicle["orientationAngle"]["value"]
+        if OBJECT_CONTAINER in of:
+            found = types.decode("PerceivedObjectContainer", of[OBJECT_CONTAINER])["perceivedObjects"]
         management = value["payload"]["managementContainer"]
         position_m = _metres(management["referencePosition"])
     except Exception:  # asn1tools has many kinds of errors for damaged bytes
