@@ -103,7 +103,7 @@ class _Vehicle:
     opened_s: float = -math.inf
     """The loop's time at which its router was opened again; infinite while it is closed."""
     more_tokens: bool | None = None
-    """Whether tokens have changed since they were sent, less than `TOKENS_S` ago; None if that is longer."""
+    """True if tokens have changed since they were sent, less than `TOKENS_S` ago; None if that is longer."""
     is_abandoned: bool = False
     """True since it was told that no session is there of programs that others have started."""
 

@@ -79,7 +79,7 @@ class Vehicle(RadioSide[Asking]):
         """Declarations of its sessions by kind."""
         self._has_tokens = asyncio.Event()
         self._more_tokens: bool | None = None
-        """Whether more tokens have changed since those of this instant were sent; None if none were."""
+        """True if more tokens have changed since those of this instant were sent; None if none were."""
         self._subscribers_of = lru_cache(MOST_KEYS)(self._find_subscribers)
         self._session_numbers = count(1)
         self._stamped_ns = 0
