@@ -249,6 +249,7 @@ class Origins:
         off_x /= c_xx
         off_y = (off_y - c_yx * off_x) / c_yy
         memory_s = MEMORY_S if is_about_lanes else SUM_MEMORY_S
+        are_few = common_m is None and (not is_about_lanes or len(sums) < MAJORITY)
         then_s, keep, keep_2 = now_s, 1.0, 1.0
         nothing: Sums = (now_s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         shares = []
@@ -293,7 +294,7 @@ class Origins:
                 shares.append(1.0)
             else:
                 of_sum = min(1.0, gate / max(abs(in_sum), _TINY))
-                of_sum = min(math.sqrt(of_sum), FAR * of_sum) if common_m is None else of_sum * of_sum
+                of_sum = min(math.sqrt(of_sum), FAR * of_sum) if are_few else of_sum * of_sum
                 shares.append(min(of_sum, INCREMENT_GATE / max(abs(alone), _TINY)))
         if not is_about_lanes:
             self._voters.update(codes if not unvouched else set(codes) - unvouched)

@@ -188,10 +188,11 @@ def test_outliers_are_weighed_by_how_far_they_are_beyond_the_gates() -> None:
     assert 0 < shares[2] < 1e-3 * shares[1]
 
 
-def test_among_many_a_lie_pulls_the_less_the_larger_it_is() -> None:
+@pytest.mark.parametrize("is_about_lanes", [False, True])
+def test_among_many_a_lie_pulls_the_less_the_larger_it_is(is_about_lanes: bool) -> None:
     """A pull that lasts adds up: c returns slowly."""
-    lies_m = [0.2, 0.4, 0.8, 50.0]
-    *honest, _, _, _, _ = shares = shares_after([0.0] * 8 + lies_m)
+    lies_m = [0.3, 0.4, 0.8, 50.0]
+    *honest, _, _, _, _ = shares = shares_after([0.0] * 8 + lies_m, is_about_lanes)
     assert honest == [1.0] * 8
     pulls_m = [share * lie_m for share, lie_m in zip(shares[8:], lies_m, strict=True)]
     assert pulls_m == sorted(pulls_m, reverse=True)
