@@ -17,6 +17,7 @@ from msgspec import Meta
 
 from agents import options as parsing
 from agents.cooperative.cmm.information import Five, Information
+from agents.cooperative.cmm.lane_memory import information_of
 from agents.cooperative.cmm.plausibility import COMPARED_GATE, PRIOR_GATE, SUM_MEMORY_S, moved, scaled_by
 from agents.cooperative.estimator import Estimator
 from agents.cooperative.frame import COMMON_LIMIT_M, CooperativeFrame, encode
@@ -219,6 +220,6 @@ def _undetected(frame: InformationFrame, direction: Array, period_s: float, limi
     unit = direction / max(float(np.hypot(*direction)), 1e-9)
     variance_m2 = float(unit @ np.linalg.inv(Information(frame.prior).matrix) @ unit)
     prior_m = min(limit_m, math.sqrt(PRIOR_GATE * 2 * variance_m2))
-    said = float(unit @ Information(frame.increment).matrix @ unit) * SUM_MEMORY_S / period_s
+    said = float(unit @ Information(information_of(frame.increment)).matrix @ unit) * SUM_MEMORY_S / period_s
     increment_m = math.sqrt(COMPARED_GATE * 0.5 / max(said, 1e-6))
     return BELOW_GATE * prior_m * unit, BELOW_GATE * min(increment_m, 10.0) * unit

@@ -112,7 +112,7 @@ def first_problem(error: ValidationError, of: type[Any]) -> str:
     path = problem["loc"]
     if problem["type"] != "extra_forbidden":
         path = tuple(part for part in path if not _ALTERNATIVE.fullmatch(str(part)))
-    keys, _ = _followed(of, path)
+    keys, sections = _followed(of, path)
     key = printable(".".join(str(part) for part in keys) or "it")
     before = f"{key}: " if path else ""
     if problem["type"] == "extra_forbidden":
@@ -125,7 +125,8 @@ def first_problem(error: ValidationError, of: type[Any]) -> str:
         tag = problem["ctx"]["tag"]
         return f"{before}kind = {shown(tag)}{did_you_mean(tag, kinds)}: must be one of {', '.join(kinds)}"
     message = _worded(problem)
-    if isinstance(problem["input"], dict) and message == "a list is needed":
+    is_section = not any(path[-1:] == (name,) for section in sections for name in section.model_fields)
+    if isinstance(problem["input"], dict) and message == "a list is needed" and is_section:
         return f"{key}: a list of tables is needed: write [[{key}]] in place of [{key}]"
     if problem["type"] == "missing":
         return f"{key}: {message}"

@@ -292,6 +292,7 @@ class Gateways:
         if crash is not None:
             others, vehicle.commands = vehicle.commands, {}
             self._spawn(self._wait_or_kill(self._told_to_end(others)))
+            self._enqueue_more_tokens(vehicle)
             vehicle.outbox.endings.append(crash)
             self._flush_soon(vehicle)
         elif how.status != 0:
@@ -330,6 +331,7 @@ class Gateways:
         vehicle = self._vehicles.get(node)
         if vehicle is None:
             return ()
+        self._enqueue_more_tokens(vehicle)
         if vehicle.early or vehicle.outbox.frames:
             self._flush(vehicle, final=True)
         vehicle.on_air = False
@@ -347,6 +349,8 @@ class Gateways:
             there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
             for vehicle in there.values():
                 vehicle.opened_s = math.inf
+                self._enqueue_more_tokens(vehicle)
+                self._flush_soon(vehicle)
             self._down |= there  # not those whose programs are starting: these do not wait for one
             await self._all_but_slow(vehicle.gateway.close() for vehicle in there.values())
         while (left_s := self._down_until_s - self._loop.time()) > 0:  # another restart may last longer

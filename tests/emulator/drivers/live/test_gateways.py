@@ -113,24 +113,38 @@ async def test_an_endpoint_is_there_again_at_its_port_and_at_all_addresses(monke
     await rig.gateways.close()
 
 
-@on_a_loop
-async def test_many_tokens_within_a_moment_are_two_messages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also if their program ends within it."""
-    rig = Rig(monkeypatch, 1, {})
-    monkeypatch.setattr(Gateway, "_is_alive", lambda gateway, key: True)
-    await rig.welcome("v01")
-    rig.gateways.send("v01", wire.Batch([], 0, origin_ns=0))
-    assert (await rig.told.get())[0] == "frames", "it is on the air, and acknowledges"
-    router: Any = rig.routers["v01"]
-    router._session = SimpleNamespace(close=lambda: None)
-    (vehicle,) = rig.gateways._vehicles.values()
-    vehicle.is_ready, vehicle.commands = True, {"v01": "talk"}
-    for key in "abc":
-        rig.gateways.take("token", (router, (key, True)), 5)
-    assert await rig.sent(1) == [([CrossingTokens(("a",))], 5)]
-    assert rig.gateways.takes_end("v01", Exit(0, ""))
-    assert [told for told, _ in await rig.sent(1)] == [[CrossingTokens(("a", "b", "c"))]]
-    await rig.gateways.close()
+@pytest.mark.parametrize("end", ["finished", "failed", "routers"])
+def test_many_tokens_within_a_moment_are_two_messages(monkeypatch: pytest.MonkeyPatch, end: str) -> None:
+    """Also if their program, or the router, ends within it."""
+    monkeypatch.setattr("emulator.drivers.live.gateways.TOKENS_S", 0.0)
+
+    async def test() -> None:
+        rig = Rig(monkeypatch, 1, {})
+        monkeypatch.setattr(Gateway, "_is_alive", lambda gateway, key: True)
+        await rig.welcome("v01")
+        rig.gateways.send("v01", wire.Batch([], 0, origin_ns=0))
+        assert (await rig.told.get())[0] == "frames", "it is on the air, and acknowledges"
+        router: Any = rig.routers["v01"]
+        router._session = SimpleNamespace(close=lambda: None)
+        (vehicle,) = rig.gateways._vehicles.values()
+        vehicle.is_ready, vehicle.commands = True, {"v01": "talk"}
+        for key in "abc":
+            rig.gateways.take("token", (router, (key, True)), 5)
+        assert await rig.sent(1) == [([CrossingTokens(("a",))], 5)]
+        if end == "routers":
+            vehicle.commands = {}
+            rig.gateways.restart_endpoints(60.0)
+        else:
+            assert rig.gateways.takes_end("v01", Exit(int(end == "failed"), ""))
+        assert [told for told, _ in await rig.sent(1)] == [[CrossingTokens(("a", "b", "c"))]]
+        for _ in range(10):
+            await asyncio.sleep(0)
+        while not rig.told.empty():
+            what, _, item = rig.told.get_nowait()
+            assert what != "frames" or not item[0].traffic.frames
+        await rig.gateways.close()
+
+    asyncio.run(test())
 
 
 @on_a_loop
