@@ -199,7 +199,7 @@ def parse_values(key: str, text: str) -> list[Any]:
 
 def _value(text: str) -> Any:
     """A value in TOML's syntax, a number such as .5, or a bare word."""
-    text = re.sub(r"^(\s*-?)(\.\d+\s*)$", r"\g<1>0\2", text)
+    text = re.sub(r"^(\s*[+-]?)(\.[0-9]+(e[+-]?[0-9]+)?\s*)$", r"\g<1>0\2", text, flags=re.IGNORECASE)
     try:
         (value,) = parse_toml(f"value = {text}").values()  # not what further lines would set
         return value

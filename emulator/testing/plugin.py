@@ -106,7 +106,9 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     report = yield
     runs = item.stash.get(_runs, [])
     if report.failed and runs:
-        begun = [run for run in runs if (run.folder / "scenario.toml").exists()]
+        from emulator.records.run_folder import is_run_folder
+
+        begun = [run for run in runs if is_run_folder(run.folder)]
         lines = [f"files  {run.folder}" for run in begun[-3:]] + [f"again  {run.reproduce}" for run in begun[-1:]]
         report.sections.append(("vnet", "\n".join(lines)))
     return report

@@ -350,7 +350,7 @@ class Gateways:
             for vehicle in there.values():
                 vehicle.opened_s = math.inf
                 self._enqueue_more_tokens(vehicle)
-                self._flush_soon(vehicle)
+                self._flush(vehicle)
             self._down |= there  # not those whose programs are starting: these do not wait for one
             await self._all_but_slow(vehicle.gateway.close() for vehicle in there.values())
         while (left_s := self._down_until_s - self._loop.time()) > 0:  # another restart may last longer
@@ -575,6 +575,8 @@ class Gateways:
 
     def _enqueue_early(self, vehicle: _Vehicle) -> None:
         early, vehicle.early = vehicle.early, {}
+        if early:
+            self._enqueue_more_tokens(vehicle)  # in their order
         for what, told in early.values():
             if (message := vehicle.gateway.take(what, told)) is not None:
                 self._enqueue(vehicle, message)

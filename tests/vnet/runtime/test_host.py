@@ -295,7 +295,7 @@ def test_a_program_may_configure_logging_in_main() -> None:
 
     async def program(node: Node) -> None:
         if node.id == "v3":
-            logging.config.dictConfig({"version": 1, "root": {"level": "INFO"}})
+            logging.config.dictConfig({"version": 1, "disable_existing_loggers": False, "root": {"level": "INFO"}})
         else:
             logging.basicConfig(level=logging.INFO, stream=io.StringIO(), force=node.id == "v2")
         logging.info("told by %s", node.id)

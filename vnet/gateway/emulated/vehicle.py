@@ -283,7 +283,7 @@ class Vehicle(RadioSide[Asking]):
             if self._more_tokens is None:
                 self._more_tokens = False
                 self._send_tokens()
-                self._loop.call_soon(self._send_more_tokens)
+                self._loop.call_soon(self._end_instant)
             else:
                 self._more_tokens = True
             self._has_tokens.set()
@@ -291,9 +291,13 @@ class Vehicle(RadioSide[Asking]):
 
     def _send_more_tokens(self) -> None:
         """Send the tokens if more than one has changed at this instant: a message each would have all of them."""
-        more, self._more_tokens = self._more_tokens, None
-        if more:
+        if self._more_tokens:
+            self._more_tokens = False
             self._send_tokens()
+
+    def _end_instant(self) -> None:
+        self._send_more_tokens()
+        self._more_tokens = None
 
     def _tell_watchers(self, key: zenoh.KeyExpr, alive: bool) -> None:
         text = str(key)
@@ -333,6 +337,8 @@ class Vehicle(RadioSide[Asking]):
     # The radio.
 
     def _send(self, message: Message) -> None:
+        if not isinstance(message, CrossingTokens):
+            self._send_more_tokens()  # in their order
         try:
             payloads = self._fragments.of(message)
         except TooLargeError as error:
