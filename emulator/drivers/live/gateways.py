@@ -292,7 +292,6 @@ class Gateways:
         if crash is not None:
             others, vehicle.commands = vehicle.commands, {}
             self._spawn(self._wait_or_kill(self._told_to_end(others)))
-            self._enqueue_more_tokens(vehicle)
             vehicle.outbox.endings.append(crash)
             self._flush_soon(vehicle)
         elif how.status != 0:
@@ -301,7 +300,6 @@ class Gateways:
         elif not vehicle.commands and not vehicle.is_ready:
             self._say_hello(vehicle, failure=f"its commands have ended before they had connected: {HOW}")
         elif not vehicle.commands:
-            self._enqueue_more_tokens(vehicle)
             vehicle.outbox.endings.append(wire.Ending(node, "finished", time_ns=self._now_ns()))
             self._flush_soon(vehicle)
         return True
@@ -331,8 +329,7 @@ class Gateways:
         vehicle = self._vehicles.get(node)
         if vehicle is None:
             return ()
-        self._enqueue_more_tokens(vehicle)
-        if vehicle.early or vehicle.outbox.frames:
+        if vehicle.early or vehicle.outbox.frames or vehicle.more_tokens:
             self._flush(vehicle, final=True)
         vehicle.on_air = False
         del self._vehicles[node]
@@ -349,7 +346,6 @@ class Gateways:
             there = {node: vehicle for node, vehicle in self._vehicles.items() if vehicle.is_ready}
             for vehicle in there.values():
                 vehicle.opened_s = math.inf
-                self._enqueue_more_tokens(vehicle)
                 self._flush(vehicle)
             self._down |= there  # not those whose programs are starting: these do not wait for one
             await self._all_but_slow(vehicle.gateway.close() for vehicle in there.values())
@@ -487,7 +483,6 @@ class Gateways:
         """Send the tokens, unless they were just sent: a message for each of many would have all others, too."""
         has_told, vehicle.more_tokens = vehicle.more_tokens is not None, True
         if not has_told:
-            self._enqueue_more_tokens(vehicle)
             self._flush(vehicle, arrived_ns)
             self._loop.call_later(TOKENS_S, self._tell_more_tokens, vehicle)
 
@@ -495,11 +490,6 @@ class Gateways:
         more, vehicle.more_tokens = vehicle.more_tokens, None
         if more and self._is_there(vehicle):
             self._tell_tokens(vehicle, time.monotonic_ns())
-
-    def _enqueue_more_tokens(self, vehicle: _Vehicle) -> None:
-        if vehicle.more_tokens:
-            vehicle.more_tokens = False
-            self._enqueue(vehicle, vehicle.gateway.tokens() or CrossingTokens(()))
 
     def _renew_tokens(self, vehicle: _Vehicle) -> None:
         if vehicle.gateway.is_paused:
@@ -575,8 +565,6 @@ class Gateways:
 
     def _enqueue_early(self, vehicle: _Vehicle) -> None:
         early, vehicle.early = vehicle.early, {}
-        if early:
-            self._enqueue_more_tokens(vehicle)  # in their order
         for what, told in early.values():
             if (message := vehicle.gateway.take(what, told)) is not None:
                 self._enqueue(vehicle, message)
@@ -609,6 +597,9 @@ class Gateways:
         vehicle.is_due = False
         if not self._is_there(vehicle):
             return
+        if vehicle.more_tokens:  # before what was put after them
+            vehicle.more_tokens = False
+            self._enqueue(vehicle, vehicle.gateway.tokens() or CrossingTokens(()))
         self._enqueue_early(vehicle)
         if vehicle.gateway.is_paused and not final:
             return
