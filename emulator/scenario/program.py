@@ -62,7 +62,6 @@ Topic = Annotated[str, AfterValidator(_is_topic)]
 
 ZENOH_ENTRY = "vnet.gateway.emulated:main"
 """Entry of vehicles of kind "zenoh" in lockstep, which runs their commands on virtual time."""
-_ENTRY = "agents.beacon:main"
 PYTHON = ("python", "python3")
 """First words of a command that stand for the interpreter of vnet."""
 PYTHON_NAME = re.compile(r"python(3(\.\d+)?)?")
@@ -89,7 +88,7 @@ class OneProgram(Section):
     environment: dict[str, str] = Field(default_factory=dict)
     """`kind = "zenoh"`: variables that the commands have besides vnet's own, filled in as their words. Exceptions
     have their own. The run's folder has them: no place for passwords."""
-    entry: Entry = _ENTRY
+    entry: Entry = "agents.beacon:main"
     """An async function of one argument, the `Node`: `package.module:function` or `file.py:function`; a file's is
     `main` if left out."""
     options: dict[str, Any] = Field(default_factory=dict)
@@ -224,7 +223,7 @@ class Program(OneProgram):
                 raise ValueError('command and zenoh go with kind = "zenoh"')
             return data
         for each in given:
-            if each.get("entry", ZENOH_ENTRY) not in (ZENOH_ENTRY, _ENTRY) or each.get("options"):
+            if each.get("entry", ZENOH_ENTRY) != ZENOH_ENTRY or each.get("options"):
                 raise ValueError('kind = "zenoh" has a command, and neither entry nor options')
         own = {**data, "entry": ZENOH_ENTRY}
         if exceptions:

@@ -451,8 +451,8 @@ class Scenario(Section):
             if why := self.refusal_of(fault):
                 raise ValueError(f'fault.{number}.kind = "{fault.kind}" {why}')
         if self.run.pacing == "lockstep":
-            if not self.program.commands:
-                raise ValueError('program.kind = "zenoh" needs a command where run.pacing = "lockstep"')
+            if not self.program.commands or any(each.command is None for each in self.program.exceptions):
+                raise ValueError('program.kind = "zenoh", and each exception, need a command in lockstep')
             for words in self.program.all_commands:
                 if not PYTHON_NAME.fullmatch(Path(words[0]).name) or not python_words(words):
                     raise ValueError(

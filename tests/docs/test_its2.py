@@ -223,7 +223,12 @@ def test_a_message_without_a_position_is_none() -> None:
     value = types.decode("CollectivePerceptionMessage", encode_cpm(Message(1, 0, at), types))
     value["payload"]["managementContainer"]["referencePosition"].update(NOWHERE)
     assert decode_cpm(types.encode("CollectivePerceptionMessage", value), types) is None
+    far = (500_000.0, 5_400_000.0)  # beyond the pole
+    assert station.decode(station.encode_cam(station.Message(1, far), 0)) is None
+    assert decode_vam(encode_vam(Message(1, 0, far), types), types, 0) is None
+    assert decode_cpm(encode_cpm(Message(1, 0, far), types), types) is None
     types = schema(STAND_IN)
+    assert decode_bsm(encode_bsm(Message(1, 0, far), 0, types), types) is None
     frame = types.decode("MessageFrame", encode_bsm(Message(1, 0, at), 0, types))
     for unknown in ({"lat": 900_000_001}, {"long": 1_800_000_001}, {"secMark": 65535}):
         value = types.decode("BasicSafetyMessage", frame["value"])

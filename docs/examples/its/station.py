@@ -156,9 +156,12 @@ def _position(position_m: tuple[float, float]) -> dict[str, Any]:
     latitude_deg = ORIGIN_DEG[0] + position_m[1] / DEGREE_M
     longitude_deg = ORIGIN_DEG[1] + position_m[0] / (DEGREE_M * math.cos(math.radians(ORIGIN_DEG[0])))
     unavailable = {"semiMajorConfidence": 4095, "semiMinorConfidence": 4095, "semiMajorOrientation": 3601}
+    latitude, longitude = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
+    if abs(latitude) > 900_000_000 or abs(longitude) >= 1_800_000_000:
+        latitude, longitude = UNKNOWN_LATITUDE, UNKNOWN_LONGITUDE
     return {
-        "latitude": round(latitude_deg * 1e7),
-        "longitude": round(longitude_deg * 1e7),
+        "latitude": latitude,
+        "longitude": longitude,
         "positionConfidenceEllipse": unavailable,
         "altitude": UNKNOWN_ALTITUDE,
     }

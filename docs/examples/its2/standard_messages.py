@@ -307,7 +307,10 @@ def _place(position_m: Xy) -> dict[str, Any]:
     latitude_deg = ORIGIN_DEG[0] + position_m[1] / DEGREE_M
     longitude_deg = ORIGIN_DEG[1] + position_m[0] / (DEGREE_M * math.cos(math.radians(ORIGIN_DEG[0])))
     altitude = {"altitudeValue": 800001, "altitudeConfidence": "unavailable"}
-    return {"latitude": round(latitude_deg * 1e7), "longitude": round(longitude_deg * 1e7), "altitude": altitude}
+    latitude, longitude = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
+    if abs(latitude) > 900_000_000 or abs(longitude) >= 1_800_000_000:  # which asn1tools does not check
+        latitude, longitude = UNKNOWN_LATITUDE, UNKNOWN_LONGITUDE
+    return {"latitude": latitude, "longitude": longitude, "altitude": altitude}
 
 
 def _metres(place: dict[str, Any]) -> Xy:

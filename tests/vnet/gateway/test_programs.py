@@ -1273,6 +1273,17 @@ def test_who_puts_into_a_full_channel_of_the_same_session_waits(drive: Drive) ->
     assert printed(run) == ["256 0", "257", "['0.2'] 0.4"]
 
 
+def test_queries_that_lie_unread_are_concluded_when_their_queryable_is_undeclared(drive: Drive) -> None:
+    run = drive("""
+        import threading, time, zenoh
+        here, there = (zenoh.open(zenoh.Config.from_env()) for _ in range(2))
+        queryable = here.declare_queryable("k", zenoh.handlers.FifoChannel(3))
+        threading.Timer(0.3, queryable.undeclare).start()
+        print(list(there.get("k", timeout=5)), f"{time.monotonic():.1f}")
+        """)
+    assert printed(run) == ["[] 1.0"], "of other vehicles it hears for radio.query_s"
+
+
 def test_a_full_channel_that_is_undeclared_lets_all_go_on_that_wait(drive: Drive) -> None:
     run = drive("""
         import threading, time, zenoh

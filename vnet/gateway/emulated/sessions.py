@@ -213,6 +213,13 @@ class Queryable(Subscriber):
 
     kind = _noun = "queryable"
 
+    def end(self) -> None:
+        """Undeclare it unless it has been, and let go of queries that lie unread, which concludes them."""
+        is_declared = self._ends is not None
+        super().end()
+        if is_declared:
+            del self._handler, self._sink, self._entity
+
 
 class Watcher(Subscriber):
     """A subscriber of tokens."""
