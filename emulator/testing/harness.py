@@ -129,7 +129,12 @@ class RunHarness:
             raise VnetError(f"an emulation needs asyncio, which does not run this test; {instead}") from None
         if self._run.started:
             raise VnetError("an emulation can be entered once: vnet_emulation(…) makes another one")
-        await self._wait(self._run.start())
+        try:
+            await self._wait(self._run.start())
+        except BaseException:  # a timeout while it starts: nobody calls `__aexit__` then
+            with suppress(VnetError):
+                await asyncio.to_thread(self.close)
+            raise
         return self
 
     async def __aexit__(

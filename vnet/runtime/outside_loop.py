@@ -68,8 +68,13 @@ class _Collector:
 
     @property
     def runs(self) -> bool:
-        """True in the thread that collects, while it does."""
+        """True in the thread that collects, while it does; where what it has called waits, others may go on."""
         return self._thread == threading.get_ident()
+
+    @runs.setter
+    def runs(self, value: bool) -> None:
+        if value != self.runs:  # else another thread may collect
+            self._thread = threading.get_ident() if value else None
 
 
 collector = _Collector()

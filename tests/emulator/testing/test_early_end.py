@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,23 @@ def test_a_run_that_is_ended_early_replays(
     driven = [pq.read_table(file) for file in sorted(tmp_path.glob("*/driven.parquet"))]
     assert len(driven) == (2 if "network.driven.road" in changes else 0)
     assert len({len(table) for table in driven}) <= 1
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_a_run_whose_start_is_cancelled_is_ended(tmp_path: Path, live: bool) -> None:
+    async def is_cancelled() -> None:
+        scenario = make_scenario("beacon", {"vehicles": 2, "duration": 6, "program": f"{__name__}:talks"})
+        entering = asyncio.create_task(RunHarness(scenario, tmp_path / "run", live=live).__aenter__())
+        await asyncio.sleep(0)
+        entering.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await entering
+
+    asyncio.run(is_cancelled())
+    for thread in (each for each in threading.enumerate() if each.name.startswith("vnet ")):
+        thread.join(10)
+        assert not thread.is_alive()
+    assert (tmp_path / "run" / "verdict.json").exists() and not (tmp_path / "run" / "operator.json").exists()
 
 
 @pytest.mark.parametrize("time_s", [math.inf, math.nan, 7.0])

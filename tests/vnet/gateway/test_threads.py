@@ -583,6 +583,31 @@ def test_nothing_of_a_killed_program_is_done_afterwards(tmp_path: Path, begin: s
     assert "never" not in done.stdout + done.stderr and not (tmp_path / "never").exists()
 
 
+def test_a_finalizer_that_waits_while_its_program_collects_is_nobody_else_s(drive: Drive) -> None:
+    text = """
+    import gc, sys, time, zenoh
+    session = zenoh.open(zenoh.Config.from_env())
+    class Robot:
+        def __init__(self):
+            self.me = self
+        def __del__(self):
+            session.put("bye", sys.argv[1])
+            time.sleep(0.2)
+            print("gone")
+    if sys.argv[1] == "v01":
+        Robot()
+        time.sleep(0.2)
+        gc.collect()
+        print("collected")
+    else:
+        time.sleep(0.3)
+        session.close()
+    """
+    run = drive(text, vehicles=2)
+    assert (run.verdict, printed(run, "v01")[:2]) == ("valid", ["gone", "collected"])
+    assert log(run, "v02")[-1].endswith("finished")
+
+
 def test_clock_error_of_a_vehicle_is_that_of_its_program(drive: Drive) -> None:
     """A skew sets the time of day alone, a drift is that of all clocks and waits."""
     text = """

@@ -27,7 +27,7 @@ from greenlet import GreenletExit, getcurrent, greenlet
 
 from vnet.gateway.emulated.shown import facade
 from vnet.runtime.asyncio_internals import note_greenlet
-from vnet.runtime.outside_loop import taken
+from vnet.runtime.outside_loop import collector, taken
 from vnet.runtime.own_asyncio import Task, present_node
 
 T = TypeVar("T")
@@ -105,6 +105,8 @@ class Strand(greenlet):
         self.looked_s, self.looks = -1.0, 0
         self.generator_hooks: tuple[Any, ...] | None = None
         """The hooks of `sys.set_asyncgen_hooks` that an event loop has set which it runs."""
+        self.collects = False
+        """True while it waits within a collection of garbage that it has called for: others do not collect."""
         self.gr_context = copy_context() if context is None else context
 
     def begin(self) -> Any:
@@ -115,6 +117,7 @@ class Strand(greenlet):
     def go(self, step: Callable[..., Any], *values: Any) -> Any:
         """Go on by `switch` or `throw`, in the folder of the program, and with its hooks."""
         folder, before = self.folder, sys.get_asyncgen_hooks()
+        is_collecting, collector.runs = collector.runs, self.collects
         if folder.path is not None:
             os.chdir(folder.path)
         if self.generator_hooks is not None:
@@ -126,6 +129,7 @@ class Strand(greenlet):
                 os.chdir(folder.home)
             if self.generator_hooks is not None:
                 sys.set_asyncgen_hooks(*before)
+            self.collects, collector.runs = collector.runs, is_collecting
 
 
 async def go_on(strand: Strand, item: Any) -> Any:
