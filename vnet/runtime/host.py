@@ -556,7 +556,8 @@ class Host:
                 continue
             if tasks := self._tasks_of(node):
                 places = ", ".join(sorted({line_of_task(task) for task in tasks}))
-                error = DeadlockError("nothing is left to wake the program; if it is over, let it return")
+                why = " (a thread called into the loop, and was refused)" if self._loop.has_refused else ""
+                error = DeadlockError(f"nothing is left to wake the program{why}; if it is over, let it return")
                 error.add_note(self.stacks(node.id))
                 self._unhandled.add(node, error, f"in {'a task' if len(tasks) == 1 else 'all tasks'} ({places})")
 

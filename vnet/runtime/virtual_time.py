@@ -277,6 +277,8 @@ class VirtualTimeLoop(SkewedLoop):
         self._ordered: OrderedQueue | None = None
         self._timer_grid = ANY_TIME
         self._thread: int | None = None
+        self.has_refused = False
+        """True once another thread has been refused, which may have told nobody."""
         self._collect_every_ns: int | None = None
         self._collections_ns: dict[int, int] = {}
         """The next collection of each generation; one that is not in it is not due."""
@@ -427,6 +429,7 @@ class VirtualTimeLoop(SkewedLoop):
 
     def _check_thread(self) -> None:
         if self._thread is not None and self._thread != get_ident():
+            self.has_refused = True
             raise RuntimeError(
                 "a thread calls into the event loop (loop.call_soon_threadsafe(), a future's set_result(), "
                 "asyncio.run_coroutine_threadsafe()): in lockstep nothing says at which emulated time it acts; "

@@ -207,6 +207,25 @@ def test_a_job_is_that_of_who_gave_it_whoever_started_the_thread() -> None:
     assert [event.node for event in exceptions(emulation)] == ["v02"]
 
 
+async def is_answered_by_a_thread_in_vain(node: Node) -> None:
+    loop = asyncio.get_running_loop()
+    answer = loop.create_future()
+
+    def give() -> None:
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(answer.set_result, None)
+
+    run_thread(give)
+    await answer
+
+
+def test_who_is_never_answered_is_told_that_a_thread_was_refused() -> None:
+    (told,) = exceptions(run_together(scenario_of([], entry(is_answered_by_a_thread_in_vain), vehicles=1)))
+    error = told.details["error"]
+    assert error.startswith("DeadlockError")
+    assert "a thread called into the loop" in error
+
+
 survivors: list[Callable[[], None]] = []
 """Ends of threads of vehicles that have been killed."""
 
