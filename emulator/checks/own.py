@@ -96,7 +96,8 @@ def own_findings(program: Program, run: Run) -> list[Finding]:
             with chdir("."):  # afterwards here again, wherever it has gone
                 for finding in _findings_of(entry, program, run):
                     if finding.name in findings:
-                        raise _NonsenseError(f"yields {finding.name.removeprefix(PREFIX)!r} twice")
+                        name = finding.name.removeprefix(PREFIX)
+                        raise _NonsenseError(f"yields {name!r}, which is there already")
                     findings[finding.name] = finding
         except KeyboardInterrupt:
             interrupted = True

@@ -241,10 +241,11 @@ def write_text(path: Path, text: str) -> None:
 
 def _claim(path: Path) -> Path:
     """Make the first of path, path-2, path-3 … that does not exist; two runs that start at once get two."""
+    path.parent.mkdir(parents=True, exist_ok=True)  # a link to nowhere exists, too, and is none
     for number in count(1):
         candidate = path if number == 1 else path.with_name(f"{path.name}-{number}")
         with suppress(FileExistsError):
-            candidate.mkdir(parents=True)
+            candidate.mkdir()
             return candidate
     raise AssertionError("count() ends")
 

@@ -798,7 +798,8 @@ def run_campaign(
     folder = out or next(path for path in _folders(name) if not path.exists())
     earlier = _earlier(plan, name, before, out)
     check_is_free(folder, "--out ")
-    folder.mkdir(parents=True, exist_ok=True)
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with _interrupted_once(), Progress(*columns, console=console) as progress:
         campaign = Campaign(plan, folder, progress, executor)

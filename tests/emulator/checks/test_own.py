@@ -204,7 +204,7 @@ def test_one_that_raises_is_unknown_and_named_and_its_results_so_far_count(here:
             "time_s = 99: the run has periods from 0 s to 0.5 s (own_checks.py:22)",
         ),
         ("single", "own:one", "nobody knows"),
-        ("endless", "own:own_checks.endless", "yields 'more' twice"),
+        ("endless", "own:own_checks.endless", "yields 'more', which is there already"),
         ("leaving", "own:own_checks.leaving", "raises SystemExit: 0 (own_checks.py:32)"),
         ("verdict", "own:own_checks.verdict", "run: has no verdict yet: its checks are still being made"),
     ],

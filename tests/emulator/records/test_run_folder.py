@@ -25,6 +25,15 @@ def test_a_name_that_another_run_has_just_taken_is_passed_over(
     assert [RunFolder.create(None, Scenario()).path.name for _ in range(2)] == ["run-1-2", "run-1-3"]
 
 
+def test_a_link_to_a_place_that_is_gone_is_no_place_for_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").symlink_to("gone")
+    with pytest.raises(VnetError, match="cannot write: File exists"):
+        RunFolder.create(None, Scenario())
+
+
 def test_a_place_that_the_system_refuses_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(VnetError, match="cannot write: File name too long"):

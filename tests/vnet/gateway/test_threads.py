@@ -608,6 +608,31 @@ def test_a_finalizer_that_waits_while_its_program_collects_is_nobody_else_s(driv
     assert log(run, "v02")[-1].endswith("finished")
 
 
+def test_a_thread_waits_for_a_module_that_another_executes(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "slow.py").write_text("import time\ntime.sleep(0.5)\nREADY = 7\n")
+    (tmp_path / "one.py").write_text("import time\ntime.sleep(0.1)\nimport two\n")
+    (tmp_path / "two.py").write_text("import time\ntime.sleep(0.1)\nimport one\n")
+    run = drive("""
+        import threading, time
+        def load(name):
+            time.sleep(0.1)
+            import slow
+            print(name, slow.READY, round(time.monotonic(), 1))
+        threads = [threading.Thread(target=load, args=[n]) for n in range(2)]
+        for thread in threads:
+            thread.start()
+        import slow
+        for thread in threads:
+            thread.join()
+        circle = threading.Thread(target=__import__, args=["two"])
+        circle.start()
+        import one
+        circle.join()
+        print("done", round(time.monotonic(), 1))
+        """)
+    assert printed(run) == ["0 7 0.5", "1 7 0.5", "done 0.6"]
+
+
 def test_clock_error_of_a_vehicle_is_that_of_its_program(drive: Drive) -> None:
     """A skew sets the time of day alone, a drift is that of all clocks and waits."""
     text = """

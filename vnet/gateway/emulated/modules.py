@@ -42,7 +42,16 @@ from vnet.gateway import client_config, python_words, session_variables
 from vnet.gateway.emulated.loops import prepare_asyncio
 from vnet.gateway.emulated.process import INTERRUPTED, OwnProcess, Semaphore, subprocess_functions, take_output
 from vnet.gateway.emulated.shown import facade, hide, import_shared, show
-from vnet.gateway.emulated.strands import Threads, fail, look, set_generator_hooks, sleep
+from vnet.gateway.emulated.strands import (
+    Strand,
+    Threads,
+    Waiting,
+    current_strand,
+    fail,
+    look,
+    set_generator_hooks,
+    sleep,
+)
 from vnet.node import Node
 from vnet.runtime.own_asyncio import Numbered
 from vnet.runtime.virtual_time import VirtualTimeLoop
@@ -263,6 +272,10 @@ class ProgramModules:
         """True once the program has opened a session of Zenoh's."""
         self.sessions: list[Any] = []
         """Those that it has opened and not closed."""
+        self._executing: dict[str, tuple[Strand | None, Waiting]] = {}
+        """The threads that execute modules, and those that wait for the end of that."""
+        self._awaited: dict[Strand, str] = {}
+        """The modules that threads wait for."""
         self.path: list[str] = []
         self.argv: list[str] = []
         own = session_variables(node.id, ENDPOINT, client_config(ENDPOINT), CLIENT_CONFIG)
@@ -406,6 +419,7 @@ class ProgramModules:
 
     def load(self, name: str) -> ModuleType:
         """Return a module as the program sees it; load it if need be. Raises ImportError."""
+        self._await(name)
         if (found := self.modules.get(name)) is not None:
             return found
         if name in self.modules:
@@ -416,6 +430,21 @@ class ProgramModules:
             if name in self.modules:
                 return self.modules[name]
         return self._load_new(name)
+
+    def _await(self, name: str) -> None:
+        """Wait until no other thread executes a module, unless that waits for one that this executes, as Python."""
+        strand = current_strand()
+        while strand is not None and (executing := self._executing.get(name)) is not None:
+            other, waiting = executing
+            while other is not None and other is not strand:
+                other, _ = self._executing.get(self._awaited.get(other, ""), (None, None))
+            if other is strand:
+                return
+            self._awaited[strand] = name
+            try:
+                waiting.wait()
+            finally:
+                del self._awaited[strand]
 
     def _load_new(self, name: str) -> ModuleType:
         top = name.partition(".")[0]
@@ -456,6 +485,8 @@ class ProgramModules:
         name = spec.name
         module = self.modules[name] = again or importlib.util.module_from_spec(spec)
         vars(module)["__builtins__"] = self._builtins
+        waiting = Waiting()
+        self._executing[name] = current_strand(), waiting
         try:
             if isinstance(spec.loader, SourceFileLoader):  # else a folder without code
                 get_code: Any = _shared_code if _is_own_copy(name) else SourceFileLoader.get_code
@@ -464,6 +495,9 @@ class ProgramModules:
             if again is None:
                 self.modules.take_back(name)
             raise
+        finally:
+            self._executing.pop(name, None)  # a module may load itself again while it is executed
+            waiting.wake_all()
         if (prepare := self._preparations.get(name)) is not None:
             prepare(module)
         return self.modules.get(name, module)
