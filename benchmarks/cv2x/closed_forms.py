@@ -9,7 +9,10 @@ resource while neither has announced its selection. A selection is announced by 
 the middle of the interval on average. So a second vehicle selects unannounced after a first one with probability
 1/2, and as often before it: once in L² periods for two vehicles. Each takes one of the A resources that are free to
 it, the same with probability 1 / A, and they collide until one of them selects again: after E[min(life, life)]
-periods. So a frame meets no other with probability (1 - E[min] / (L² A))^(V - 1).
+periods. And who selects in a slot has not sensed that slot, which the last one of its window repeats: what another
+vehicle has reserved for it before is over by then. That vehicle is not excluded: once in 100 L periods for each of
+two, until one of them selects again, after E[min(life, rest of a life)] periods. So a frame meets no other with
+probability (1 - (E[min(life, life)] / L² + 2 E[min(life, rest)] / (100 L)) / A)^(V - 1).
 
 **The model of Cao et al.** (arXiv 2309.16680, equations 8 and 12, as a public program that uses them restates them;
 the paper itself was not at hand) counts each selection of another vehicle in the interval before and after one's
@@ -84,8 +87,10 @@ def meets(case: Case) -> float:
         return float(1 - (1 - 1 / case.resources) ** (case.vehicles - 1))
     longer = lives(case.keep)
     mean, both = longer.sum(), (longer**2).sum()
+    left = (longer.sum() - np.cumsum(longer)) / mean  # the share of resources in use that are used more often yet
     free = case.resources - (case.vehicles - 1)
-    return float(1 - (1 - both / (mean**2 * free)) ** (case.vehicles - 1))
+    both_at_once, one_unseen = both / mean**2, 2 * (longer * left).sum() / (PERIOD_MS * mean)
+    return float(1 - (1 - (both_at_once + one_unseen) / free) ** (case.vehicles - 1))
 
 
 def meets_by_cao(case: Case) -> float | None:
