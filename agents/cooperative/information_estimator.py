@@ -271,7 +271,10 @@ class InformationEstimator:
         if self._options.consensus == "ratio":
             count = len(means_m)
             middle_m = math.fsum([x for x, _ in means_m]) / count, math.fsum([y for _, y in means_m]) / count
-            self.mean_m = tracked_mean(middle_m, self.mean_m, self.limit_m / SPREAD_GATE)
+            limit_m = self.limit_m / SPREAD_GATE
+            if self._options.defence and limit_m == math.inf:  # few are heard: false sums would choose among them
+                limit_m = math.sqrt(own[2] + own[4])
+            self.mean_m = tracked_mean(middle_m, self.mean_m, limit_m)
         limited, increments = self._limited(heard, priors)
         self._weighed = pool.codes
         weights = self._weights = self._weigh(pool, means_m, own[2] + own[4], leaning, len(frames))

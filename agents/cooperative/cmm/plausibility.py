@@ -20,6 +20,8 @@ PRIOR_FACTOR = 2.0
 """Largest trace of a prior's matrix, relative to one's own."""
 INCREMENT_GATE = 16.0
 """Largest squared deviation of an increment from what is believed."""
+LANE_GATE = 8.0
+"""The same of an origin's sum of few increments of lanes, where more than a few origins are heard."""
 SUM_GATE = 4.0
 """Largest squared deviation of an origin's sum of many increments: the errors of what was believed partly cancel,
 and one honest sum in ten thousand deviates by 3.5 (N2) to 4.5 (N1)."""
@@ -34,7 +36,7 @@ SPREAD_GATE = 3.5
 """Largest distance of a prior's mean from the median of all, in deviations of their spread."""
 MANY = 90.0
 """Number of increments in a sum, less what has decayed, from which on the gate of many applies; for one it is
-`INCREMENT_GATE`."""
+`INCREMENT_GATE`, of lanes `LANE_GATE`."""
 LEAN_LIMIT = 0.1
 """Largest mean distance of an origin's priors from the median of all, in deviations that both claim: in honest runs
 one in a hundred has 0.07 (N1), 0.10 (N2), 0.18 (N3), where a few pass on what the others cannot know."""
@@ -250,6 +252,7 @@ class Origins:
         off_y = (off_y - c_yx * off_x) / c_yy
         memory_s = MEMORY_S if is_about_lanes else SUM_MEMORY_S
         are_few = common_m is None and (not is_about_lanes or len(sums) < MAJORITY)
+        gate_of_few = LANE_GATE if is_about_lanes and not are_few else INCREMENT_GATE
         then_s, keep, keep_2 = now_s, 1.0, 1.0
         nothing: Sums = (now_s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         shares = []
@@ -289,7 +292,7 @@ class Origins:
                 in_sum *= self._most / (n_a + n_d)
             gate = gate_of_many
             if not -gate < in_sum < gate:
-                gate = INCREMENT_GATE + (gate - INCREMENT_GATE) * min(1.0, count / MANY)
+                gate = gate_of_few + (gate - gate_of_few) * min(1.0, count / MANY)
             if -INCREMENT_GATE < alone < INCREMENT_GATE and -gate < in_sum < gate:
                 shares.append(1.0)
             else:
