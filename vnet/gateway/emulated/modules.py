@@ -428,7 +428,7 @@ class ProgramModules:
         if parent:
             self.load(parent)
             if name in self.modules:
-                return self.modules[name]
+                return self.load(name)  # another thread may execute it by now
         return self._load_new(name)
 
     def _await(self, name: str) -> None:
